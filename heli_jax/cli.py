@@ -147,8 +147,15 @@ def _add_config(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _prepare_jax() -> None:
-    """float64, and a compilation cache that takes everything. Only entry points do this."""
+def _prepare_jax(cpu_devices: int | None = None) -> None:
+    """float64, and a compilation cache that takes everything. Only entry points do this.
+
+    Args:
+        cpu_devices: so many processors are devices; JAX decides unless given.
+
+    Raises:
+        InputError: JAX_PLATFORMS asks for a device that is not there.
+    """
     # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
     # option, --help and `info` need none of them.
     import jax
@@ -164,6 +171,22 @@ def _prepare_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(_cache()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if cpu_devices is not None:
+        # Once JAX is in use their number stays as it is.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", cpu_devices)
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    if platforms in ("", "cpu"):
+        return
+    try:
+        jax.devices()
+    # An assertion, where the part of JAX that knows the device is there and the device is not.
+    except (RuntimeError, AssertionError) as e:
+        raise InputError(
+            f"JAX_PLATFORMS={platforms}: JAX finds no such device here, expected one that there is "
+            "(a GPU of NVIDIA's needs its driver and the extra gpu: pip install 'heli_jax[gpu]'), "
+            "or JAX_PLATFORMS=cpu"
+        ) from e
 
 
 def _cache() -> Path:
@@ -306,15 +329,12 @@ def _sweep(options: argparse.Namespace) -> int:
     out = Path(options.out) if options.out else run_directory.default_directory(config)
     if not options.resume:
         run_directory.require_free(out, ", or --resume")
-    _prepare_jax()
-    import jax
-
     from heli_jax.numerics.cores import cores
 
-    # Each core a device of its own; where there are GPUs they are the devices. Once JAX is in use
-    # their number stays as it is.
-    with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", options.devices or cores())
+    # Each core a device of its own; where there are GPUs they are the devices.
+    _prepare_jax(options.devices or cores())
+    import jax
+
     from heli_jax import config as configuration
     from heli_jax import simulation_output, sweep_workflow
 

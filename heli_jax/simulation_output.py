@@ -132,7 +132,9 @@ def print_sweep(out: Path) -> None:
     totals = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     counts = {k: v for k, v in totals["status"].items() if v}
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
-    print(f"{_counted(totals['elements'])} of {totals['model']}: {words}")
+    # A store of an earlier version does not say: there was no other.
+    backend = totals["split"].get("backend", "xla")
+    print(f"{_counted(totals['elements'])} of {totals['model']}: {words}; backend {backend}")
     rows = []
     for name, result in totals["results"].items():
         numbers = [

@@ -396,6 +396,18 @@ def test_usage_and_places_to_write(bench, capsys):
     refused(capsys, ["info", bench.parent / "none.csv"], "none.csv")
 
 
+def test_a_device_that_is_not_there(bench, capsys, monkeypatch):
+    import jax
+
+    def none():
+        raise AssertionError
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr(jax, "devices", none)
+    for command in (["fit", bench], ["sweep", bench], ["check", bench]):
+        refused(capsys, command, "JAX_PLATFORMS=cuda", "heli_jax[gpu]")
+
+
 def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys):
     def lowered(options):
         try:

@@ -70,10 +70,12 @@ def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
 
 @pytest.mark.slow
 def test_the_python_of_the_page_runs(folder):
-    assert len(parts("docs/python.md")) == 3
+    assert len(parts("docs/python.md")) == 4
     out = run(folder, "\n".join(parts("docs/python.md")[1:]))
-    status, estimates, gradients, best = out.strip().split("\n", 3)
+    status, estimates, gradients, best, booted, again = out.strip().split("\n", 5)
     assert status.startswith("converged The data alone determine only a/Ixx and a/If")
     assert "'Ixx': (0.024" in estimates
     assert gradients.startswith("[")
     assert len(best.split()) == 2
+    assert booted.startswith("(0.02")
+    assert "[ True  True]" in again

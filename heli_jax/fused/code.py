@@ -1,14 +1,44 @@
 """LLVM assembly, line by line: scalars that all vehicles share, and vectors over vehicles."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.fused.cuda_driver import CudaError
+
 
 class UnsupportedError(Exception):
     """An operation that has no translation; in words what it is."""
+
+    place: str | None = None
+    """where it comes from, as `fused.place` has it"""
+
+    def __str__(self) -> str:
+        words = super().__str__()
+        return words if self.place is None else f"{words} ({self.place})"
+
+
+@contextmanager
+def translating() -> Iterator[None]:
+    """What goes wrong meanwhile, however unforeseen, leaves a program that is not to be had.
+
+    XLA computes the same: no failure here may end what somebody asked for. An error of the model's
+    own is raised there again.
+
+    Raises:
+        UnsupportedError: in place of any other error.
+    """
+    try:
+        yield
+    except (UnsupportedError, CudaError):
+        raise
+    except Exception as e:
+        said = " ".join(str(e).split())
+        words = f"this model, whose translation failed ({type(e).__name__}: {said[:200]})"
+        raise UnsupportedError(words) from e
 
 
 class Value(NamedTuple):
@@ -85,6 +115,8 @@ class Code:
         """the type of a pointer to an array"""
         self.lines: list[str] = []
         self.block = "entry"
+        self.taken: Value | None = None
+        """whether any vehicle takes the branch that is being written; None outside of branches"""
         self.declared: dict[str, str] = {}
         self.globals: dict[str, str] = {}
         self._count = 0
@@ -186,6 +218,38 @@ class Code:
         self.declared[full] = f"declare {kind} {full}({', '.join([kind] * len(values))})"
         operands = ", ".join(f"{kind} {self.of(v, shared)}" for v in values)
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
+
+    def library(self, name: str, *values: Value) -> Value:
+        """A function that LLVM does not know and the C library has, such as `log1p`: called for
+        each vehicle."""
+        dtype = values[0].dtype
+        kind, shared = type_of(dtype), all(v.shared for v in values)
+        own = self.target.functions(name, kind) or f"{name}{'f' if kind == 'float' else ''}"
+        takes = ", ".join([kind] * len(values))
+        self.declared[f"@{own}"] = f"declare {kind} @{own}({takes}) nounwind memory(none)"
+        operands = [self.of(v, shared) for v in values]
+        if shared or self.lanes == 1:
+            given = ", ".join(f"{kind} {o}" for o in operands)
+            return self.made(f"call {kind} @{own}({given})", dtype, shared)
+        vector, joined = self.vector(kind), "poison"
+        for lane in range(self.lanes):
+            each = [
+                self.made(f"extractelement {vector} {o}, i64 {lane}", dtype, True).operand
+                for o in operands
+            ]
+            given = ", ".join(f"{kind} {o}" for o in each)
+            result = self.made(f"call {kind} @{own}({given})", dtype, True).operand
+            right = f"insertelement {vector} {joined}, {kind} {result}, i64 {lane}"
+            joined = self.made(right, dtype, False).operand
+        return Value(joined, dtype, False)
+
+    def any(self, which: Value) -> Value:
+        """Whether it is true of any of the vehicles that are in flight together."""
+        if which.shared or self.lanes == 1:
+            return which._replace(shared=True)
+        name, vector = f"@llvm.vector.reduce.or.v{self.lanes}i1", self.vector("i1")
+        self.declared[name] = f"declare i1 {name}({vector})"
+        return self.made(f"call i1 {name}({vector} {which.operand})", which.dtype, True)
 
     def many(self, shared: bool) -> str:
         """What stands before a type in an intrinsic's name."""

@@ -1,13 +1,15 @@
 """A program for whole runs on the processor at hand, compiled and called."""
 
 import ctypes
+import re
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from heli_jax.fused.code import Target
+from heli_jax.fused.code import Target, UnsupportedError
 from heli_jax.fused.program import Argument, Run, whole, write
 
 
@@ -107,6 +109,9 @@ def _compiled(assembly: str) -> Any:
     import llvmlite.binding as llvm
 
     target = _machine()
+    for name in re.findall(r"^declare .*@(?!llvm\.)(\w+)\(", assembly, re.MULTILINE):
+        # LLVM would end the process where it does not find one.
+        llvm.add_symbol(name, _address(name))
     module = llvm.parse_assembly(assembly)
     module.verify()
     builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=3))
@@ -115,3 +120,19 @@ def _compiled(assembly: str) -> Any:
     engine = llvm.create_mcjit_compiler(module, _machine())
     engine.finalize_object()
     return engine
+
+
+def _address(name: str) -> int:
+    """Where a function of the C library is.
+
+    Raises:
+        UnsupportedError: it has none of this name.
+    """
+    # Elsewhere it is part of what every process of Python has loaded.
+    library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None)
+    try:
+        address = ctypes.cast(getattr(library, name), ctypes.c_void_p).value
+    except AttributeError as e:
+        raise UnsupportedError(f"{name}, which this machine's C library does not have") from e
+    assert address is not None
+    return address

@@ -26,17 +26,41 @@ def _arithmetic(of_floats: str, of_integers: str) -> Operation:
 
 
 def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    if a.dtype.kind != "f":
-        raise UnsupportedError("a quotient of integers")
-    return code.operation(f"fdiv {_F}", a, b)
+    if a.dtype.kind == "f":
+        return code.operation(f"fdiv {_F}", a, b)
+    return _of_integers(code, "div", a, b, constant(-1, b.dtype))
+
+
+def _remainder(code: Code, a: Value, b: Value, **_: Any) -> Value:
+    """With the sign of the dividend."""
+    if a.dtype.kind == "f":
+        return code.library("fmod", a, b)
+    return _of_integers(code, "rem", a, b, a)
+
+
+def _of_integers(code: Code, name: str, a: Value, b: Value, by_zero: Value) -> Value:
+    """A quotient or a remainder, toward zero; of zero what XLA makes of it."""
+    if a.dtype.kind not in "iu":
+        raise UnsupportedError("a quotient of truth values")
+    zero, one = constant(0, b.dtype), constant(1, b.dtype)
+    none = code.compare("icmp eq", b, zero)
+    # The processor stops at a quotient by zero, and at the least integer by -1, which has none.
+    divisor = code.choose(none, one, b)
+    if a.dtype.kind == "u":
+        return code.choose(none, by_zero, code.operation(f"u{name}", a, divisor))
+    negated = code.compare("icmp eq", b, constant(-1, b.dtype))
+    result = code.operation(f"s{name}", a, code.choose(negated, one, divisor))
+    if name == "div":
+        result = code.choose(negated, code.operation("sub", zero, a), result)
+    return code.choose(none, by_zero, result)
 
 
 def _extreme(of_floats: str, signed: str, unsigned: str) -> Operation:
     # `maximum` gives what is not a number on, as JAX does; `maxnum` would lose it.
     def made(code: Code, a: Value, b: Value, **_: Any) -> Value:
         names = {"f": of_floats, "i": signed, "u": unsigned}
-        if a.dtype.kind not in names:
-            raise UnsupportedError(f"{of_floats} of truth values")
+        if a.dtype.kind == "b":
+            return code.operation("or" if signed == "smax" else "and", a, b)
         return code.intrinsic(names[a.dtype.kind], a, b)
 
     return made
@@ -60,9 +84,33 @@ def _function(name: str) -> Operation:
     return made
 
 
+def _library(name: str) -> Operation:
+    def made(code: Code, a: Value, **_: Any) -> Value:
+        if a.dtype.kind != "f":
+            raise UnsupportedError(f"{name} of integers")
+        return code.library(name, a)
+
+    return made
+
+
+def _polynomial(code: Code, x: Value, *factors: Value, **_: Any) -> Value:
+    """Of rising powers, by Horner's rule."""
+    total = factors[-1]
+    for factor in reversed(factors[:-1]):
+        total = OPERATIONS["add"](code, OPERATIONS["mul"](code, total, x), factor)
+    return total
+
+
+def _one_minus_square(code: Code, a: Value, **_: Any) -> Value:
+    one = constant(1, a.dtype)
+    return code.operation("fmul", code.operation("fadd", one, a), code.operation("fsub", one, a))
+
+
 def _absolute(code: Code, a: Value, **_: Any) -> Value:
     if a.dtype.kind == "f":
         return code.intrinsic("fabs", a)
+    if a.dtype.kind == "u":
+        return a
     zero = constant(0, a.dtype)
     return code.choose(code.compare("icmp slt", a, zero), code.operation("sub", zero, a), a)
 
@@ -86,16 +134,16 @@ def _power(code: Code, a: Value, *, y: int, **_: Any) -> Value:
     result, square, left = None, a, abs(y)
     while left:
         if left & 1:
-            result = square if result is None else code.operation(f"fmul {_F}", result, square)
+            result = square if result is None else OPERATIONS["mul"](code, result, square)
         left >>= 1
         if left:
-            square = code.operation(f"fmul {_F}", square, square)
+            square = OPERATIONS["mul"](code, square, square)
     assert result is not None
-    return result if y > 0 else code.operation(f"fdiv {_F}", constant(1, a.dtype), result)
+    return result if y > 0 else OPERATIONS["div"](code, constant(1, a.dtype), result)
 
 
 def _square(code: Code, a: Value, **_: Any) -> Value:
-    return code.operation(f"fmul {_F}" if a.dtype.kind == "f" else "mul", a, a)
+    return OPERATIONS["mul"](code, a, a)
 
 
 def _inverse_root(code: Code, a: Value, **_: Any) -> Value:
@@ -103,11 +151,15 @@ def _inverse_root(code: Code, a: Value, **_: Any) -> Value:
 
 
 def _sign(code: Code, a: Value, **_: Any) -> Value:
+    zero, one = constant(0, a.dtype), constant(1, a.dtype)
+    if a.dtype.kind == "u":
+        return code.choose(code.compare("icmp eq", a, zero), zero, one)
     if a.dtype.kind != "f":
-        raise UnsupportedError("the sign of an integer")
+        positive = code.choose(code.compare("icmp sgt", a, zero), one, zero)
+        return code.choose(code.compare("icmp slt", a, zero), constant(-1, a.dtype), positive)
     # Zero and what is not a number are their own sign.
-    unit = code.intrinsic("copysign", constant(1, a.dtype), a)
-    nonzero = code.compare("fcmp one", a, constant(0, a.dtype))
+    unit = code.intrinsic("copysign", one, a)
+    nonzero = code.compare("fcmp one", a, zero)
     return code.choose(nonzero, unit, a)
 
 
@@ -200,6 +252,7 @@ OPERATIONS: dict[str, Operation] = {
     "sub": _arithmetic("fsub", "sub"),
     "mul": _arithmetic("fmul", "mul"),
     "div": _quotient,
+    "rem": _remainder,
     "neg": _negative,
     "abs": _absolute,
     "max": _extreme("maximum", "smax", "umax"),
@@ -208,6 +261,8 @@ OPERATIONS: dict[str, Operation] = {
     "sqrt": _function("sqrt"),
     "rsqrt": _inverse_root,
     "square": _square,
+    "one_minus_square": _one_minus_square,
+    "polynomial": _polynomial,
     "integer_pow": _power,
     "pow": _power_of,
     "floor": _function("floor"),
@@ -218,6 +273,15 @@ OPERATIONS: dict[str, Operation] = {
     "exp": _function("exp"),
     "exp2": _function("exp2"),
     "log": _function("log"),
+    "log2": _function("log2"),
+    "log1p": _library("log1p"),
+    "expm1": _library("expm1"),
+    "cbrt": _library("cbrt"),
+    "asinh": _library("asinh"),
+    "acosh": _library("acosh"),
+    "atanh": _library("atanh"),
+    "erf": _library("erf"),
+    "erfc": _library("erfc"),
     "logistic": _logistic,
     "sin": _function("sin"),
     "cos": _function("cos"),

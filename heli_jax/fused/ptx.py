@@ -17,7 +17,8 @@ from heli_jax.fused.program import Run, Text, write
 _TRIPLE = "nvptx64-nvidia-cuda"
 _FROM_LIBDEVICE = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
-    *("exp", "exp2", "log", "pow"),
+    *("exp", "exp2", "log", "log2", "pow", "log1p", "expm1", "cbrt"),
+    *("asinh", "acosh", "atanh", "erf", "erfc", "fmod"),
 }
 # What LLVM has a description of; a later GPU runs the last one's program as well.
 _KNOWN = (70, 72, 75, 80, 86, 87, 89, 90)

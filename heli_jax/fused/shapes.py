@@ -158,6 +158,86 @@ def _reduction(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]]
     return made
 
 
+def _anywhere(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """Over all axes. Equinox asks so whether any of a batch needs something; here each vehicle asks
+    for itself, and gets the same."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        axes = tuple(range(len(inputs[0].shape)))
+        return _reduction(operation)(code, inputs, {"axes": axes})
+
+    return made
+
+
+def _running(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """cumsum and the like."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        source = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
+        source = source[::-1] if params["reverse"] else source
+        result = np.array(source)
+        for k in range(1, len(source)):
+            for at in np.ndindex(source.shape[1:]):
+                result[(k, *at)] = OPERATIONS[operation](
+                    code, result[(k - 1, *at)], source[(k, *at)]
+                )
+        return np.moveaxis(result[::-1] if params["reverse"] else result, 0, params["axis"])
+
+    return made
+
+
+def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """argmax and argmin: the first of the best, or the first that is not a number."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        (axis,), dtype = params["axes"], np.dtype(params["index_dtype"])
+        source = np.moveaxis(elements(code, inputs[0]), axis, 0)
+        result = np.empty(source.shape[1:], object)
+        for at in np.ndindex(result.shape):
+            best, place = source[(0, *at)], constant(0, dtype)
+            for k in range(1, len(source)):
+                value = source[(k, *at)]
+                keep = code.operation(
+                    "or",
+                    OPERATIONS[order](code, best, value),
+                    OPERATIONS["ne"](code, best, best),
+                )
+                place = code.choose(keep, place, constant(k, dtype))
+                best = code.choose(keep, best, value)
+            result[at] = place
+        return result
+
+    return made
+
+
+def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """scatter, of one window of length one along the axes that are indexed: `.at[i, j].set(v)`."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        old, where, new = (elements(code, v) for v in inputs)
+        numbers = params["dimension_numbers"]
+        axes = tuple(numbers.scatter_dims_to_operand_dims)
+        plain = where.shape == (len(axes),) and set(axes) == set(numbers.inserted_window_dims)
+        # Whatever is asked for, GatherScatterMode.CLIP moves it into the array; all others leave
+        # out what is beyond it.
+        if not plain or "CLIP" in str(params["mode"]):
+            raise UnsupportedError("several places of an array that are written at once")
+        result = np.empty(old.shape, object)
+        for at in np.ndindex(old.shape):
+            # Any: an element, of which NumPy's types make an array as well.
+            before: Any = old[at]
+            value: Any = new[tuple(i for d, i in enumerate(at) if d not in axes)]
+            if operation is not None:
+                value = OPERATIONS[operation](code, before, value)
+            for index, axis in zip(where, axes, strict=True):
+                here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
+                value = code.choose(here, value, before)
+            result[at] = value
+        return result
+
+    return made
+
+
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     a, b = (elements(code, v) for v in inputs)
@@ -198,4 +278,15 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "reduce_and": _reduction("and"),
     "reduce_or": _reduction("or"),
     "dot_general": _product,
+    "scatter": _put(None),
+    "scatter-add": _put("add"),
+    "scatter_add": _put("add"),
+    "cumsum": _running("add"),
+    "cumprod": _running("mul"),
+    "cummax": _running("max"),
+    "cummin": _running("min"),
+    "argmax": _where_extreme("ge"),
+    "argmin": _where_extreme("le"),
+    "unvmap_any": _anywhere("or"),
+    "unvmap_all": _anywhere("and"),
 }

@@ -25,6 +25,7 @@ from heli_jax.fused.operands import (
     scalar,
 )
 from heli_jax.fused.operations import OPERATIONS
+from heli_jax.fused.place import place_of
 from heli_jax.fused.shapes import SHAPED
 
 _UNROLLED = 16
@@ -69,7 +70,11 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
 
     for equation in jaxpr.eqns:
         inputs = [read(v) for v in equation.invars]
-        outputs = _equation(code, equation, inputs)
+        try:
+            outputs = _equation(code, equation, inputs)
+        except UnsupportedError as e:
+            e.place = e.place or place_of(equation)
+            raise
         known |= dict(zip(equation.outvars, outputs, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
@@ -82,7 +87,7 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         return translate(
             code, inner.jaxpr if closed else inner, inner.consts if closed else (), inputs
         )
-    if name in ("optimization_barrier", "copy"):
+    if name in ("optimization_barrier", "copy", "stop_gradient"):
         return list(inputs)
     if name == "scan":
         return _scan(code, params, inputs)
@@ -98,41 +103,73 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         results = results if equation.primitive.multiple_results else [results]
         return [np.asarray(r) for r in results]
     if name in OPERATIONS:
-        return [_elementwise(code, name, params, inputs)]
+        dtype = np.dtype(equation.outvars[0].aval.dtype)
+        return [_elementwise(code, name, params, inputs, dtype)]
     if name in SHAPED:
         return [SHAPED[name](code, inputs, params)]
+    # Such as jnp.searchsorted, of which the primitive is the same for all.
+    name = type(params["_prim"]).__name__ if "_prim" in params else name
     raise UnsupportedError(f"the operation {name}")
 
 
-def _elementwise(code: Code, name: str, params: dict[str, Any], inputs: list[Operand]) -> Operand:
+def _elementwise(
+    code: Code, name: str, params: dict[str, Any], inputs: list[Operand], dtype: np.dtype
+) -> Operand:
+    """Arrays of one shape, single numbers, and arrays with axes of length 1 that are repeated."""
     operation = OPERATIONS[name]
-    stored = [v for v in inputs if isinstance(v, Stored)]
-    if stored:
-        shape = next(v.shape for v in stored)
+    shape = np.broadcast_shapes(*(v.shape for v in inputs))
+    size = int(np.prod(shape))
+    if any(isinstance(v, Stored) for v in inputs):
 
         def element(at: tuple[Value, ...]) -> Value:
-            return operation(code, *(at_place(code, v, at) for v in inputs), **params)
+            values = (at_place(code, v, _repeated(v.shape, shape, at)) for v in inputs)
+            return operation(code, *values, **params)
 
-        dtype = np.dtype(params.get("new_dtype", stored[0].dtype))
         return Stored(shape, dtype, element)
-    arrays = [elements(code, v) for v in inputs]
-    shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    if size > MOST:
+        raise UnsupportedError(f"an array of {shape} as a whole")
+    arrays = [np.broadcast_to(elements(code, v), shape) for v in inputs]
     result = np.empty(shape, object)
     for at in np.ndindex(shape):
-        result[at] = operation(code, *(a[at] if a.shape else a[()] for a in arrays), **params)
+        result[at] = operation(code, *(a[at] for a in arrays), **params)
     return result
+
+
+def _repeated(
+    own: tuple[int, ...], shape: tuple[int, ...], at: tuple[Value, ...]
+) -> tuple[Value, ...]:
+    """Where in an array stands what is at a place of the shape that it is repeated to."""
+    if not own:
+        return ()
+    zero = constant(0, INDEX)
+    return tuple(i if n == m else zero for n, m, i in zip(own, shape, at, strict=True))
 
 
 def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
     """cond: each vehicle may take another branch, so all are computed and one result is taken."""
-    which, operands = scalar(code, inputs[0]), inputs[1:]
-    results = [
-        translate(code, branch.jaxpr, branch.consts, operands) for branch in params["branches"]
-    ]
+    which, operands, branches = inputs[0], inputs[1:], params["branches"]
+    if not isinstance(which, Stored) and which.dtype != object:
+        branch = branches[int(np.clip(which, 0, len(branches) - 1))]
+        return translate(code, branch.jaxpr, branch.consts, operands)
+    which, outside, results = scalar(code, which), code.taken, []
+    for i, branch in enumerate(branches):
+        # A loop of a branch that nobody takes need not have an end.
+        taken = code.any(_takes(code, which, i, len(branches)))
+        code.taken = taken if outside is None else code.operation("and", outside, taken)
+        results.append(translate(code, branch.jaxpr, branch.consts, operands))
+    code.taken = outside
     return [
-        _elementwise(code, "select_n", {}, [_filled(which, case[0]), *case])
+        _elementwise(code, "select_n", {}, [_filled(which, case[0]), *case], dtype_of(case[0]))
         for case in zip(*results, strict=True)
     ]
+
+
+def _takes(code: Code, which: Value, i: int, count: int) -> Value:
+    """Whether a branch is the one: the first and the last also stand for what is beyond them."""
+    if which.dtype.kind == "b":
+        return which if i else code.operation("xor", which, constant(True, which.dtype))
+    order = "sle" if i == 0 else "sge" if i == count - 1 else "eq"
+    return code.compare(f"icmp {order}", which, constant(i, which.dtype))
 
 
 def _filled(which: Value, like: Operand) -> Elements:
@@ -222,6 +259,8 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
     # Entered at least once, as all loops here: what it then carries is not taken if it should not
     # have been.
     entered = holds(carry)
+    if code.taken is not None:
+        entered = code.operation("and", entered, code.taken)
     results = loop(
         code,
         # Never again where it should not have been entered: such a loop may have no end.
@@ -230,6 +269,6 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
         lambda _, carried: translate(code, body.jaxpr, body.consts, [*of_body, *carried]),
     )
     return [
-        _elementwise(code, "select_n", {}, [_filled(entered, new), old, new])
+        _elementwise(code, "select_n", {}, [_filled(entered, new), old, new], dtype_of(old))
         for old, new in zip(carry, results, strict=True)
     ]

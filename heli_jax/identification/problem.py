@@ -48,7 +48,7 @@ __all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
 
 _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
-_FEWEST_SEEN = 8
+FEWEST_SEEN = 8
 """measured samples of an output at least"""
 _PER_PARAMETER = 3
 """samples of a flight for each free parameter, at least"""
@@ -351,9 +351,9 @@ def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
         # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
         # own, and so no noise.
         seen = int(np.isfinite(y).sum())
-        if seen < _FEWEST_SEEN:
+        if seen < FEWEST_SEEN:
             raise ValueError(
-                f"{where}, output {name!r}: expected at least {_FEWEST_SEEN} measured samples, got "
+                f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
                 f"{seen} of {y.size}"
             )
         # A flight held out is simulated, not weighed: it needs no noise.

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax.fused.code import UnsupportedError
+from heli_jax.fused.code import UnsupportedError, translating
 from heli_jax.fused.cuda_driver import CudaError, Gpu
 from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
@@ -215,6 +215,7 @@ def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> T
 
 
 @functools.lru_cache(maxsize=32)
+@translating()
 def _compiled(
     plan: Plan,
     structure: Any,

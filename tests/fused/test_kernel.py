@@ -85,12 +85,106 @@ UNARY = {
     "atan2": lambda x: jnp.arctan2(x, x - 0.5),
     "minimum": lambda x: jnp.minimum(x, 0.3) + jnp.maximum(x, -0.2),
 }
+# Several in a program, which takes as long to compile as one.
+GROUPS = {
+    "of the C library": lambda x: (
+        jnp.log1p(x * x)
+        + jnp.expm1(-x)
+        + jnp.cbrt(x)
+        + jnp.arcsinh(x)
+        + jnp.arccosh(1.0 + x * x)
+        + jnp.arctanh(0.9 * jnp.tanh(x))
+        + jax.scipy.special.erf(x)
+        + jnp.log2(1.0 + x * x)
+        + jnp.sinc(x)
+    ),
+    "slopes": lambda x: sum(
+        jax.grad(f)(x)
+        for f in (
+            jnp.tanh,
+            lambda v: jnp.arcsin(0.4 * v),
+            lambda v: jnp.arccos(0.4 * v),
+            lambda v: jnp.log1p(v * v),
+            jnp.expm1,
+            jnp.arcsinh,
+            lambda v: jnp.arctanh(0.4 * v),
+            lambda v: v * jax.lax.stop_gradient(v),
+            jax.nn.softplus,
+            lambda v: v % 0.7,
+        )
+    ),
+    "remainders": lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, -0.3) + jnp.remainder(x, -0.45),
+    "quotients of integers": lambda x: (
+        sum(
+            (how(jnp.floor(9 * x).astype(kind), jnp.asarray(by, kind))).astype(x.dtype)
+            for how in (jax.lax.div, jax.lax.rem, jnp.floor_divide, jnp.mod)
+            for kind in (jnp.int32, jnp.int64, jnp.uint32)
+            for by in ((3, 0) if kind == jnp.uint32 else (3, -2, -1, 0))
+        )
+        * 1e-9
+    ),
+    "powers of integers": lambda x: (
+        lambda n: n**3 + n**2 + jnp.square(n) + jnp.sign(n) + jnp.abs(n)
+    )(jnp.floor(3 * x).astype(jnp.int32)).astype(x.dtype),
+    "truth values": lambda x: jnp.where(
+        jnp.maximum(x > 0, x > 1), 1.0, jnp.where(jnp.minimum(x > -1, x < -0.5), 2.0, x)
+    ),
+}
+_M = np.array([[0.0, 1.0], [-1.0, -0.5]])
+_PAIRS = {
+    "M * v": lambda v: _M * v,
+    "M + v": lambda v: _M + v,
+    "M / v": lambda v: _M / (2.0 + v * v),
+    "max": lambda v: jnp.maximum(_M, v),
+    "v v'": lambda v: v[:, None] * v,
+    "outer": jnp.outer,
+    "keep": lambda v: v / (1.0 + jnp.sum(v**2, keepdims=True)),
+    "atan2": lambda v: jnp.arctan2(_M, v[None, :]),
+    "where": lambda v: jnp.where(_M > 0, v, v[:, None]),
+    "sums": lambda v: jnp.cumsum(v) + jax.lax.cumsum(v, reverse=True) + jax.lax.cummax(v),
+    "put": lambda v: jnp.zeros((2, 2)).at[1].set(v).at[0, 1].add(v[0]) + v.at[1].set(0.5),
+    "best": lambda v: jnp.argmax(v) + 0.5 * jnp.argmin(jnp.outer(v, v), axis=1),
+}
 
 
 @pytest.mark.parametrize("name", UNARY)
 def test_an_operation(name):
     def step(stays, u, x, k):
         return 0.3 * UNARY[name](stays[0] * x + u[k]) + stays[1]
+
+    agree(step)
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_operations_together(name):
+    def step(stays, u, x, k):
+        return 0.3 * jnp.tanh(GROUPS[name](stays[0] * x + u[k])) + stays[1]
+
+    agree(step)
+
+
+def test_axes_of_length_one_are_repeated():
+    def step(stays, u, x, k):
+        pair = jnp.stack([x, stays[0]])
+        arrays = [f(pair) if n != "outer" else f(pair, pair) for n, f in _PAIRS.items()]
+        # Of a record too, which is not taken apart.
+        late = (2.0 * u[:, None] + jnp.ones((1, 2)))[k]
+        return 0.1 * jnp.tanh(sum(jnp.sum(a) for a in arrays)) + 0.1 * jnp.sum(late)
+
+    # As users have JAX; the tests' own setting refuses such sums.
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        agree(step)
+
+
+@pytest.mark.parametrize("of", [lambda stays, u, k, x: u[k], lambda stays, u, k, x: x])
+def test_a_loop_without_end_in_a_branch_that_nobody_takes(of):
+    def step(stays, u, x, k):
+        def endless(v):
+            return jax.lax.while_loop(lambda c: c[1] < 1.0, lambda c: (c[0] + 1.0, c[1]), (v, 0.0))
+
+        return jax.lax.cond(
+            of(stays, u, k, x) > 90.0, lambda v: endless(v)[0], lambda v: 0.5 * v + u[k], x
+        )
 
     agree(step)
 
@@ -142,7 +236,11 @@ def test_what_is_not_a_number_stays_so():
             lambda s, u, x, k: jax.lax.while_loop(lambda y: y > 1e-3, lambda y: 0.5 * y, x),
             "another pass for each vehicle",
         ),
-        (lambda s, u, x, k: jax.scipy.special.erf(x), "erf"),
+        (lambda s, u, x, k: jax.scipy.special.erfinv(x), r"erf_inv \(at test_kernel.py:\d+\)"),
+        (
+            lambda s, u, x, k: jnp.searchsorted(u, x).astype(x.dtype),
+            r"SearchSorted \(at test_kernel.py:\d+",
+        ),
         (lambda s, u, x, k: u[(jnp.abs(x) * 2).astype(int)], "not the same for all"),
         (lambda s, u, x, k: jnp.sort(jnp.stack([x, s[0]]))[0], "sort"),
     ],

@@ -183,6 +183,29 @@ def test_records_fitted_together_are_as_each_by_itself(fitted):
             np.testing.assert_allclose(found.values[name][k::3], found.values[name][k], rtol=1e-6)
 
 
+def test_a_records_cost_is_its_own(fitted):
+    whole = record(BENCH, seed=5, n=150)
+    # Of the last one too few, of the one before as many as `fit` takes.
+    counts = (150, 40, 0, 8, 7)
+    records = [
+        dataclasses.replace(whole, outputs={"roll": np.where(np.arange(150) < c, y, np.nan)})
+        for c in counts
+        for y in [np.asarray(whole.outputs["roll"])]
+    ]
+    together, many = refit(fitted, records), refit(fitted, records * 6)
+    for k, r in enumerate(records):
+        alone = refit(fitted, [r])
+        for found in (together, many):
+            assert found.converged[k] == alone.converged[0]
+            np.testing.assert_allclose(found.cost[k], alone.cost[0], rtol=1e-6)
+            for name, value in alone.values.items():
+                np.testing.assert_allclose(found.values[name][k], value[0], rtol=1e-5)
+    np.testing.assert_array_equal(together.converged[[0, 1, 2, 4]], [True, True, False, False])
+    assert np.isnan(together.cost[[2, 4]]).all()
+    assert np.isnan(together.values["Ixx"][[2, 4]]).all()
+    np.testing.assert_array_equal(np.isfinite(together.cost), np.array(counts) >= 8)
+
+
 def test_records_unlike_the_fits_are_refused(fitted):
     good = record(BENCH, seed=5, n=150)
     cases = {
@@ -196,6 +219,33 @@ def test_records_unlike_the_fits_are_refused(fitted):
             refit(fitted, [good, flight])
     with pytest.raises(ValueError, match="one record at least"):
         refit(fitted, [])
+    with pytest.raises(TypeError, match=r"^refit, record 0: expected a Flight or a list of them"):
+        refit(fitted, [None])
+
+
+def test_a_device_that_is_none_is_refused_before_anything_is_fitted(fitted):
+    for wrong in ("gpu", 0):
+        said = re.escape(
+            f"device: expected a device of JAX, such as jax.devices('gpu')[0], got {wrong!r}"
+        )
+        with pytest.raises(TypeError, match=said):
+            bootstrap(fitted, 24, device=wrong)
+        with pytest.raises(TypeError, match=said):
+            refit(fitted, [None], device=wrong)
+    with pytest.raises(ValueError, match="expected at least 1 run, got 0"):
+        bootstrap(fitted, 0)
+
+
+def test_many_records_that_are_no_program_say_why(fitted, monkeypatch):
+    few = bootstrap(fitted, 2)
+    assert few.note == ""
+    monkeypatch.setattr(many_runs, "_MANY", 2)
+    monkeypatch.setattr(fused_runs, "_refused", lambda _: "a model of straw (at straw.py:3)")
+    said = "there is no translation of a model of straw (at straw.py:3)"
+    again = bootstrap(fitted, 2)
+    assert said in again.note
+    np.testing.assert_array_equal(again.values["Ixx"], few.values["Ixx"])
+    assert said in refit(fitted, [record(BENCH, seed=5, n=150)] * 2).note
 
 
 class Device:

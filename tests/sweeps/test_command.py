@@ -56,7 +56,7 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     out = tmp_path / "runs" / "one"
     assert cli.main(["sweep", str(write(content())), "--out", str(out)]) == 0
     shown = capsys.readouterr()
-    assert "6 elements of roll-on-stand: 6 ok" in shown.out
+    assert "6 elements of roll-on-stand: 6 ok; backend fused" in shown.out
     assert str(out / "sweep.zarr") in shown.out
     assert "6 of 6 elements" in shown.err
     assert {p.name for p in out.iterdir()} >= {"config.yaml", "sweep.zarr", "summary.json"}
@@ -64,7 +64,7 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(list((out / "figures").glob("*.png")))
-    assert "6 elements of roll-on-stand: 6 ok" in page
+    assert "6 elements of roll-on-stand: 6 ok; backend fused" in page
     # As every page: what made it, its files, and words for who does not see the figures.
     assert "How this was made" in page
     assert '<a href="config.yaml">' in page

@@ -1,6 +1,7 @@
 """Runs as one program against the same by XLA, sample by sample."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
 
     def field(params, state, inputs):
         slope = STAND.vector_field(params, state, inputs)
-        odd = jax.scipy.special.erf(slope.phi)
+        odd = jax.scipy.special.erfinv(0.1 * slope.phi)
         return naming.replace(slope, phi=odd)
 
     model = dataclasses.replace(STAND, vector_field=field, linear=False)
@@ -93,7 +94,27 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     wanted = job(model, bench30, record, paired({"Ixx": [0.03, 0.04]}), {"m": BOTH["rms"]})
     found = run_sweep(wanted, None, Options(say=said.append))
     assert found.attrs["split"]["backend"] == "xla"
-    assert any("there is no translation of the operation erf" in s for s in said)
+    said = next(s for s in said if "no translation" in s)
+    assert re.search(r"of the operation erf_inv \(at test_fused.py:\d+\)", said)
+
+
+def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkeypatch):
+    from heli_jax.fused.operations import OPERATIONS
+    from heli_jax.sweeps.run import Options, run_sweep
+    from heli_jax.sweeps.spec import job
+
+    def wrong(code, *values, **_):
+        return code.made("fmul contract i32 %nowhere, 1", values[0].dtype, False)
+
+    monkeypatch.setitem(OPERATIONS, "sub", wrong)
+    monkeypatch.setitem(OPERATIONS, "mul", wrong)
+    said = []
+    wanted = job(STAND, bench30, record, paired({"Ixx": [0.031, 0.042]}), {"own": BOTH["rms"]})
+    found = run_sweep(wanted, None, Options(say=said.append, lanes=1))
+    assert found.attrs["split"]["backend"] == "xla"
+    assert any("whose translation failed (RuntimeError: LLVM IR parsing error" in s for s in said)
+    with pytest.raises(ValueError, match=r"backend: this sweep cannot be fused: .*LLVM IR"):
+        run_sweep(wanted, None, Options(backend="fused", lanes=1))
 
 
 @pytest.mark.slow

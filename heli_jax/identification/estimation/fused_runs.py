@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.fused.code import UnsupportedError
+from heli_jax.fused.code import UnsupportedError, translating
 from heli_jax.fused.cuda_driver import CudaError, Gpu
 from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
@@ -264,6 +264,7 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
 
 
 @functools.lru_cache(maxsize=16)
+@translating()
 def _compiled(
     layout: Layout,
     structure: Any,
@@ -293,7 +294,7 @@ def _part(
     z = np.zeros(layout.size)
     run = traced(_making(layout, i, samples), shared, records, z, each)
     if (size := _size(run.run.step.jaxpr)) > _MOST:
-        raise UnsupportedError(f"{size} operations a sample")
+        raise UnsupportedError(f"a sample of {size} operations, more than {_MOST}")
     columns = _columns(layout, i)
     places = np.array([0, *(1 + j for part in columns for j in part)])
     if device is None or device.platform == "cpu":

@@ -16,7 +16,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     descend,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.measured_signals import measured_count
+from heli_jax.identification.estimation.measured_signals import measured_counts
 from heli_jax.identification.estimation.optimiser_step import BATCHED, constants_of
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.estimation.scaling import Scaling, scaling, trusted_columns
@@ -52,6 +52,7 @@ def optimise_many(
     hold: int | None = None,
     batch: int = 8,
     device: Any = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Optimum:
     """Optima (k, ...) for many starts or records near an optimum.
 
@@ -64,6 +65,7 @@ def optimise_many(
         batch: runs side by side, by vmap.
         device: a GPU of NVIDIA's, as JAX has it, for runs that are programs of machine code; the
             processor unless given.
+        say: called with a sentence where many runs are no programs of machine code.
 
     Raises:
         ValueError: the runs cannot be programs of a GPU, though one was given.
@@ -71,7 +73,7 @@ def optimise_many(
     layout, noise = reached.layout, reached.noise
     units = _units_at(reached)
     many = starts.shape[0] >= _MANY or device is not None
-    fused = _fused(reached, data, each, device) if many else None
+    fused = _fused(reached, data, each, device, say) if many else None
     if fused is not None:
         batch = _SIDE_BY_SIDE
     if hold is not None:
@@ -89,15 +91,39 @@ def optimise_many(
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)
 
-        count = measured_count(numbers) // batch
+        # Each record's own: of one another may lack most samples.
+        count = measured_counts(numbers)
         ends = descend(evaluate, constants, evaluate(z0), count, _MANY_STEPS, BATCHED).optimum
         optima.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
         stages.advance(min(batch, k - i))
     return jax.tree.map(lambda *v: np.concatenate(v), *optima)
 
 
+def check_device(device: Any) -> None:
+    """Refuse what `optimise_many` cannot take as a device, before anything is computed.
+
+    Raises:
+        TypeError: no device of JAX.
+        ValueError: one that is neither a processor nor a GPU of NVIDIA's.
+    """
+    if device is None:
+        return
+    if not (hasattr(device, "platform") and hasattr(device, "local_hardware_id")):
+        raise TypeError(
+            f"device: expected a device of JAX, such as jax.devices('gpu')[0], got {device!r}"
+        )
+    if device.platform not in ("cpu", "gpu", "cuda"):
+        raise ValueError(
+            f"device: expected a GPU of NVIDIA's or a processor, got {device.platform}"
+        )
+
+
 def _fused(
-    reached: Solution, data: Callable[[Any], Data], each: Any, device: Any
+    reached: Solution,
+    data: Callable[[Any], Data],
+    each: Any,
+    device: Any,
+    say: Callable[[str], None],
 ) -> FusedRuns | None:
     """The runs as programs of machine code; None where they cannot be."""
     layout, numbers, noise, _ = reached
@@ -113,6 +139,10 @@ def _fused(
     except UnsupportedError as e:
         if device is not None:
             raise ValueError(f"device: these runs are no program for a GPU: {e}") from e
+        say(
+            "each record is fitted by XLA step by step, not by one program of machine code: "
+            f"there is no translation of {e}"
+        )
         return None
 
 

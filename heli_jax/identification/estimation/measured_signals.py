@@ -36,11 +36,19 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
 
 def measured_count(data: Data) -> int:
     """How many measured numbers there are."""
+    return int(measured_counts(data))
+
+
+def measured_counts(data: Data) -> np.ndarray:
+    """The same of each record, where all of `data` has leading axes of records."""
     # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
-    return sum(
-        int(np.isfinite(np.asarray(y)).sum())
-        for flight in data.flights
-        for y in flight.outputs.values()
+    return np.sum(
+        [
+            np.isfinite(np.asarray(y)).sum(axis=-1)
+            for flight in data.flights
+            for y in flight.outputs.values()
+        ],
+        axis=0,
     )
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.estimation.many_runs import check_device, optimise_many
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of
@@ -24,6 +24,8 @@ class Bootstrap(NamedTuple):
     """runs that did not converge"""
     records: tuple[int, ...] = ()
     """the numbers of the records that these are of"""
+    note: str = ""
+    """why many records were not fitted by programs of machine code, where they were not"""
 
     def interval(self, name: str) -> tuple[float, float]:
         """2.5 and 97.5 % of the values."""
@@ -42,12 +44,16 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
         runs: how many records.
         seed: of noise and disturbance.
         device: a GPU of NVIDIA's, as `jax.devices()` has it, that computes the refits of output
-            error; the processor unless given.
+            error; the processor unless given, and where it is one of JAX's CPU devices.
 
     Raises:
-        ValueError: the fit has no program for a GPU, though one was given; the time shift is free,
-            or the data do not determine every parameter.
+        TypeError: a device that is none of JAX's.
+        ValueError: no run; the fit has no program for a GPU, though one was given; the time shift
+            is free, or the data do not determine every parameter.
     """
+    check_device(device)
+    if runs < 1:
+        raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
     at = fit.reached
     if at.layout.shift:
         raise ValueError("bootstrap: not available with a free time shift")
@@ -75,7 +81,8 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
     # Every refit from the optimum, which is where the record was simulated.
     starts = jnp.tile(at.z[None, :], (runs, 1))
     each = (outputs, jnp.asarray(means, at.z.dtype))
-    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device)
+    notes: list[str] = []
+    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device, say=notes.append)
     converged = np.asarray(optima.converged)
     # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
     # than they are uncertain.
@@ -84,7 +91,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
         for i, name in enumerate(at.layout.free)
     }
     fitted = tuple(int(i) for i in np.flatnonzero(converged))
-    return Bootstrap(estimates, runs - len(fitted), fitted)
+    return Bootstrap(estimates, runs - len(fitted), fitted, " ".join(notes))
 
 
 def _records(

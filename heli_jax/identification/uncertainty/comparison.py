@@ -74,6 +74,8 @@ def intervals(
         report(f"bootstrap, {runs} records")
         with stage("bootstrap", total=runs):
             booted = bootstrap(fit, runs, seed=seed)
+        if booted.note:
+            report(booted.note)
     if draws:
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):

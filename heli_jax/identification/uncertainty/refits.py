@@ -9,7 +9,8 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.estimation.many_runs import check_device, optimise_many
+from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Data, value_of
 
@@ -22,10 +23,14 @@ class Refits(NamedTuple):
     values: dict[str, np.ndarray]
     """by free parameter, (records,); NaN where a record did not converge"""
     converged: np.ndarray
-    """(records,)"""
+    """(records,); False too of a record that `fit` would refuse, since an output of it has fewer
+    than 8 measured samples: of nothing measured the start would be the optimum"""
     cost: np.ndarray
-    """(records,) sum of squares over the number of measurements, by the noise of the fit: 1 where a
-    record is as noisy, more where the model explains it less"""
+    """(records,) sum of squares over the record's number of measured samples, by the noise of the
+    fit: 1 where a record is as noisy, more where the model explains it less; NaN of a record with
+    too few"""
+    note: str = ""
+    """why many records were not fitted by programs of machine code, where they were not"""
 
 
 def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any = None) -> Refits:
@@ -40,18 +45,20 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any
         fit: with output error or filter error.
         records: each a Flight, or as many as the fit has.
         device: a GPU of NVIDIA's, as `jax.devices()` has it, for output error; the processor unless
-            given.
+            given, and where it is one of JAX's CPU devices.
 
     Raises:
+        TypeError: a device that is none of JAX's, or a record that is no flights.
         ValueError: a record is not like that of the fit, with what differs; a method that estimates
             the noise's spectrum; no program for a GPU, though one was given.
     """
+    check_device(device)
     at = fit.reached
     if at.layout.estimator.noise_spectrum:
         raise ValueError(f"refit: not available with method {fit.method}")
     if not records:
         raise ValueError("refit: expected one record at least, got none")
-    flights = [[r] if isinstance(r, Flight) else list(r) for r in records]
+    flights = [_flights(r, f"refit, record {k}") for k, r in enumerate(records)]
     for k, record in enumerate(flights):
         _check(at.data, at.layout.holds, record, f"refit, record {k}", at.layout.model)
     each = tuple(
@@ -76,14 +83,33 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any
         return at.data._replace(flights=changed)
 
     starts = jnp.tile(at.z[None, :], (len(flights), 1))
-    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device)
-    converged = np.asarray(optima.converged)
+    notes: list[str] = []
+    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device, say=notes.append)
+    enough = np.array([_enough(record) for record in flights])
+    converged = np.asarray(optima.converged) & enough
     z = jnp.asarray(optima.z)
     values = {
         name: np.where(converged, np.asarray(value_of(at.layout, at.data, i, z[:, i])), np.nan)
         for i, name in enumerate(at.layout.free)
     }
-    return Refits(values, converged, np.asarray(optima.cost))
+    cost = np.where(enough, np.asarray(optima.cost), np.nan)
+    return Refits(values, converged, cost, " ".join(notes))
+
+
+# Any: what a caller gave.
+def _flights(record: Any, where: str) -> list[Flight]:
+    flights = [record] if isinstance(record, Flight) else record
+    if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
+        raise TypeError(f"{where}: expected a Flight or a list of them, got {record!r:.80}")
+    return list(flights)
+
+
+def _enough(record: list[Flight]) -> bool:
+    """Whether of every output as many samples are measured as `fit` asks for."""
+    # Of the fit's outputs alone there are records, see `_check`.
+    return all(
+        np.isfinite(y).sum() >= FEWEST_SEEN for flight in record for y in flight.outputs.values()
+    )
 
 
 def _inputs(model: Any, flight: Flight) -> Any:
