@@ -26,6 +26,7 @@ from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
+from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -188,7 +189,9 @@ def assemble(
     if bool(best.converged):
         fast = as_good_as_aliases(fast, Valley(problem, solution, e))
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
-    twins = twins_of(problem, solution, e) if bool(best.converged) else ()
+    arrived = bool(best.converged)
+    twins = twins_of(problem, solution, e) if arrived else ()
+    second = second_solutions(problem, solution, e, told=twins) if arrived else ()
     errors = standard_errors(
         problem,
         solution,
@@ -197,6 +200,7 @@ def assemble(
         white=all_white,
         aliased=aliased,
         twins=twins,
+        second=second,
         optimum=bool(best.converged),
     )
     if bool(best.converged):

@@ -31,6 +31,7 @@ from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
@@ -134,7 +135,8 @@ def check(problem: Problem) -> Check:
     # determined there may differ from what is at the optimum, for which the fit asks again.
     at = Solution(*guess[:4])
     twins = twins_of(problem, at, guess.e, optimum=False)
-    around = Around(twins=twins, valley=Valley(problem, at, guess.e))
+    second = second_solutions(problem, at, guess.e, optimum=False, told=twins)
+    around = Around(twins=twins, second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))

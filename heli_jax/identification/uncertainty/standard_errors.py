@@ -18,7 +18,12 @@ from heli_jax.identification.identifiability.beyond_slopes import (
 )
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.valley import Valley
-from heli_jax.identification.identifiability.verdict import Z95, Combination, Verdict
+from heli_jax.identification.identifiability.verdict import (
+    Z95,
+    Combination,
+    SecondSolution,
+    Verdict,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.autocorrelated_residuals import (
     Sandwich,
@@ -55,6 +60,7 @@ def standard_errors(
     white: bool,
     aliased: Collection[str] = (),
     twins: tuple[tuple[str, str], ...] = (),
+    second: tuple[SecondSolution, ...] = (),
     optimum: bool = True,
 ) -> StandardErrors:
     """As the slopes have them, and where these leave wide intervals as the likelihood has them.
@@ -67,9 +73,10 @@ def standard_errors(
         white: whether the residuals are white and independent between outputs.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
         twins: the pairs of parameters whose values may be exchanged.
+        second: other values that fit as well.
         optimum: whether the point is one, about which the likelihood may be asked.
     """
-    around = Around(frozenset(aliased), twins, Valley(problem, at, e))
+    around = Around(frozenset(aliased), twins, second, Valley(problem, at, e))
     errors = _by_slopes(problem, at, e, before, around, white=white)
     if not optimum:
         return errors
