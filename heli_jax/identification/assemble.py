@@ -58,6 +58,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import (
+    WRONG_OPTIMUM,
     by_excitation,
     unless_unrelated,
 )
@@ -243,6 +244,7 @@ def assemble(
         lacking = unmodelled(solution, e, sds, coloured=in_colour)
         adequacy = with_unmodelled(adequacy, lacking)
     adequacy = adequacy.doubted(delay_doubts(problem, estimates))
+    stays = stays and WRONG_OPTIMUM not in adequacy.advice
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False
