@@ -253,13 +253,15 @@ def fit(
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
     points = _starts(guess, problem, starts, seed)
-    with stage(words):
+    # A model that is unstable where the search passes overflows, in time as in its powers; that is
+    # told by what is not finite, and no warning of NumPy's says it better.
+    with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
     doubts = record_doubts(problem)
     said = (*cautions(problem), *(f.sentence for f in doubts.findings))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
-    with stage("intervals and verdicts"):
+    with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
         return _with_turned_sticks(problem, guess, assemble(problem, search, optimum, run))
 
