@@ -5,7 +5,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy.linalg
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
 from heli_jax.naming import Scalar
@@ -43,11 +43,11 @@ NUISANCE = Nuisance(bias=False, initial_state=False)
 
 def flight(outputs=("p",), noise=0.05):
     """The record by SciPy."""
-    A, B = np.array([[-6.0, 40.0], [0.0, -20.0]]), np.array([[0.0], [20.0]])
-    F, G, *_ = scipy.signal.cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), DT)
+    M = np.array([[-6.0, 40.0, 0.0], [0.0, -20.0, 20.0], [0.0, 0.0, 0.0]])
+    E = np.asarray(scipy.linalg.expm(DT * M))
     X = np.zeros((N, 2))
     for k in range(N - 1):
-        X[k + 1] = F @ X[k] + G[:, 0] * U[k]
+        X[k + 1] = E[:2, :2] @ X[k] + E[:2, 2] * U[k]
     rng = np.random.default_rng(2)
     measured = {"p": X[:, 0], "s": X[:, 1]}
     sd = noise * np.std(X, axis=0)
