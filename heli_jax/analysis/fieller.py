@@ -18,6 +18,8 @@ from jaxtyping import Complex, Float
 from heli_jax.analysis.response_curves import octave_mean
 
 _Z95 = 1.959963984540054
+_STRONG = 0.25
+"""of c S_vv in the mean over an octave, up to which an instrument is strong enough: F of 7.7"""
 
 
 def sd_of_ratio(
@@ -59,5 +61,5 @@ def sd_of_ratio(
         share = explained / np.maximum(explained + own, 1e-300)
         around = np.stack([octave_mean(omega, v) for v in share.T], axis=1)
         # c S_vv again, with the octave's share of the input that instruments explain.
-        strong = direct | (c * explained * (1.0 - around) < around)
+        strong = direct | (c * explained * (1.0 - around) < _STRONG * around)
         return np.where((room > 0) & strong[:, None, :], reach / _Z95, np.nan)

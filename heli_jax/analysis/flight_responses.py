@@ -285,10 +285,11 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
         weak = np.all([np.isfinite(p.coherence) & ~np.isfinite(p.sd) for p in pairs], axis=0)
         if not weak.any():
             continue
-        hz = omega[weak] / (2.0 * np.pi)
+        hz, at = omega / (2.0 * np.pi), np.flatnonzero(weak)
+        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+        bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
         notes.append(
-            f"{name}: at {int(np.sum(weak))} of {omega.size} frequencies, {hz[0]:.3g} to "
-            f"{hz[-1]:.3g} Hz, the excitation hardly moves the input beside what feedback and "
+            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly moves the input beside what feedback and "
             "pilot make of it: no response is given there; a larger or longer excitation tells"
         )
     return notes
