@@ -289,8 +289,9 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
         runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
         bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
         notes.append(
-            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly moves the input beside what feedback and "
-            "pilot make of it: no response is given there; a larger or longer excitation tells"
+            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly "
+            "moves the input beside what feedback and pilot make of it: no response is given "
+            "there; a larger or longer excitation tells"
         )
     return notes
 
