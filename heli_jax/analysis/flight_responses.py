@@ -134,6 +134,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     if not outputs:
         raise ValueError("; ".join(notes[-3:]))
     notes += _moving_as_one(flights, inputs, outputs)
+    notes += _weak(omega, instruments, outputs)
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
     fits = _fits(settings, outputs, windows, holds)
     return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
@@ -274,6 +275,25 @@ def _moving_as_one(
         f"{' and '.join(those)} move as one: no response tells what each of them does; move them "
         "apart, or leave one of them out"
     ]
+
+
+def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]) -> list[str]:
+    """Where an instrument hardly moves its input, so that nothing is known of the responses."""
+    notes = []
+    for name in instruments:
+        pairs = [output.pairs[name] for output in outputs.values()]
+        weak = np.all([np.isfinite(p.coherence) & ~np.isfinite(p.sd) for p in pairs], axis=0)
+        if not weak.any():
+            continue
+        hz, at = omega / (2.0 * np.pi), np.flatnonzero(weak)
+        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+        bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
+        notes.append(
+            f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly "
+            "moves the input beside what feedback and pilot make of it: no response is given "
+            "there; a larger or longer excitation tells"
+        )
+    return notes
 
 
 def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> dict[str, Output]:

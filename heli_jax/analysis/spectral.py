@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from heli_jax.analysis.fieller import sd_of_ratio
+
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
 _FINE = 64
@@ -209,7 +211,8 @@ def responses(
 ) -> Responses:
     """Responses of each output to each input, the others taken into account.
 
-    Where inputs move as one (or one does not move) no response is determined: it is NaN there.
+    Where inputs move as one (or one does not move) no response is determined: it is NaN there, and
+    where an instrument is too weak beside what else moves its input (`fieller`).
 
     Args:
         spectra: of the signals.
@@ -244,6 +247,9 @@ def responses(
         multiple = np.clip(1.0 - left / power, 0.0, 1.0)
     # Each input takes one of the averages for its own response.
     sd = np.sqrt(0.5 * error / (n - m)[:, :, None])
+    if instruments is not None:
+        sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m))
+        H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
     return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
 

@@ -8,8 +8,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.log import ChannelLog
@@ -109,9 +107,7 @@ class Request:
         time = [] if self.time is None else [self.time.name]
         return list(dict.fromkeys([*time, *(s.name for s in self.signals.values())]))
 
-    def of_kind(
-        self, kind: str, samples: Mapping[tuple[str, str], np.ndarray]
-    ) -> dict[str, np.ndarray]:
+    def of_kind[V](self, kind: str, samples: Mapping[tuple[str, str], V]) -> dict[str, V]:
         """The samples of all inputs or of all outputs by the model's name, in the user's order."""
         return {key: samples[key, each] for key, each in self.signals if each == kind}
 

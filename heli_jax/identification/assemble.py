@@ -27,6 +27,7 @@ from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
 from heli_jax.identification.identifiability.as_likely import unless_as_likely
+from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -58,6 +59,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import (
+    WRONG_OPTIMUM,
     by_excitation,
     unless_unrelated,
 )
@@ -190,7 +192,9 @@ def assemble(
     if bool(best.converged):
         fast = as_good_as_aliases(fast, Valley(problem, solution, e))
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
-    twins = twins_of(problem, solution, e) if bool(best.converged) else ()
+    arrived = bool(best.converged)
+    twins = twins_of(problem, solution, e) if arrived else ()
+    second = second_solutions(problem, solution, e, told=twins) if arrived else ()
     errors = standard_errors(
         problem,
         solution,
@@ -199,6 +203,7 @@ def assemble(
         white=all(w.white for w in white.values()) if e.innovations else all_white,
         aliased=aliased,
         twins=twins,
+        second=second,
         optimum=bool(best.converged),
     )
     if bool(best.converged):
@@ -245,6 +250,7 @@ def assemble(
         late = late_stick(problem, solution, e, named)
         adequacy = with_late_stick(adequacy, late)
     adequacy = adequacy.doubted(delay_doubts(problem, estimates))
+    stays = stays and WRONG_OPTIMUM not in adequacy.advice
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False

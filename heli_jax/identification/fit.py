@@ -32,6 +32,7 @@ from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
@@ -137,7 +138,8 @@ def check(problem: Problem) -> Check:
     # determined there may differ from what is at the optimum, for which the fit asks again.
     at = Solution(*guess[:4])
     twins = twins_of(problem, at, guess.e, optimum=False)
-    around = Around(twins=twins, valley=Valley(problem, at, guess.e))
+    second = second_solutions(problem, at, guess.e, optimum=False, told=twins)
+    around = Around(twins=twins, second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
@@ -259,13 +261,15 @@ def fit(
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
     points = _starts(guess, problem, starts, seed)
-    with stage(words):
+    # A model that is unstable where the search passes overflows, in time as in its powers; that is
+    # told by what is not finite, and no warning of NumPy's says it better.
+    with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
     doubts = record_doubts(problem)
     said = (*cautions(problem), *(f.sentence for f in doubts.findings))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
-    with stage("intervals and verdicts"):
+    with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
         return _with_turned_sticks(problem, guess, assemble(problem, search, optimum, run))
 

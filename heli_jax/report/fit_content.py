@@ -232,6 +232,7 @@ def verdict(verdict: Verdict) -> dict[str, Any]:
         "resting_on_priors": list(verdict.resting),
         "exchangeable_nuisances": list(verdict.exchangeable),
         "exchangeable_parameters": [list(pair) for pair in verdict.twins],
+        "other_solutions": [other.values for other in verdict.second],
         "names": list(verdict.names),
         "correlation": verdict.correlation,
         "covariance_log": verdict.covariance,

@@ -359,3 +359,24 @@ def test_a_shift_of_the_inputs_is_a_phase():
     shift = found.nuisance["time_shift"]
     assert shift.lower95 < 3 * flight.dt < shift.upper95
     assert jnp.isfinite(shift.sd)
+
+
+def test_errors_that_overflow_have_no_spectrum(tmp_path):
+    """Where they do the relaxation ends, with a level that is no number, and warns of nothing."""
+    path = tmp_path / "falling.yaml"
+    path.write_text(FALLING)
+    model, rng = linear_model(path), np.random.default_rng(0)
+    flight = Flight(
+        dt=DT,
+        inputs={"lat": rng.standard_normal(300)},
+        outputs={n: rng.standard_normal(300) for n in ("p", "phi")},
+    )
+    free = {"Lp": Free(1e6), "Llat": Free(1e200)}
+    problem = Problem(model.model, model.vehicle().params, [flight], free, method="frequency-error")
+    layout = layout_of(problem, problem.training)
+    data = data_of(problem, problem.training, layout)
+    noise, z = first_noise(problem, problem.training), start_vector(layout, data, problem)
+    same, relaxed = layout.estimator.relax(layout, data, None, noise, z)
+    assert same is z
+    assert np.isnan(relaxed.log_variance_ratio)
+    assert relaxed.whitening is noise.whitening

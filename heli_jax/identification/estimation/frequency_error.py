@@ -182,7 +182,15 @@ class FrequencyError(Estimator):
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
-        whitening = whitening_by(machine_of(layout, data, z), errors)
+        # Powers of errors that overflow have no spectrum.
+        with np.errstate(all="ignore"):
+            try:
+                whitening = whitening_by(machine_of(layout, data, z), errors)
+                sound = all(np.isfinite(W).all() for W in whitening)
+            except np.linalg.LinAlgError:
+                sound = False
+        if not sound:
+            return z, noise._replace(log_variance_ratio=np.asarray(np.nan))
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = in_time(layout, data, noise, z)
         # Records of one length have one spectrum.

@@ -112,8 +112,9 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
             for n in before
         )
         change += slopes_changed(noise, new) + float(own_changed(noise, new))
-        # Residuals that overflowed show no noise.
+        # Residuals that overflowed show no noise, and where they do is no optimum.
         if not np.isfinite(change):
+            best = best._replace(converged=np.asarray(False))
             break
         moves = estimator.noise_matters(search.problem, layout, noise, new)
         # The noise first and the parameters after it: the parameters of one round are the best for

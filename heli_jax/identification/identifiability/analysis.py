@@ -34,7 +34,14 @@ from heli_jax.identification.identifiability.sentences import (
     Weakest,
     sentences,
 )
-from heli_jax.identification.identifiability.verdict import ROUGHLY, Z95, Pair, Unknown, Verdict
+from heli_jax.identification.identifiability.verdict import (
+    ROUGHLY,
+    Z95,
+    Pair,
+    SecondSolution,
+    Unknown,
+    Verdict,
+)
 from heli_jax.identification.identifiability.wide_intervals import (
     TAKES_NO_PART,
     factor,
@@ -152,18 +159,20 @@ class _Analysis(NamedTuple):
     """what priors determine, and the data alone do not"""
     exchange: Exchange
     twins: tuple[tuple[str, str], ...]
+    second: tuple[SecondSolution, ...]
     limits: Mapping[str, tuple[float, float]]
     """by name the ends of an interval that is not the slopes'"""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Also those that take a small part in a direction that is not determined, and those whose
-        values may be exchanged."""
+        """Also those that take a small part in a direction that is not determined, those whose
+        values may be exchanged, and those that have others as good."""
         return tuple(
             u.name
             for i, u in enumerate(self.unknowns)
             if any(abs(v[i]) > TAKES_NO_PART for v in self.determined.null)
             or any(u.name in pair for pair in self.twins)
+            or any(u.name in other.changed for other in self.second)
         )
 
     @property
@@ -219,6 +228,7 @@ def analyse(
         resting,
         exchange,
         elsewhere.twins,
+        elsewhere.second,
         elsewhere.limits,
     )
     return _verdict(analysis, remedies or {})
@@ -245,11 +255,12 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         roughly,
         through_zero,
         a.twins,
+        a.second,
     )
     directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
         names=names,
-        identifiable=not known.null and not a.twins,
+        identifiable=not (known.null or a.twins or a.second),
         rank=known.rank,
         rank_without_priors=a.data.rank,
         condition=a.condition,
@@ -274,6 +285,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
             )
         ),
         twins=a.twins,
+        second=a.second,
     )
 
 
@@ -387,7 +399,7 @@ def _pairs(
 def _weakest(a: _Analysis) -> Weakest | None:
     """The least determined direction, and what is determined far better; None where there is more
     to say than that."""
-    if a.determined.null or a.data.null or a.twins or not a.condition > ILL_CONDITIONED:
+    if a.determined.null or a.data.null or a.twins or a.second or not a.condition > ILL_CONDITIONED:
         return None
     covariance = a.determined.covariance
     _, vectors = np.linalg.eigh(covariance)

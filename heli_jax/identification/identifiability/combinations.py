@@ -8,7 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.identifiability.verdict import Z95, Combination, Unknown
+from heli_jax.identification.identifiability.verdict import (
+    Z95,
+    Combination,
+    SecondSolution,
+    Unknown,
+)
 
 TAKES_PART = 0.1
 """of a unit direction: less is not worth naming"""
@@ -193,6 +198,8 @@ class Elsewhere(NamedTuple):
 
     twins: tuple[tuple[str, str], ...] = ()
     """pairs of parameters whose values may be exchanged"""
+    second: tuple[SecondSolution, ...] = ()
+    """other values that fit as well"""
     tied: Tied = combinations
     null: tuple[np.ndarray, ...] = ()
     """directions (q,) in relative coordinates that are open at another point as likely"""

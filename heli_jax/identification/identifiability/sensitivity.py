@@ -12,7 +12,12 @@ from heli_jax.identification.identifiability.analysis import NULL, analyse
 from heli_jax.identification.identifiability.combinations import Elsewhere, Tied, combinations
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.valley import Valley
-from heli_jax.identification.identifiability.verdict import Combination, Unknown, Verdict
+from heli_jax.identification.identifiability.verdict import (
+    Combination,
+    SecondSolution,
+    Unknown,
+    Verdict,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
@@ -224,6 +229,8 @@ class Around(NamedTuple):
     """the parameters that move a mode which the samples do not tell from its aliases"""
     twins: tuple[tuple[str, str], ...] = ()
     """pairs of parameters whose values may be exchanged"""
+    second: tuple[SecondSolution, ...] = ()
+    """other values that fit as well"""
     valley: Valley | None = None
     """tells which combinations are the same far from the point; else its slopes are believed"""
     null: tuple[np.ndarray, ...] = ()
@@ -298,5 +305,7 @@ def verdict_of(
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
     remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
-    elsewhere = Elsewhere(around.twins, around.tied, around.null, around.one_sided, around.limits)
+    elsewhere = Elsewhere(
+        around.twins, around.second, around.tied, around.null, around.one_sided, around.limits
+    )
     return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)

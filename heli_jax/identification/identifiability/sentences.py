@@ -4,7 +4,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
+from heli_jax.identification.identifiability.verdict import (
+    Combination,
+    Pair,
+    SecondSolution,
+    Unknown,
+)
 
 # Index is the number; from nine on all are called nine.
 _NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
@@ -63,17 +68,21 @@ class Facts(NamedTuple):
     """parameters of either sign whose 95 % interval holds zero"""
     twins: tuple[tuple[str, str], ...] = ()
     """pairs whose values may be exchanged"""
+    second: tuple[SecondSolution, ...] = ()
+    """other values that fit as well"""
 
 
 def sentences(facts: Facts) -> tuple[str, ...]:
     """What the data determine, what they do not, and what can be done, most important first."""
     lines = [_without_effect(name) for name in facts.without_effect]
     lines += [_exchanged(pair, facts) for pair in facts.twins]
+    lines += _also_fits(facts)
     lines += [_not_determined(group, facts) for group in facts.groups]
     # Each parameter is spoken of once, in the sentence that says most: what comes later leaves out
     # what an earlier one has named.
     in_groups = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
     in_groups |= {n for pair in facts.twins for n in pair}
+    in_groups |= {n for other in facts.second for n in other.changed}
     partners = [n for n in facts.undetermined if n not in in_groups]
     not_determined = in_groups | set(partners)
     if partners:
@@ -204,6 +213,26 @@ def _exchanged(pair: tuple[str, str], facts: Facts) -> str:
         f"not tell which is which: fix one of {', '.join(pair)}, give it a prior, or bound them "
         "apart."
     )
+
+
+def _also_fits(facts: Facts) -> list[str]:
+    """One sentence for each set of parameters that have several values."""
+    here = {u.name: u.value for u in facts.unknowns}
+    by_names: dict[tuple[str, ...], list[SecondSolution]] = {}
+    for other in facts.second:
+        by_names.setdefault(other.changed, []).append(other)
+    lines = []
+    for names, others in by_names.items():
+        sets = [here, *(other.values for other in others)]
+        sets = [", ".join(f"{n} {values[n]:.4g}" for n in names) for values in sets]
+        lines.append(
+            f"{listed(names)} {'have' if len(names) > 1 else 'has'} "
+            f"{_NUMBERS[min(len(sets), len(_NUMBERS) - 1)]} solutions that answer alike, two modes "
+            f"exchanged: {'; or '.join(sets)}. The data do not tell which: "
+            f"fix one of {', '.join(names)}, give it a prior, or bound it to one side; a lag such "
+            "as a servo's can be measured by itself."
+        )
+    return lines
 
 
 def _at_bound(u: Unknown) -> str:

@@ -22,7 +22,7 @@ _FREQUENCIES = 9
 """at which responses are compared, from the record's length to the samples'"""
 _ALIKE = 1e-3
 """relative difference of responses, up to a gain, that is none"""
-_APART = 9.0
+APART = 9.0
 """squares that the slopes let expect of the exchange: below, the two values are the same"""
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -42,7 +42,7 @@ def twins_of(
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     pairs = _candidates(problem, values)
     # The slopes first: they cost nothing, and leave those out whose values are nearly the same.
-    pairs = [pair for pair in pairs if _expected(at, e, pair) > _APART]
+    pairs = [pair for pair in pairs if _expected(at, e, pair) > APART]
     if not pairs or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return ()
     pairs = _alike(problem, values, pairs)
@@ -91,11 +91,11 @@ def _alike(
         2.0 * np.pi / (flight.n_samples * flight.dt), np.pi / flight.dt, _FREQUENCIES
     )
     rows = [naming.names(problem.model.Outputs).index(n) for n in flight.outputs]
-    one = _responses(problem, params, about, omega)[:, rows]
+    one = responses_of(problem, params, about, omega)[:, rows]
     same = []
     for a, b in pairs:
         changed = naming.replace(params, **{a: free[b], b: free[a]})
-        other = _responses(problem, changed, about, omega)[:, rows]
+        other = responses_of(problem, changed, about, omega)[:, rows]
         power = np.sum(np.abs(one) ** 2, axis=0)
         gains = np.real(np.sum(np.conj(one) * other, axis=0)) / np.maximum(power, 1e-300)
         difference = np.linalg.norm(other - gains * one, axis=0)
@@ -104,7 +104,7 @@ def _alike(
     return same
 
 
-def _responses(
+def responses_of(
     problem: Problem, params: Any, about: OperatingPoint, omega: np.ndarray
 ) -> np.ndarray:
     """(k, p, m) of the linearised model, with the delays of its inputs."""

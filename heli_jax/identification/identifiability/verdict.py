@@ -74,6 +74,15 @@ class Pair(NamedTuple):
     correlation: float
 
 
+class SecondSolution(NamedTuple):
+    """Other values of the free parameters that fit as well."""
+
+    values: dict[str, float]
+    """of all that are free, SI"""
+    changed: tuple[str, ...]
+    """those whose value is another"""
+
+
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """What the data (with the priors) determine."""
@@ -111,6 +120,8 @@ class Verdict:
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
     twins: tuple[tuple[str, str], ...] = ()
     """pairs of parameters whose values may be exchanged: the data do not tell which is which"""
+    second: tuple[SecondSolution, ...] = ()
+    """other values that the data do not tell from these"""
 
     @property
     def text(self) -> str:

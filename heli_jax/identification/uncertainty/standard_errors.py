@@ -24,7 +24,12 @@ from heli_jax.identification.identifiability.through_inputs import (
     through_inputs,
 )
 from heli_jax.identification.identifiability.valley import Valley
-from heli_jax.identification.identifiability.verdict import Z95, Combination, Verdict
+from heli_jax.identification.identifiability.verdict import (
+    Z95,
+    Combination,
+    SecondSolution,
+    Verdict,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.autocorrelated_residuals import (
     Sandwich,
@@ -66,6 +71,7 @@ def standard_errors(
     white: bool,
     aliased: Collection[str] = (),
     twins: tuple[tuple[str, str], ...] = (),
+    second: tuple[SecondSolution, ...] = (),
     optimum: bool = True,
 ) -> StandardErrors:
     """As the slopes have them, and where these leave wide intervals as the likelihood has them.
@@ -79,9 +85,10 @@ def standard_errors(
             process noise whether the innovations are.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
         twins: the pairs of parameters whose values may be exchanged.
+        second: other values that fit as well.
         optimum: whether the point is one, about which the likelihood may be asked.
     """
-    around = Around(frozenset(aliased), twins, Valley(problem, at, e))
+    around = Around(frozenset(aliased), twins, second, Valley(problem, at, e))
     inputs = through_inputs(at, e) if optimum else None
     if inputs is not None:
         return _with_process_noise(problem, at, e, inputs, around, white=white)

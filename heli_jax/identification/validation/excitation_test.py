@@ -26,6 +26,11 @@ from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
 
+WRONG_OPTIMUM = (
+    "An unstable model whose residual follows the inputs is a wrong optimum, or feedback made it: "
+    "start with other signs or from several points (fit.starts); where somebody held the machine, "
+    "log the excitation (signals.instruments)."
+)
 LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
@@ -67,13 +72,22 @@ def by_excitation(
         return None
     failed = {n: f for n, f in followed.items() if f.p_value < LEVEL / len(followed)}
     bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
-    what = "the excitation" if at.data.flights[0].by_instrument is not None else "the inputs"
+    direct = at.data.flights[0].by_instrument is None
+    what = "the inputs" if direct else "the excitation"
     numbers = ", ".join(f"{n} ({_in_words(f)})" for n, f in failed.items())
     said = (
         f"The residual still follows {what} in {numbers}: the model, or its estimates, are wrong "
         "there, and no interval allows for that."
     )
     remarks = _diverged(agreement)
+    if failed and remarks and direct and not bad:
+        # An unstable model fits at its frequencies whatever the ends of the record let it: that its
+        # simulation leaves the record is excused only where nothing else speaks against it.
+        doubt = (
+            f"the residual of {' and '.join(failed)} follows {what}, and simulated the model "
+            "leaves the record"
+        )
+        return Adequacy(False, False, (), (said,), (WRONG_OPTIMUM,), remarks, doubts=(doubt,))
     if bad:
         doubt = f"the residual of {' and '.join(bad)} follows {what}"
         worse = any(not followed[n].explained >= 0.0 for n in bad)

@@ -1,0 +1,43 @@
+"""Errors of responses by instrument, by chance: each frequency is a draw of its own."""
+
+import numpy as np
+import pytest
+
+from heli_jax.analysis.spectral import CrossSpectra, responses
+
+RESPONSE, WINDOWS, DRAWS = 2.0 - 1.0j, 20, 4000
+
+
+def drawn(strength, seed=0):
+    """Responses of `DRAWS` frequencies, the input `strength` times the excitation and as much of
+    feedback's as it is itself."""
+    rng = np.random.default_rng(seed)
+
+    def normal():
+        return rng.standard_normal((WINDOWS, DRAWS)) + 1j * rng.standard_normal((WINDOWS, DRAWS))
+
+    z, e = normal(), normal()
+    u = strength * z + 0.8 * e + 0.6 * normal()
+    signals = np.stack([u, RESPONSE * u + e, z])
+    S = np.einsum("awk,bwk->kab", np.conj(signals), signals) / WINDOWS
+    spectra = CrossSpectra(np.arange(1.0, DRAWS + 1.0), S, float(WINDOWS), 1.0)
+    return responses(spectra, [0], [1], instruments=[2])
+
+
+@pytest.mark.parametrize("strength", [0.2, 0.8, 1.0, 10.0])
+def test_intervals_hold_however_weak_the_excitation_is(strength):
+    found = drawn(strength)
+    H, sd = found.H[:, 0, 0], found.sd[:, 0, 0]
+    given = np.isfinite(sd)
+    # Where nothing is known no response is given, and none is counted among the misses.
+    inside = np.abs(np.real(H - RESPONSE)) < 1.96 * sd
+    outside = np.mean(given & ~inside)
+    assert outside < 0.06
+    assert np.array_equal(given, np.isfinite(H))
+    share = {0.2: (0.0, 0.0), 0.8: (0.9, 1.0), 1.0: (0.99, 1.0), 10.0: (1.0, 1.0)}[strength]
+    assert share[0] <= np.mean(given) <= share[1]
+
+
+def test_a_strong_one_has_the_errors_of_a_mean():
+    found = drawn(30.0)
+    assert np.std(np.real(found.H[:, 0, 0])) == pytest.approx(np.median(found.sd), rel=0.1)
