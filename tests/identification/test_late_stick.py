@@ -5,11 +5,13 @@ Records are made by SciPy at 1 kHz and logged at 50 Hz.
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.flights.holds import decide
 from heli_jax.identification.validation.own_samples import own_samples
 
@@ -43,7 +45,7 @@ roll = Model(
 )  # fmt: skip
 
 
-def problem(grid, *, shift=False, start=(-6.0, 20.0)):
+def problem(grid, *, shift=False, start=(-6.0, 20.0), filtered=False):
     """Steps at multiples of `grid` [ms], the stick read at the logger's samples."""
     rng = np.random.default_rng(5)
     u, k = np.zeros(N), 0
@@ -61,10 +63,15 @@ def problem(grid, *, shift=False, start=(-6.0, 20.0)):
         hold={"lat": taken.hold}, hold_reason={"lat": taken.reason},
     )  # fmt: skip
     free = {"Lp": Free(start[0]), "Ll": Free(start[1])}
-    return Problem(
-        roll, Params(*start), [flight], free, method="output-error",
-        nuisance=Nuisance(time_shift=shift),
-    )  # fmt: skip
+    if not filtered:
+        return Problem(
+            roll, Params(*start), [flight], free, method="output-error",
+            nuisance=Nuisance(time_shift=shift),
+        )  # fmt: skip
+    model = with_disturbance(roll, "p")
+    gust = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
+    known = model.Params(*map(jnp.asarray, start), **gust)
+    return Problem(model, known, [flight], free, method="filter-error")
 
 
 def test_a_stick_that_is_late_is_no_plain_yes():
@@ -95,6 +102,17 @@ def test_a_stick_whose_steps_fall_on_samples_is_not():
     assert found.adequacy.summary == "yes"
     assert found.interval == "95 % interval"
     assert found.estimates["Lp"].value == pytest.approx(-12.0, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grid", [1, EVERY])
+def test_a_filter_says_it_too(grid):
+    late = fit(problem(grid, filtered=True)).late_stick
+    if grid == EVERY:
+        assert late is None
+    else:
+        assert late is not None
+        assert 0.004 < late.seconds < 0.016
 
 
 def test_check_says_what_half_a_sample_of_the_stick_does():

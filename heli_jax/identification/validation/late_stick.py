@@ -201,7 +201,7 @@ def _by_shift(
     """The inputs that move, and the derivative (n,) of the rows by how much later they come [1/s];
     None where a shift is free, or makes no sense."""
     layout, flights = at.layout, problem.training
-    if is_kinematic(layout.model) or layout.shift or not layout.estimator.rows_are_samples:
+    if is_kinematic(layout.model) or layout.shift or layout.estimator.noise_spectrum:
         return None
     moving = tuple(
         n
