@@ -21,6 +21,8 @@ from heli_jax.flights.table import Table, shown
 
 _SHARED = 0.1
 """of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
+_SHORTEST = 1e-6
+"""[s] between rows, below which they are no clock's"""
 _FEWEST = 8
 """rows of a topic"""
 _NAMED = 2
@@ -114,7 +116,7 @@ def joined_log(
         topics = topics_of(seconds, signals, table.units, request.time.name)
         notes = (*table.notes, joined_note(topics))
     else:
-        carried = _carried(request, seconds, signals, rounding_of(stamps) * scale)
+        carried = _carried(request, stamps, signals, scale)
         if not carried:
             return None
         topics = topics_of(seconds, {**signals, **carried}, table.units, request.time.name)
@@ -126,7 +128,7 @@ def joined_log(
 
 
 def _carried(
-    request: Request, seconds: np.ndarray, signals: Mapping[str, np.ndarray], rounding: float
+    request: Request, stamps: np.ndarray, signals: Mapping[str, np.ndarray], scale: float
 ) -> dict[str, np.ndarray]:
     """The outputs (N,) of a join that was filled forward, at the rows with a new value alone; none
     where the rows are one clock's, or are wanted as they are."""
@@ -134,9 +136,14 @@ def _carried(
     inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
     asked = [n for n, repeats in stated.items() if repeats != "keep" and n not in inputs]
     # Without a rate the rows are the grid, and a repeated value is a missing sample of it.
-    if request.options.rate is None or seconds.size < _FEWEST or np.any(np.diff(seconds) <= 0):
+    if request.options.rate is None or stamps.size < _FEWEST:
         return {}
-    if not isinstance(uniform_grid(seconds - seconds[0], rounding), Uneven):
+    seconds = stamps * scale
+    steps = np.diff(seconds)
+    # What is no clock is refused where a table is read.
+    if np.any(steps <= 0) or np.median(steps) < _SHORTEST:
+        return {}
+    if not isinstance(uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale), Uneven):
         return {}
     return {n: first_of_each(signals[n]) for n in asked if carried_on(seconds, signals[n])}
 

@@ -115,7 +115,8 @@ def test_runs_side_by_side_have_files_configurations_and_bode_diagrams(tmp_path)
     rng = np.random.default_rng(0)
     u, held = rng.standard_normal(4000), part("flight 1", 7.0, 4000)
     for name, gain in (("a", 1.0), ("b", 2.0)):
-        folder = write_run(tmp_path / name, {"Ixx": (2.0e-5, 1e-6)})
+        one_log = [{"flight": "flight 1", "hold_out": False, "sha256": "a"}]
+        folder = write_run(tmp_path / name, {"Ixx": (2.0e-5, 1e-6)}, data=one_log)
         (folder / "config.yaml").write_text(f"model: <{name}>\n")
         y = np.convolve(u, [0.5, 0.3, 0.2])[:4000]
         run = held._replace(inputs={"lat": u}, measured={"p": y}, simulated={"p": gain * y})
@@ -130,7 +131,7 @@ def test_runs_side_by_side_have_files_configurations_and_bode_diagrams(tmp_path)
     html = page.read_text()
     assert '<a href="../a/fit.json">fit.json</a>' in html
     assert "model: &lt;b&gt;" in html
-    assert "Not drawn: c (no p in a flight named flight 1)." in html
+    assert "Not drawn: c (no p of that log in a flight named flight 1, or no result)." in html
     assert "lat to p, flight 1" in html
     assert "2.00·10⁻⁵ ± 0.10·10⁻⁵" in html
     assert "kg m²" in html
