@@ -1,9 +1,10 @@
-"""Numbers as text: no more digits than their standard deviation allows."""
+"""Numbers and verdicts as text: no more digits than a standard deviation allows."""
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
+from typing import Any
 
 NOTHING = "–"
 WORST = -10.0
@@ -180,3 +181,13 @@ def _signed(text: str) -> str:
     if text.startswith("-"):
         return text[1:] if not text.strip("-0.") else f"−{text[1:]}"
     return text
+
+
+def adequacy_of(content: Mapping[str, Any]) -> str:
+    """The verdict on adequacy in words; by yes and no alone of fits of earlier versions.
+
+    Args:
+        content: of fit.json.
+    """
+    summary = (content.get("adequacy") or {}).get("summary")
+    return str(summary or {True: "yes", False: "no", None: "not judged"}[content["adequate"]])

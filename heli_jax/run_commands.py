@@ -9,7 +9,7 @@ from typing import Any
 
 from heli_jax import run_directory
 from heli_jax.errors import InputError
-from heli_jax.summaries import adequacy_of
+from heli_jax.numbers import adequacy_of
 from heli_jax.terminal_table import print_table
 
 _DEEPEST = 3

@@ -210,13 +210,3 @@ def _range(values: np.ndarray) -> tuple[str, str]:
 
 def _quoted(name: str) -> str:
     return f" {name!r}" if name else ""
-
-
-def adequacy_of(content: Mapping[str, Any]) -> str:
-    """The verdict on adequacy in words; by yes and no alone of fits of earlier versions.
-
-    Args:
-        content: of fit.json.
-    """
-    summary = (content.get("adequacy") or {}).get("summary")
-    return str(summary or {True: "yes", False: "no", None: "not judged"}[content["adequate"]])

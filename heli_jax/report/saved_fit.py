@@ -12,8 +12,9 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import adequacy_of
 from heli_jax.regular_file import read_regular
-from heli_jax.summaries import Summary, adequacy_of, as_html, as_text, of_estimates
+from heli_jax.summaries import Summary, as_html, as_text, of_estimates
 
 if TYPE_CHECKING:
     import pandas as pd
