@@ -5,16 +5,23 @@ A table is known by its rows: lines of as many cells, most of them numbers, righ
 as many names, or a line of units between them.
 """
 
-import csv
 import dataclasses
 import itertools
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from heli_jax.errors import InputError
-from heli_jax.flights.csv_cells import MISSING, is_number, row_of_units
-from heli_jax.flights.csv_dates import is_date, is_day
+from heli_jax.flights.csv_cells import is_number, row_of_units
+from heli_jax.flights.csv_dates import is_date
+from heli_jax.flights.csv_lines import (
+    Head,
+    are_units,
+    cells_of,
+    is_for_comments,
+    is_row,
+    names_fit,
+)
+from heli_jax.flights.csv_nameless import FEWEST, nameless_head
 from heli_jax.flights.csv_text import (
     DELIMITERS,
     LONGEST_HEADER,
@@ -30,14 +37,10 @@ from heli_jax.flights.table import shown, wrong
 _LOOKED_AT = 1 << 20
 _MOST_LINES = 20_000
 """bytes and lines in which a table is sought"""
-_FEWEST = 3
-"""rows that make a table"""
 _NEAR = 6
 """lines from a header on, one of which is a row of the table"""
 _FIRST = 100
 """rows by which it is told how wide a table is"""
-_NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
-"""with any decimal sign, and with marks between thousands"""
 _TYPE = re.compile(r"\s*(?:u?int|long|float|double|single|real|string|bool|boolean)\d*\s*", re.I)
 _SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 _RULE = re.compile(r"([*=#~_-])\1+.*\1\1")
@@ -45,28 +48,6 @@ _RULE = re.compile(r"([*=#~_-])\1+.*\1\1")
 _UNIT_LABEL = re.compile(r".*(?:unit|einheit).*", re.IGNORECASE)
 _IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
 """of a body, in place of its name"""
-
-
-class Head(NamedTuple):
-    """The names of a table and where its rows begin.
-
-    Attributes:
-        header: the line of names.
-        delimiter: between them; a tab of a file whose cells have blanks between them.
-        above: lines of names above the header, the nearest first.
-        first_line: the number of the first line of rows or units.
-        note: what stands above, in words; empty of a table that begins with its names.
-        is_fitting: whether rows of as many cells were found right below.
-        units: of the columns behind the first, where a line above names them.
-    """
-
-    header: Line
-    delimiter: str
-    above: tuple[str, ...]
-    first_line: int
-    note: str = ""
-    is_fitting: bool = True
-    units: tuple[str, ...] = ()
 
 
 def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
@@ -91,12 +72,14 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
             return None
         return Head(below, separator[1], (), below.number + 1)
     near = [line for line in lines_in(data, plain, _LOOKED_AT, _NEAR) if line.text.strip()]
+    if nameless := nameless_head(data, near, blanks):
+        return nameless
     delimiter = find_delimiter(plain.text, near[1].text if len(near) > 1 else "")
     if _is_header(near, delimiter, blanks):
         return Head(plain, delimiter, (), plain.number + 1)
     lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
     unsure = Head(plain, delimiter, (), plain.number + 1, is_fitting=False)
-    return _sought(path, lines, blanks) or unsure
+    return _sought(path, lines, blanks) or nameless_head(data, lines, blanks, FEWEST) or unsure
 
 
 def _is_header(lines: Sequence[Line], delimiter: str, blanks: bool) -> bool:
@@ -106,19 +89,19 @@ def _is_header(lines: Sequence[Line], delimiter: str, blanks: bool) -> bool:
         return True
     if delimiter not in header:
         return False
-    width = len(_cells(header, delimiter))
-    cells = [_cells(line.text, delimiter) for line in below]
+    width = len(cells_of(header, delimiter))
+    cells = [cells_of(line.text, delimiter) for line in below]
     # Rows of other lengths are told with their line where the names are above one that fits.
-    row = next((i for i, c in enumerate(cells) if len(c) == width and _is_row(c)), None)
+    row = next((i for i, c in enumerate(cells) if len(c) == width and is_row(c)), None)
     if row is None:
         return False
-    return all(_is_row(c) or _are_units(c) for c in cells[:row])
+    return all(is_row(c) or are_units(c) for c in cells[:row])
 
 
 def _sought(path: str, lines: Sequence[Line], blanks: bool) -> Head | None:
     """The table further down."""
     for delimiter in (*DELIMITERS, " ") if blanks else DELIMITERS:
-        cells = [_cells(line.text, delimiter) for line in lines]
+        cells = [cells_of(line.text, delimiter) for line in lines]
         heads = _heads(lines, cells, delimiter)
         if len(heads) > 1:
             first, second = (head.header.number for head in heads[:2])
@@ -134,9 +117,9 @@ def _heads(lines: Sequence[Line], cells: Sequence[list[str]], delimiter: str) ->
     heads, at = [], 0
     while at < len(lines):
         end = at
-        while end < len(lines) and _is_row(cells[end]) and len(cells[end]) == len(cells[at]):
+        while end < len(lines) and is_row(cells[end]) and len(cells[end]) == len(cells[at]):
             end += 1
-        if end - at >= _FEWEST and (head := _head_above(lines, cells, at, delimiter)):
+        if end - at >= FEWEST and (head := _head_above(lines, cells, at, delimiter)):
             heads.append(head)
         at = max(end, at + 1)
     return heads
@@ -147,13 +130,13 @@ def _head_above(
 ) -> Head | None:
     """The header of rows that begin at a line; None where no names stand above them."""
     width, begin = len(cells[row]), row
-    if row and len(cells[row - 1]) == width and _are_units(cells[row - 1]):
+    if row and len(cells[row - 1]) == width and are_units(cells[row - 1]):
         begin = row - 1
     header = begin - 1
     # A rule, a word on what follows, or types of the columns, between names and rows.
     if header > 0 and (len(cells[header]) == 1 or all(map(_TYPE.fullmatch, cells[header]))):
         header -= 1
-    if header < 0 or not _fits(cells[header], cells[row]):
+    if header < 0 or not names_fit(cells[header], cells[row]):
         return None
     if delimiter == " " and not is_of_blanks(lines[header].text, lines[row].text):
         return None
@@ -192,57 +175,9 @@ def _is_group(lines: Sequence[Line], cells: Sequence[list[str]], at: int, width:
     """Whether a line may hold names of groups of the columns, or their numbers."""
     filled = [cell for cell in cells[at] if cell.strip()]
     together = lines[at].number + 1 == lines[at + 1].number
-    alike = len(cells[at]) == width and not _are_units(cells[at])
+    alike = len(cells[at]) == width and not are_units(cells[at])
     is_rule = len(filled) == 1 and _RULE.fullmatch(filled[0].strip()) is not None
     return together and alike and bool(filled) and not is_rule and not is_date(filled[0])
-
-
-def _fits(names: Sequence[str], row: Sequence[str]) -> bool:
-    """Whether a line names the cells of a row; one name more may stand there for comments."""
-    surplus = len(names) - len(row)
-    return surplus in (0, 1) and (not surplus or is_for_comments(names[-1])) and _are_names(names)
-
-
-def is_for_comments(name: str) -> bool:
-    """Whether a name is that of a column which rows need not have, as LabVIEW's."""
-    return name.strip().lower() in ("", "comment", "comments")
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    if delimiter == " ":
-        return line.split()
-    if '"' in line:
-        try:
-            return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-        except (csv.Error, StopIteration):
-            pass
-    return line.split(delimiter)
-
-
-def _is_value(cell: str) -> bool:
-    numbers = bool(_NUMBER.fullmatch(cell)) or is_number(cell) or cell in MISSING
-    return numbers or is_date(cell) or is_day(cell)
-
-
-def _is_row(cells: Sequence[str]) -> bool:
-    """Whether cells are those of a sample: the first is a number or a time, or most are."""
-    filled = [cell.strip() for cell in cells if cell.strip()]
-    if len(cells) < 2 or not filled:
-        return False
-    values = sum(map(_is_value, filled))
-    return 2 * values > len(filled) or (_is_value(filled[0]) and 3 * values >= len(filled))
-
-
-def _are_names(cells: Sequence[str]) -> bool:
-    filled = [cell.strip() for cell in cells if cell.strip()]
-    # A sample of which all but the time is text is no line of names.
-    if len(cells) < 2 or not filled or _is_value(filled[0]):
-        return False
-    return 2 * sum(map(_is_value, filled)) < len(filled)
-
-
-def _are_units(cells: Sequence[str]) -> bool:
-    return row_of_units(cells) is not None
 
 
 def qualified(names: Sequence[str], above: Sequence[Sequence[str]]) -> tuple[str, ...]:
@@ -268,7 +203,7 @@ def qualified(names: Sequence[str], above: Sequence[Sequence[str]]) -> tuple[str
 
 
 def require_names(path: str, names: Sequence[str], delimiter: str, line: str) -> None:
-    """Refuse a first line that holds a sample.
+    """Refuse a first line that holds a sample, of which some cells are no numbers.
 
     Args:
         path: for the message.

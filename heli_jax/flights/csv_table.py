@@ -13,10 +13,12 @@ import numpy as np
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
 from heli_jax.flights.csv_cells import row_of_units
+from heli_jax.flights.csv_comments import without_comments
 from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
+from heli_jax.flights.csv_lines import Head
 from heli_jax.flights.csv_on_disk import plain_beginning
-from heli_jax.flights.csv_preamble import Head, as_wide, find_head, qualified, require_names
+from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
@@ -164,6 +166,8 @@ class CsvTable:
         self._digest, self._body, self._head = digest, body, head
         self._dates: set[str] = set()
         self._signs = decimal_signs(body)
+        self._is_searched = False
+        """for comments among the rows"""
 
     @property
     def sha256(self) -> str:
@@ -186,6 +190,8 @@ class CsvTable:
     def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]
         numbers = number_columns(self._body, len(self.names), indices, self._signs)
+        if numbers is None and self._passed_over():
+            numbers = number_columns(self._body, len(self.names), indices, self._signs)
         if numbers is not None:
             return {n: numbers[i].values for n, i in zip(names, indices, strict=True)}
         result = {}
@@ -211,6 +217,8 @@ class CsvTable:
         likely = likely_numbers(self._body, width, self._signs)
         plain = number_columns(self._body, width, likely, self._signs) or {}
         rest = [i for i in range(width) if i not in plain]
+        if rest and self._passed_over():
+            return self._survey()
         found = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
         if rest:
             texts = zip(rest, self._texts(rest), strict=True)
@@ -288,6 +296,19 @@ class CsvTable:
         if len(found) != 1 or self.names[found[0]] == name:
             return None
         return filled_cells(self._texts(found)[0]).to_pylist()
+
+    def _passed_over(self) -> bool:
+        """Whether comments stood among the rows, which are without them from now on."""
+        if self._is_searched or self._body.size > _LARGEST_TEXT:
+            return False
+        self._is_searched = True
+        found = without_comments(self._body)
+        if found is None:
+            return False
+        self._body, note = found
+        self._signs = decimal_signs(self._body)
+        self._note(note)
+        return True
 
     def _note(self, words: str) -> None:
         if words not in self.notes:

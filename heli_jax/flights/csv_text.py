@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from heli_jax.flights.csv_fortran import is_fortran, parted
 from heli_jax.flights.table import wrong
 
 
@@ -174,7 +175,7 @@ _LONGEST_LINE = 10_000_000
 _LONGEST_PREAMBLE = 1_000_000
 """bytes of blank lines and comments before the header"""
 _BLOCK = 1 << 20
-_PLAIN = re.compile(r"[+-]?[0-9]*\.?[0-9]+(?:\.|[eE][+-]?[0-9]+)?|nan", re.IGNORECASE)
+_PLAIN = re.compile(r"[+-]?[0-9]*\.?[0-9]+(?:\.|[eEdD][+-]?[0-9]+)?|nan", re.IGNORECASE)
 _COMMENT = re.compile(r"\s*(#|//|%(\s|%|[^,;\t]*$))")
 """A name may begin with a percent sign, so that of MATLAB's comments those are known which go on
 with a blank or have no cells."""
@@ -322,12 +323,14 @@ def is_of_blanks(header: str, first: str) -> bool:
     """Whether blanks alone stand between the cells of header and first row."""
     # Names may hold blanks: only where nothing else is between them, and as many cells below.
     alone = not any(delimiter in header.strip() + first.strip() for delimiter in DELIMITERS)
-    return alone and len(header.split()) == len(first.split()) > 1
+    return alone and len(header.split()) == len(parted(first).split()) > 1
 
 
 def tabs_for_blanks(text: str) -> str:
-    """Lines whose cells have any number of blanks around them, with one tab between cells."""
-    return "\n".join("\t".join(line.split()) for line in lines_of(text))
+    """Lines whose cells have any number of blanks around them, with one tab between cells; between
+    numbers that are glued at their signs too."""
+    lines = map(parted, lines_of(text)) if is_fortran(text) else lines_of(text)
+    return "\n".join("\t".join(line.split()) for line in lines)
 
 
 def header_names(path: str, header: str, delimiter: str, line: int) -> tuple[str, ...]:

@@ -90,13 +90,6 @@ def test_a_row_of_units_is_no_sample(tmp_path):
     np.testing.assert_allclose(f.outputs["p"], P, atol=1e-6)
 
 
-def test_numbers_where_names_should_stand_are_refused_with_the_remedy(tmp_path):
-    path = written(tmp_path, ROWS)
-    for use in (read, describe_log, lambda p: convert_log(p, Selection())):
-        with pytest.raises(InputError, match=r"line 1: got numbers.*'time,column2,column3'"):
-            use(path)
-
-
 @pytest.mark.parametrize("zone", ["", "Z", "+01:00"])
 def test_dates_and_times_of_day_are_clocks(tmp_path, zone):
     stamps = np.datetime64("2024-02-29T23:59:58", "ms") + np.round(1e3 * T).astype("m8[ms]")

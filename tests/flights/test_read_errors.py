@@ -80,7 +80,10 @@ BAD_TEXT = {
     "blanks for delimiters": ("t stick phi\n0 1 2\n", ["line 1", "no comma"]),
     "header alone": ("t,stick,phi\n", ["line 1", "header alone"]),
     "header and blanks": ("# a\nt,stick,phi\n  \n\n", ["line 2", "header alone"]),
-    "no header": (csv_text(rows()[1:], header="0.000,0,0.0"), ["line 1", "names of the columns"]),
+    "no header": (
+        csv_text(rows()[1:], header="0.000,0,0.0"),
+        ["no column 't'", "column1, column2"],
+    ),
     "short row": (ragged(3, -1), ["line 8", "2 cells", "expected 3"]),
     "long row": (ragged(3, 2), ["line 8", "5 cells", "expected 3"]),
     "text": (with_cell(4, 2, "fast"), ["line 6", "'phi'", "'fast'"]),
