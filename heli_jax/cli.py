@@ -371,7 +371,8 @@ def _info(options: argparse.Namespace) -> int:
     from heli_jax import log_output
     from heli_jax.flights.describe import describe_flights
 
-    flights = list(describe_flights(options.log, options.time, options.time_unit, options.flight))
+    clock = (options.time, options.time_unit, options.flight, options.time_rate)
+    flights = list(describe_flights(options.log, *clock))
     if options.json:
         print(log_output.as_json(flights))
     else:

@@ -79,11 +79,22 @@ def add_sweep_options(command: argparse.ArgumentParser) -> None:
     )
 
 
+def add_time_rate(command: argparse.ArgumentParser) -> None:
+    """The rate of a table that has no times."""
+    command.add_argument(
+        "--time-rate",
+        type=float,
+        metavar="HZ",
+        help="of a table without times: samples a second",
+    )
+
+
 def add_info_options(command: argparse.ArgumentParser) -> None:
     """Of `heli-jax info`."""
     command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
     command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
     command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+    add_time_rate(command)
     command.add_argument("--flight", type=count, metavar="N", help="this one alone (from 1)")
     command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
     command.add_argument("--json", action="store_true", help="everything, for other programs")
@@ -113,6 +124,7 @@ def add_convert_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--flight", type=count, metavar="N", help="of a log of several (from 1)")
     command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
     command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+    add_time_rate(command)
 
 
 def selection(options: argparse.Namespace) -> "Selection":
@@ -139,6 +151,7 @@ def selection(options: argparse.Namespace) -> "Selection":
         options.flight,
         options.time,
         options.time_unit,
+        options.time_rate,
         by_preset,
     )
 
@@ -178,6 +191,7 @@ def add_new_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--vehicle", metavar="FILE", help="a vehicle file that is there already")
     command.add_argument("--flight", type=count, metavar="N", help="of a log that holds several")
+    add_time_rate(command)
     command.add_argument("--out", metavar="FILE", help="configuration (default: the log's name)")
 
 

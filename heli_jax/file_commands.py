@@ -13,7 +13,8 @@ def new(options: argparse.Namespace, say: Callable[[str], None]) -> int:
 
     log = Path(options.log)
     out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
-    written = write_config(log, out, options.model, options.vehicle, options.flight)
+    chosen = (options.model, options.vehicle, options.flight, options.time_rate)
+    written = write_config(log, out, *chosen)
     for note in written.notes:
         say(note)
     return 0

@@ -380,8 +380,13 @@ def _as_logged(
     logged, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
     model, named = experiment.model, first_signals(experiment)
     # An autopilot's log needs no name for the time; the table that is written here has one.
-    name, unit = ("time", "s") if logged.time is None else (logged.time.signal, logged.time.unit)
-    columns = {name: times / factor_to_si(unit, "s", f"{where}.time.unit")}
+    time = logged.time
+    name, unit = ("time", "s") if time is None else (time.signal or "time", time.unit)
+    seconds = factor_to_si(unit, "s", f"{where}.time.unit")
+    # A column that counts samples; where rows are the clock, times do no harm beside them.
+    if time is not None and time.rate is not None and time.signal is not None:
+        seconds = 1.0 / time.rate
+    columns = {name: times / seconds}
     for by_name, values in (
         (signals(model, "inputs", named.inputs, where), driven),
         (signals(model, "outputs", named.outputs, where), outputs),

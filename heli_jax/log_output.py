@@ -18,6 +18,7 @@ from typing import Any
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.rotor_lines import LEAST, RotorLines
+from heli_jax.flights.row_clock import ROWS
 from heli_jax.flights.vibration import SMALLEST, line_words
 from heli_jax.numbers import terse
 
@@ -136,20 +137,25 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) 
 
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
     if clock is None:
-        yield "time: no column looks like a clock; --time NAME says which is one"
+        yield (
+            "time: no column looks like a clock; --time NAME says which is one, --time-rate HZ how "
+            "many samples a second has (in a configuration time: {rate: HZ})"
+        )
         return
     if clock.problem:
         yield f"time: {clock.column} [{clock.unit}]"
         yield f"! {clock.problem}"
     else:
         uniform = "uniform" if clock.uniform else "not uniform"
+        name = f"{clock.column} [{clock.unit}]"
+        if clock.counted is not None:
+            by = f" (by {clock.said})" if clock.said else ""
+            name = f"{'rows' if clock.column == ROWS else clock.column}{by}"
         yield (
-            f"time: {clock.column} [{clock.unit}], {terse(clock.duration, 6)} s "
-            f"at {terse(clock.rate, 6)} Hz, "
-            f"{uniform}"
+            f"time: {name}, {terse(clock.duration, 6)} s at {terse(clock.rate, 6)} Hz, {uniform}"
         )
         yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
-    if clock.guessed:
+    if clock.guessed and clock.counted is None:
         yield f"the unit {clock.unit} is guessed; --time-unit says which it is"
     # The longest are those that a fit minds: a lost row is bridged.
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length)[:_MOST_LINES]:

@@ -18,6 +18,7 @@ from heli_jax.config.schema import (
     FlightConfig,
     InputConfig,
     OutputConfig,
+    TimeConfig,
 )
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
@@ -29,6 +30,7 @@ from heli_jax.flights.file_units import taken_note
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.named import Named, NamedBy
+from heli_jax.flights.row_clock import by_rate
 from heli_jax.flights.table import Table
 
 
@@ -84,7 +86,7 @@ def _read_flight(
         flights = (read_parts if f.gaps == "split" else _read_one)(
             path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
-            time=None if time is None else Signal(time.signal, time.unit, "s"),
+            time=_clock(time),
             inputs={n: inputs[n] for n in named.inputs} | instruments,
             outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
@@ -182,7 +184,7 @@ def _also(
         "" if align is None else align.to,
         {n: inputs[n] for n in also.signals.inputs},
         {n: outputs[n] for n in also.signals.outputs},
-        None if time is None else Signal(time.signal, time.unit, "s"),
+        _clock(time),
         also.flight,
         align is not None and align.reverse,
         None if opened is None else with_derived(opened),
@@ -209,11 +211,27 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
         selection,
         rate=first.rate if selection.rate is None else selection.rate,
         flight=first.flight if selection.flight is None else selection.flight,
-        time=time.signal if selection.time is None and time is not None else selection.time,
-        time_unit=time.unit if selection.time is None and time is not None else selection.time_unit,
+        **_of_clock(selection, time),
         named=None if selection.signals else _columns(experiment),
         swashplate=None if ccpm is None else ccpm.swashplate(),
     )
+
+
+def _clock(time: TimeConfig | None) -> Signal | None:
+    """The clock of a table, as a configuration names it."""
+    if time is None:
+        return None
+    if time.rate is not None:
+        return by_rate(time.rate, time.signal)
+    return Signal(time.signal or "", time.unit, "s")
+
+
+def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
+    """The fields of a selection that name the clock, where it does not itself."""
+    if time is None or selection.time is not None or selection.time_rate is not None:
+        return {}
+    unit = time.unit if time.rate is None else None
+    return {"time": time.signal, "time_unit": unit, "time_rate": time.rate}
 
 
 def _columns(experiment: Experiment) -> NamedBy:

@@ -54,10 +54,20 @@ def _model_choice(value: Any) -> Any:
 
 
 class TimeConfig(_Strict):
-    signal: str
-    """the column of time stamps"""
+    signal: str | None = None
+    """the column of time stamps, or with a rate one that counts samples"""
     unit: str = "s"
     """of the stamps: s, ms, us or ns"""
+    rate: Positive | None = None
+    """samples a second [Hz] of a file without times: of its rows, or of what `signal` counts"""
+
+    @model_validator(mode="after")
+    def _one_clock(self) -> "TimeConfig":
+        if self.signal is None and self.rate is None:
+            raise ValueError("expected the column of times, signal, or samples a second, rate")
+        if self.rate is not None and "unit" in self.model_fields_set:
+            raise ValueError("unit: expected none beside a rate, which says how long a sample is")
+        return self
 
 
 class InputConfig(LoggedInputConfig):

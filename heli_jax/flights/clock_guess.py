@@ -27,7 +27,7 @@ _COUNTERS = {
         "count",
         "counter",
     ),
-    *("row", "iteration", "id", "no", "nr", "number", "n", "packet", "tick"),
+    *("row", "iteration", "id", "no", "nr", "number", "n", "packet", "tick", "axis", "line"),
 }
 
 
@@ -87,11 +87,25 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:
     Args:
         surveys: of a table's columns, none of which is a clock.
     """
-    with_numbers = [(s.name, s.values) for s in surveys if s.values is not None]
-    counters = [n for n, x in with_numbers if _increases(x) and _counts(n, x)]
-    if not counters:
+    name = counter_of(surveys)
+    if name is None:
         return ()
-    return (f"{shown(counters[0])} counts rows and is taken for no time: add a column of times",)
+    return (f"{shown(name)} counts rows and is taken for no time",)
+
+
+def counter_of(surveys: Sequence[Survey]) -> str | None:
+    """The column that counts rows or frames, some of which may be lost; None without one.
+
+    Args:
+        surveys: of a table's columns.
+    """
+    with_numbers = [(s.name, s.values) for s in surveys if s.values is not None]
+    return next((n for n, x in with_numbers if _increases(x) and _is_counter(n, x)), None)
+
+
+def _is_counter(name: str, values: np.ndarray) -> bool:
+    whole = bool(np.all(values == np.rint(values)))
+    return whole and _by_name(name) and float(np.median(np.diff(values))) == 1.0
 
 
 def _increases(values: np.ndarray) -> bool:
@@ -101,10 +115,15 @@ def _increases(values: np.ndarray) -> bool:
 def _counts(name: str, values: np.ndarray) -> bool:
     """Whether whole numbers count rows or frames, one by one, by name too: a log at a sample a
     second has such times."""
-    by_name = not name or bool(_COUNTERS & set(words_in(name)))
-    return by_name and bool(
+    return _by_name(name) and bool(
         np.all(values[1:] == values[:-1] + 1.0) and values[0] == np.rint(values[0])
     )
+
+
+def _by_name(name: str) -> bool:
+    """Whether a name is that of a counter, or none: of a matrix, or of a text without names."""
+    is_numbered = not name or name.endswith("]") or re.fullmatch(r"column\d+", name) is not None
+    return is_numbered or bool(_COUNTERS & set(words_in(name)))
 
 
 def _with_unit(table: Table, name: str, stamps: np.ndarray) -> tuple[Signal, bool]:

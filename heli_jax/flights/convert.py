@@ -50,6 +50,8 @@ class Selection:
         flight: which flight of a file that holds several, from 1.
         time: of a table the column of time stamps; guessed where it is not given.
         time_unit: of these stamps; guessed likewise.
+        time_rate: samples a second [Hz] of a table without times: of its rows, or of what `time`
+            counts.
         named: what names the columns in place of `signals`, which are then in SI.
         swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
     """
@@ -60,6 +62,7 @@ class Selection:
     flight: int | None = None
     time: str | None = None
     time_unit: str | None = None
+    time_rate: float | None = None
     named: NamedBy | None = None
     swashplate: Swashplate | None = None
 
@@ -92,14 +95,16 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     named = None if selection.named is None else selection.named(log)
     notes = [] if named is None else list(named.notes)
     if isinstance(log, DerivedTable):
-        channels, clockless = as_channels(log.table, selection.time, selection.time_unit, notes)
+        channels, clockless = as_channels(
+            log.table, selection.time, selection.time_unit, notes, selection.time_rate
+        )
         require_clocks(channels, clockless, selection.signals, notes)
         # Without a rate the rows are copied as they are, empty cells and all.
         rate = selection.rate
         channels = channels if rate is None else without_joins(channels, notes)
         log = with_derived(channels, selection.swashplate)
         assert isinstance(log, DerivedLog)
-    elif selection.time or selection.time_unit:
+    elif selection.time or selection.time_unit or selection.time_rate:
         raise wrong(log.path, "its topics have clocks of their own, expected no time to be stated")
     notes += log.notes
     if named is None:

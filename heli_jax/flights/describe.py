@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import nearest
 from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import arrival_notes, counter_notes, guess_clock
+from heli_jax.flights.clock_guess import arrival_notes, counter_notes, counter_of, guess_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -27,6 +27,7 @@ from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
+from heli_jax.flights.row_clock import ROWS, by_rate, stated_rate
 from heli_jax.flights.table import (
     Survey,
     Table,
@@ -86,6 +87,8 @@ class TimeInfo:
     `rate` [Hz] is that of the usual step; `jitter` the largest error of a step in steps, or where
     the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
     they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
+    `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
+    clock and the rows do (`heli_jax.flights.row_clock.ROWS`); `said` where the file says so.
     """
 
     column: str
@@ -97,6 +100,8 @@ class TimeInfo:
     gaps: tuple[Gap, ...]
     problem: str = ""
     guessed: bool = False
+    counted: float | None = None
+    said: str = ""
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,10 @@ class LogInfo:
 
 
 def describe_log(
-    path: str | Path, time: str | Signal | None = None, unit: str | None = None
+    path: str | Path,
+    time: str | Signal | None = None,
+    unit: str | None = None,
+    rate: float | None = None,
 ) -> LogInfo:
     """Signals, rates, duration and gaps of a log, of its first flight where it holds several.
 
@@ -147,11 +155,13 @@ def describe_log(
             column with a usual name (its unit from an ending such as `_ms`, or guessed from the
             steps), or the first that increases from row to row.
         unit: of the time stamps, whichever column they are in.
+        rate: samples a second [Hz] of a table without times: of its rows, or of a column that
+            counts them.
 
     Raises:
         InputError: the log cannot be read, has no such column, or needs no column of times.
     """
-    return next(describe_flights(path, time, unit))
+    return next(describe_flights(path, time, unit, rate=rate))
 
 
 def describe_flights(
@@ -159,6 +169,7 @@ def describe_flights(
     time: str | Signal | None = None,
     unit: str | None = None,
     number: int | None = None,
+    rate: float | None = None,
 ) -> Iterator[LogInfo]:
     """As `describe_log`, of all flights of a log, one by one.
 
@@ -167,6 +178,7 @@ def describe_flights(
         time: the column of time stamps.
         unit: of the time stamps.
         number: of the one flight to describe, from 1.
+        rate: samples a second [Hz] of a table without times.
 
     Raises:
         InputError: as `describe_log`.
@@ -175,9 +187,9 @@ def describe_flights(
     # spares no time.
     log = chosen_flights(path, open_flights(path), number)
     if not isinstance(log, tuple):
-        yield describe_table(log, time, unit)
+        yield describe_table(log, time, unit, rate)
         return
-    for option, value in (("time", time), ("unit of time", unit)):
+    for option, value in (("time", time), ("unit of time", unit), ("rate of rows", rate)):
         if value is not None:
             problem = f"its topics have clocks of their own, expected no {option} to be stated"
             raise wrong(str(path), problem)
@@ -218,32 +230,47 @@ def _describe_topic(topic: Topic) -> TopicInfo:
     return TopicInfo(topic.name, topic.times.size, time, columns)
 
 
-def describe_table(table: Table, time: str | Signal | None, unit: str | None) -> LogInfo:
+def describe_table(
+    table: Table, time: str | Signal | None, unit: str | None, rate: float | None = None
+) -> LogInfo:
     """As `describe_log`, of a table that is open.
 
     Args:
         table: of rows.
         time: the column of time stamps.
         unit: of the time stamps.
+        rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
+            clock, or a column that counts them, unless `time` names one.
 
     Raises:
         InputError: it has no such column.
     """
-    surveys = table.survey()
-    if time is None:
+    surveys, said = table.survey(), ""
+    if rate is not None:
+        if not (rate > 0 and np.isfinite(rate)):
+            raise wrong(table.path, f"expected a positive number of samples a second, got {rate:g}")
+        name = time.name if isinstance(time, Signal) else time
+        name = counter_of(surveys) if name is None else _asked_time(table, surveys, name).name
+        signal, guessed, unit = by_rate(rate, name), False, None
+    elif time is None:
         signal, guessed = guess_clock(table, surveys)
+        if signal is None and (stated := stated_rate(surveys)) is not None:
+            (found, said), unit = stated, None
+            signal, guessed = by_rate(found, counter_of(surveys)), True
     else:
         signal, guessed = _asked_time(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
     # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
-    if signal is not None:
+    if signal is not None and signal.name != ROWS:
         once = without_copies(table, signal.name, surveys)
         if once is not table:
             table, surveys = once, once.survey()
     marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
+    if clock is not None and said:
+        clock = replace(clock, said=said)
     return LogInfo(
         path=table.path,
         format=table.format,
@@ -327,15 +354,24 @@ def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
 
 
 def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed: bool) -> TimeInfo:
-    stamps = _values(surveys, signal.name)
+    if signal.name == ROWS:
+        stamps = np.arange(_n_rows(surveys), dtype=np.float64)
+    else:
+        stamps = _values(surveys, signal.name)
     assert stamps is not None  # only a column of numbers is guessed or taken for a clock
+    if signal.name == ROWS or signal.scale != 1.0:
+        clock = _describe_stamps(signal.name, "s", stamps, signal.scale)
+        return replace(clock, guessed=guessed, counted=round(1.0 / signal.scale, 9))
     unit = table.time_unit(signal.name) or signal.unit
     return replace(_describe_stamps(signal.name, unit, stamps), guessed=guessed)
 
 
-def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
-    """What stamps (N,) in a unit of time are as a clock."""
-    scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
+def _describe_stamps(
+    name: str, unit: str, stamps: np.ndarray, scale: float | None = None
+) -> TimeInfo:
+    """What stamps (N,) in a unit of time, or of `scale` [s], are as a clock."""
+    if scale is None:
+        scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
         stamps, _ = without_overflow(stamps)
         seconds = stamps * scale

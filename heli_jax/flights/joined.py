@@ -110,7 +110,9 @@ def joined_log(
         return None
     signals = {s.name: numbers[s.name] for s in request.signals.values()}
     inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
-    scale = units.factor(table.time_unit(request.time.name) or request.time.unit, "s")
+    scale = request.time.scale
+    if scale == 1.0:
+        scale = units.factor(table.time_unit(request.time.name) or request.time.unit, "s")
     seconds = stamps * scale
     if is_joined(seconds, signals, inputs):
         topics = topics_of(seconds, signals, table.units, request.time.name)

@@ -48,6 +48,7 @@ from heli_jax.flights.onto_grid import (
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
+from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.slower import Timed
 from heli_jax.flights.table import Table, column, sample_count, shown, wrong
 from heli_jax.flights.table_view import first_of_copies, seen_once
@@ -82,6 +83,11 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     if request.time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
+    if isinstance(table, DerivedTable):
+        if request.time.name == ROWS:
+            table = DerivedTable(counted(table.table, request.time), table.swashplate)
+    else:
+        table = counted(table, request.time)
     numbers = table.numbers(request.columns)
     joined = joined_log(table, request, numbers)
     if joined is not None:
@@ -223,9 +229,11 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
     place = column(time.name)
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
     stated = table.time_unit(time.name)
-    scale = units.factor(stated or time.unit, "s")
+    is_counted = time.scale != 1.0
+    scale = time.scale if is_counted else units.factor(stated or time.unit, "s")
     # A type is unmistakable; only words may be meant for something else.
-    said = () if stated and not table.units.get(time.name) else _unit_notes(time, stated)
+    is_sure = is_counted or (stated and not table.units.get(time.name))
+    said = () if is_sure else _unit_notes(time, stated)
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:

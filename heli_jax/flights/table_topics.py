@@ -6,10 +6,11 @@ from dataclasses import replace
 
 from heli_jax.errors import InputError
 from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.describe import describe_table
+from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.flights.table_view import numbers_once
 
@@ -21,11 +22,15 @@ type Clockless = Mapping[str, int]
 
 
 def as_channels(
-    table: Table, time: str | None, unit: str | None, notes: list[str]
+    table: Table,
+    time: str | None,
+    unit: str | None,
+    notes: list[str],
+    rate: float | None = None,
 ) -> tuple[ChannelLog, Clockless]:
     """A table as a log of one topic, its clock named or guessed; arrays of other lengths that have
     a clock too are topics of their own."""
-    topic, start = _table_topic(table, time, unit, notes)
+    topic, start = _table_topic(table, time, unit, notes, rate)
     topics, clockless = [topic], {}
     parts = {}
     if isinstance(table, ArrayTable):
@@ -81,6 +86,12 @@ def require_clocks(
         notes.append(f"{words}, of {size} samples, for which there is no clock")
 
 
+def clock_words(clock: TimeInfo) -> str:
+    """What is taken for a clock of so many samples a second, in words."""
+    what = "rows" if clock.column == ROWS else shown(clock.column)
+    return f"{what} are taken as samples at {clock.counted:g} Hz"
+
+
 def matching(names: Iterable[str], pattern: str) -> list[str]:
     # The brackets of gyroADC[0] are meant as they stand.
     literal = pattern.replace("[", "[[]")
@@ -88,22 +99,31 @@ def matching(names: Iterable[str], pattern: str) -> list[str]:
 
 
 def _table_topic(
-    table: Table, time: str | None, unit: str | None, notes: list[str]
+    table: Table,
+    time: str | None,
+    unit: str | None,
+    notes: list[str],
+    rate: float | None = None,
 ) -> tuple[Topic, float]:
     """The columns of a table's clock, which is named or guessed, and its first time [s]."""
-    info = describe_table(table, time, unit)
+    info = describe_table(table, time, unit, rate)
     clock = info.time
     if clock is None or clock.problem:
         why = clock.problem if clock else "no column looks like a clock"
         remedy = "expected --time NAME, a column of increasing times"
+        if not clock:
+            remedy += ", or --time-rate HZ, samples a second"
         if clock:
             remedy += ", or a file without the rows that go back"
-        elif texts := [c.name for c in info.columns if c.kind == "text"]:
+        if not clock and (texts := [c.name for c in info.columns if c.kind == "text"]):
             why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
         raise wrong(table.path, f"{why}, {remedy}")
-    if clock.guessed:
+    if clock.said:
+        notes.append(f"{clock_words(clock)}, as the file says: {clock.said}")
+    elif clock.guessed:
         notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
-    rows = next(c.count for c in info.columns if c.name == clock.column)
+    is_rows = clock.column == ROWS
+    rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
     whole = not isinstance(table, ArrayTable)
     numeric = [c for c in info.columns if c.kind == "number"]
@@ -114,7 +134,10 @@ def _table_topic(
     # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
-    numbers, copies = numbers_once(table, clock.column, names)
+    if is_rows:
+        numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
+    else:
+        numbers, copies = numbers_once(table, clock.column, names)
     stamps, more = without_overflow(numbers.pop(clock.column))
     notes += (*copies, *more)
     # By the clock's own measure of its length, which knows its unit.

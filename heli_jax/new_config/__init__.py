@@ -53,6 +53,7 @@ def write_config(
     model: str | None = None,
     vehicle: str | None = None,
     flight: int | None = None,
+    time_rate: float | None = None,
 ) -> Written:
     """Write a configuration, and for models of a machine's geometry a vehicle file to fill in.
 
@@ -63,6 +64,7 @@ def write_config(
             moves unless given.
         vehicle: a vehicle file.
         flight: of a log that holds several, from 1.
+        time_rate: samples a second [Hz] of a table without times.
 
     Raises:
         InputError: the log cannot be read, holds nothing of the model, or a file is in the way.
@@ -70,7 +72,7 @@ def write_config(
     if out.exists():
         raise InputError(f"{out}: is there already; expected another place, --out FILE")
     require_place(out, str(out))
-    read = read_log(Path(log), flight)
+    read = read_log(Path(log), flight, time_rate)
     chosen = text.Chosen(*_model(model, read, str(log)))
     preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
     signals = None if preset else _signals(chosen.model, read)
@@ -103,6 +105,9 @@ def write_config(
         words = "1 number is" if todo == 1 else f"{todo} numbers are"
         notes.append(f"{words} yours to give, where {EDIT} stands")
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
+    if signals is not None and not signals.outputs:
+        wanted = ", ".join(naming.names(chosen.model.Outputs))
+        notes.append(f"found none of {wanted} by its name: say which were logged, and as what")
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
         notes.append(f"{words}: name the stick's, which no rate or angle is")
@@ -273,7 +278,8 @@ def _signals(model: Any, log: Log) -> text.Signals:
     smooth = bool(measured) and all(map(without_noise, measured))
     wandering = {} if smooth else _wandering(model, log, outputs)
     outputs = {n: g for n, g in outputs.items() if n not in wandering}
-    return text.Signals(inputs, outputs, known, rest, excitations, wandering, smooth)
+    ranges = {n: (np.nanmin(x := log.series[n].values), np.nanmax(x)) for n in rest}
+    return text.Signals(inputs, outputs, known, rest, excitations, wandering, smooth, ranges)
 
 
 def _only_turn(model: Any) -> dict[str, str]:

@@ -1,5 +1,7 @@
 """A log as `heli-jax new` looks at it, whatever its format."""
 
+import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,10 +15,14 @@ from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_topics import clock_words
 from heli_jax.flights.table_view import numbers_once
 from heli_jax.new_config.guess import Series
 
+_ASSUMED = 100.0
+"""Hz, of rows of which nothing tells how fast they were sampled"""
 _FEWEST = 8
 """samples of a signal"""
 
@@ -35,23 +41,29 @@ class Log(NamedTuple):
     """what of the log is not looked at"""
 
 
-def read_log(path: Path, number: int | None) -> Log:
+def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
     """The channels of a log that hold samples.
 
     Args:
         path: of any format that is read.
         number: of the flight, of a log that holds several, from 1.
+        rate: samples a second [Hz] of a table without times.
 
     Raises:
-        InputError: it cannot be read, or holds no times.
+        InputError: it cannot be read, or its times are none.
     """
     opened = chosen_flights(path, open_flights(path), number)
     if not isinstance(opened, tuple):
         # Arrays may have clocks of their own, by where they stand in the file.
-        grouped = by_clocks(opened) if isinstance(opened, ArrayTable) else None
+        grouped = None
+        if isinstance(opened, ArrayTable) and rate is None:
+            grouped = by_clocks(opened)
         if grouped is None:
-            return _read_table(opened)
+            return _read_table(opened, rate)
         opened = (grouped,)
+    if rate is not None:
+        problem = "its topics have clocks of their own, expected no rate of rows to be stated"
+        raise wrong(str(path), problem)
     first, *others = opened
     series = {
         name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
@@ -73,31 +85,44 @@ def read_log(path: Path, number: int | None) -> Log:
     )
 
 
-def _read_table(table: Table) -> Log:
-    info: LogInfo = describe_table(table, None, None)
-    if info.time is None or info.time.problem:
-        why = info.time.problem if info.time is not None else _without_time(info)
-        raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
-    clock = info.time.column
+def _read_table(table: Table, rate: float | None) -> Log:
+    info: LogInfo = describe_table(table, None, None, rate)
+    notes: tuple[str, ...] = ()
+    time = info.time
+    if time is None:
+        # How many samples a second has only the user knows; a guess needs no more than their order.
+        time = describe_table(table, None, None, _ASSUMED).time
+        assert time is not None
+        time = dataclasses.replace(time, counted=math.nan)
+        notes = (f"{_without_time(info)}: how many samples a second has is yours to say",)
+    if time.problem:
+        problem = "expected a column of increasing times, got none"
+        raise wrong(table.path, f"{problem}: {time.problem}")
+    if time.said:
+        notes = (f"{clock_words(time)}, as the file says: {time.said}",)
+    clock = time.column
+    if clock == ROWS:
+        table = CountedTable(table)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
     # Of arrays those that are as long as the clock.
-    rows = {c.name: c.rows for c in info.columns}
+    rows = {ROWS: info.n_rows} | {c.name: c.rows for c in info.columns}
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
     values, _ = numbers_once(table, clock, [clock, *(n for n in names if n != clock)])
-    times = _from_first(values[clock], info.time.duration)
+    times = _from_first(values[clock], time.duration)
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))
         for n in names
         if n != clock and _is_known(values[n])
     }
-    notes = arrival_notes(clock, names)
+    notes += arrival_notes(clock, names)
     if others:
         listed = ", ".join(map(shown, others[:6]))
-        notes += (f"left out, since they are not as long as {shown(clock)}: {listed}",)
-    return Log(table.path, table.format, series, info.time, None, False, notes)
+        words = shown(clock) if clock != ROWS else "the others"
+        notes += (f"left out, since they are not as long as {words}: {listed}",)
+    return Log(table.path, table.format, series, time, None, False, notes)
 
 
 def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
@@ -115,7 +140,7 @@ def _without_time(info: LogInfo) -> str:
     """Why none of a table's columns is a time, in words."""
     strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
     notes = [strays, *(note for note in info.notes if "taken for no time" in note)]
-    return "; ".join(filter(None, ("none of its columns is a time", *notes)))
+    return "; ".join(filter(None, ("no column is a time", *notes)))
 
 
 def _is_known(values: np.ndarray) -> bool:

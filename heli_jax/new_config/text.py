@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
-from heli_jax.errors import InputError
 from heli_jax.flights.describe import TimeInfo
+from heli_jax.flights.row_clock import ROWS
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
@@ -53,6 +53,8 @@ class Signals(NamedTuple):
     """angles that are left out, since their error is that of an integrated rate"""
     smooth: bool = False
     """whether no output has a sensor's noise"""
+    ranges: Mapping[str, tuple[float, float]] = {}
+    """least and largest number of each channel that is left"""
 
 
 def configuration(
@@ -85,8 +87,6 @@ def configuration(
         others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
 
-    Raises:
-        InputError: the log holds no output of the model.
     """
     lines = [
         f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
@@ -172,6 +172,8 @@ def _axes(model: Any) -> tuple[str, ...]:
 def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     if time is None:
         return []
+    if time.counted is not None and math.isnan(time.counted):
+        return []
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
     if not time.uniform or time.gaps:
         longest = max((g.length for g in time.gaps), default=0.0)
@@ -195,19 +197,13 @@ def _models(others: Sequence[str]) -> list[str]:
 
 
 def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -> list[str]:
-    if not signals.outputs:
-        listed = ", ".join(signals.rest[:_MOST_LISTED])
-        wanted = ", ".join(naming.names(chosen.model.Outputs))
-        raise InputError(f"{log}: found none of {wanted} by its name, expected one; got {listed}")
     lines = [
         f"    known: {{{name}: {value:.5g}}}       # GUESS: mean of {_comment(channel)}, in SI"
         for name, (channel, value) in signals.known.items()
     ]
     lines.append("    signals:")
     if time is not None:
-        unit = "" if time.unit == "s" else f", unit: {time.unit}"
-        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
-        lines.append(f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}")
+        lines.append(_time(time))
     lines.append("      inputs:")
     for name, found in signals.inputs.items():
         meaning = naming.meaning(chosen.model.Inputs, name)
@@ -215,6 +211,8 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
     lines.append("      outputs:")
     for name, found in signals.outputs.items():
         lines += _signal(name, found, naming.meaning(chosen.model.Outputs, name))
+    if not signals.outputs and not signals.wandering:
+        return [*lines, *_unknown(chosen.model), *_ranges(signals.ranges)]
     lines += _left_out(signals.wandering)
     lines += _missing(chosen, signals)
     lines += _instruments(signals.excitations)
@@ -223,6 +221,21 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
         more = "" if len(signals.rest) <= _MOST_LISTED else ", ..."
         lines.append(f"      # not used: {_comment(listed)}{more}")
     return lines
+
+
+def _time(time: TimeInfo) -> str:
+    """The clock of a table."""
+    if time.counted is None:
+        unit = "" if time.unit == "s" else f", unit: {time.unit}"
+        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
+        return f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}"
+    counter = "" if time.column == ROWS else f"signal: {_value(time.column)}, "
+    if math.isnan(time.counted):
+        return (
+            f"      time: {{{counter}rate: {EDIT}}}   # Hz, samples a second: no column is a time"
+        )
+    said = f"   # GUESS: the file says {_comment(time.said)}" if time.said else ""
+    return f"      time: {{{counter}rate: {time.counted:.10g}}}{said}"
 
 
 def _preset(preset: str, outputs: Sequence[str]) -> list[str]:
@@ -249,6 +262,27 @@ def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
             *(f"        # {words.strip()}" for words in _signal(name, found, "")),
         )
     ]
+
+
+def _unknown(model: Any) -> list[str]:
+    """Outputs of which no name tells, for the user to name or to take out."""
+    lines = ["        # No name tells of an output: take out those that were not logged."]
+    for name in naming.names(model.Outputs):
+        meaning, unit = naming.meaning(model.Outputs, name), naming.unit(model.Outputs, name) or "1"
+        lines += [f"        # {name}: {_comment(meaning)}"] if meaning else []
+        words = "in what the log has it" if unit == "1" else f"such as {unit}"
+        lines.append(f"        {name}: {{signal: {EDIT}, unit: {EDIT}}}   # {words}")
+    return lines
+
+
+def _ranges(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """What the channels of a log are like, where only their numbers tell."""
+    moving = {n: r for n, r in ranges.items() if r[0] < r[1]}
+    shown = list(moving.items())[:_MOST_LISTED]
+    lines = [f"      #   {_comment(n)}: {low:.4g} to {high:.4g}" for n, (low, high) in shown]
+    more = len(moving) - len(shown)
+    lines += [f"      #   and {more} more: heli-jax info"] if more > 0 else []
+    return ["      # What moves in the log:", *lines] if lines else []
 
 
 def _missing(chosen: Chosen, signals: Signals) -> list[str]:

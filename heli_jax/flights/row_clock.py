@@ -1,0 +1,122 @@
+"""Clocks of tables that hold no times: rows, or counts of a column, at a rate that is known."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.flights.channel_names import words_in
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.table import Survey, Table, shown
+
+ROWS = "row number"
+"""what the numbers of rows are called, from 0, as a column"""
+_STEPS = {"ts", "dt", "tsample", "tsamp", "tsampling"}
+_RATES = {"fs", "hz"}
+_OF_SAMPLES = {"sample", "samples", "sampling", "time"}
+_STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
+_FASTEST, _SLOWEST = 1e5, 0.2
+"""Hz: no record of a flight is outside of these"""
+
+
+def by_rate(rate: float, counter: str | None = None) -> Signal:
+    """The clock of rows that were sampled at a rate.
+
+    Args:
+        rate: [Hz]
+        counter: a column that counts samples; the rows themselves without one.
+    """
+    return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
+
+
+class CountedTable:
+    """A `Table` of which the numbers of the rows can be asked for as a column."""
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.path, self.format, self.size = table.path, table.format, table.size
+        self.names = (*table.names, ROWS)
+        self.notes, self.units = table.notes, table.units
+
+    @property
+    def sha256(self) -> str:
+        """Of the file."""
+        return self.table.sha256
+
+    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """The columns as float64 (N,), the numbers of the rows from 0."""
+        own = [n for n in names if n != ROWS] or list(self.table.names[:1])
+        columns = self.table.numbers(own)
+        # A table says more of its cells once they were read.
+        self.notes = self.table.notes
+        columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
+        return {n: columns[n] for n in names}
+
+    def survey(self) -> list[Survey]:
+        """Every column of the file."""
+        return self.table.survey()
+
+    def place(self, row: int) -> str:
+        """Where a row stands."""
+        return self.table.place(row)
+
+    def cell_text(self, name: str, row: int) -> str:
+        """What stands in a cell, in words."""
+        return str(row) if name == ROWS else self.table.cell_text(name, row)
+
+    def time_unit(self, name: str) -> str | None:
+        """The unit of a column of time stamps."""
+        return None if name == ROWS else self.table.time_unit(name)
+
+
+def counted(table: Table, time: Signal | None) -> Table:
+    """A table with its rows' numbers, where they are the clock.
+
+    Args:
+        table: of rows.
+        time: the clock that is asked for.
+    """
+    return table if time is None or time.name != ROWS else CountedTable(table)
+
+
+def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
+    """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
+    and this number in words; None where there is none, or are several.
+
+    Args:
+        surveys: of all columns or arrays.
+    """
+    found: dict[float, str] = {}
+    for each in surveys:
+        step = _is_step(each.name)
+        if each.values is None or step is None:
+            continue
+        values = each.values[np.isfinite(each.values)]
+        # In a table a number may stand in the first row alone, or in each.
+        if not values.size or np.ptp(values) > 0 or values[0] <= 0:
+            continue
+        number = float(values[0])
+        rate = 1.0 / number if step else number
+        if _SLOWEST <= rate <= _FASTEST:
+            found.setdefault(rate, f"{shown(each.name)} = {number:g}")
+    if len(found) != 1:
+        return None
+    rate, words = next(iter(found.items()))
+    # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
+    near = round(rate, 6)
+    return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
+
+
+def _is_step(name: str) -> bool | None:
+    """Whether a name is that of a time step, or of a rate (False); None of anything else."""
+    words = words_in(name.rpartition(".")[2].rpartition("/")[2])
+    joined = "".join(words)
+    if joined in _STEPS or (
+        len(words) == 2 and words[0] in (*_OF_SAMPLES, "delta") and words[1] in _STEP_WORDS
+    ):
+        return True
+    if joined in _RATES or (
+        len(words) == 2 and words[0] in _OF_SAMPLES and words[1] in _RATE_WORDS
+    ):
+        return False
+    return None
