@@ -331,8 +331,14 @@ def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) ->
 
 def test_a_counter_of_rows_is_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = write(tmp_path / "run.csv", {"Frame": np.arange(T.size), "aileron": STICK, "p": RATE})
-    assert cli.main(["new", str(log), "--out", str(tmp_path / "x.yaml")]) == 2
+    out = tmp_path / "x.yaml"
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
     assert "'Frame' counts rows and is taken for no time" in capsys.readouterr().err
+    assert "time: {signal: Frame, rate: EDIT}" in out.read_text()
+    assert cli.main(["check", str(out)]) == 2
+    out.unlink()
+    assert cli.main(["new", str(log), "--time-rate", "50", "--out", str(out)]) == 0
+    assert "time: {signal: Frame, rate: 50}" in out.read_text()
 
 
 def test_of_channels_without_names_the_one_that_the_output_follows_is_taken() -> None:
