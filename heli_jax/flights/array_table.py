@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.flights import mat_file, packed
+from heli_jax.flights import hdf5_texts, mat_file, packed
 from heli_jax.flights.mat_labels import labelled
+from heli_jax.flights.named_columns import NamedColumns, as_lists
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -117,7 +118,8 @@ def open_mat(path: Path) -> ArrayTable:
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
     try:
-        whole, units, notes = labelled(*mat_file.read_mat(data))
+        read = mat_file.read_mat(data)
+        whole, units, notes = labelled(*read)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
     except mat_file.LargeMatFile as e:
@@ -125,11 +127,14 @@ def open_mat(path: Path) -> ArrayTable:
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     real = {name: np.real(array) for name, array in whole.items()}
+    named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
     for name, array in real.items():
-        parts = dict(_vectors(name, array))
-        arrays |= parts
-        of_parts |= dict.fromkeys(parts, units.get(name, ""))
+        for i, (part, vector) in enumerate(_vectors(name, array)):
+            called = named.name(name, i) or part
+            arrays[called] = vector
+            of_parts[called] = named.unit(name, i) or units.get(name, "")
+    notes = (*notes, *named.notes)
     complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
     words = f"complex numbers, of which the real part is read: {complex_ones}"
     notes = (*notes, words) if complex_ones else notes
@@ -188,8 +193,9 @@ class _DataSets:
     """What is read of a file whose data sets have attributes."""
 
     def __init__(self) -> None:
-        self._arrays: dict[str, np.ndarray] = {}
+        self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
+        self._texts: dict[str, list[str]] = {}
         self._scaled: dict[str, None] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
@@ -207,14 +213,24 @@ class _DataSets:
         if missing:
             self._missing[name] = missing
         stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), "")
-        for part, vector in _vectors(name, values):
-            self._arrays[part] = vector
-            self._units[part] = packed.text_of(stated)
+        self._stored[name] = values
+        self._units[name] = packed.text_of(stated)
+
+    def add_texts(self, name: str, texts: Sequence[Any]) -> None:
+        """A list of texts, by which columns may be called."""
+        self._texts[name] = [packed.text_of(text).strip("\0 ") for text in texts]
 
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
         """All of them."""
         notes = packed.notes_of(self._scaled, self._missing, self._left_out)
-        return ArrayTable(path, kind, data, self._arrays, self._units, notes)
+        named = NamedColumns(self._stored, self._texts)
+        arrays, units = {}, {}
+        for name, values in self._stored.items():
+            for i, (part, vector) in enumerate(_vectors(name, values)):
+                called = named.name(name, i) or part
+                arrays[called] = vector
+                units[called] = named.unit(name, i) or self._units[name]
+        return ArrayTable(path, kind, data, arrays, units, (*notes, *named.notes))
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -244,7 +260,13 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         # Any: h5py's classes cannot be named where it is not installed.
         def visit(name: str, item: Any) -> None:
             nonlocal cells, claimed
-            if not isinstance(item, h5py.Dataset) or not _holds_numbers(item.dtype, item.ndim):
+            if not isinstance(item, h5py.Dataset):
+                return
+            dotted = name.replace("/", ".") if kind == "mat 7.3" else name
+            if (texts := hdf5_texts.list_of(item)) is not None:
+                read.add_texts(dotted, texts)
+                return
+            if not _holds_numbers(item.dtype, item.ndim) or hdf5_texts.is_text(item):
                 return
             if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
                 return
@@ -257,10 +279,11 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
                 raise wrong(str(path), str(e)) from e
             # A structure's path is as `open_mat` gives it for older versions, so that a
             # configuration does not depend on the version in which a file was saved.
-            dotted = name.replace("/", ".") if kind == "mat 7.3" else name
             # Of others nothing is read: they may be of types that h5py does not know.
             counting = (*packed.ATTRIBUTES, *packed.UNIT_ATTRIBUTES)
             attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
+            for beside, texts in hdf5_texts.of_attributes(item).items():
+                read.add_texts(f"{dotted}_{beside}", texts)
             for field, values, own in _fields(dotted, np.asarray(item), attributes):
                 read.add(field, values, own)
 
@@ -268,6 +291,8 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
             # This visits every object once and follows no links, of which a circle would never end
             # and one to another file would read that.
             file.visititems(visit)
+            for name, number in hdf5_texts.numbers_of(file).items():
+                read.add(name, np.array([number]), {})
         return read
 
     return _guarded(path, "HDF5 file", read).table(str(path), kind, data)

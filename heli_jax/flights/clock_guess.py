@@ -31,12 +31,15 @@ _COUNTERS = {
 }
 
 
-def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None, bool]:
+def guess_clock(
+    table: Table, surveys: Sequence[Survey], by_name: bool = False
+) -> tuple[Signal | None, bool]:
     """The clock, and whether its unit is a guess.
 
     Args:
         table: of rows.
         surveys: of its columns.
+        by_name: whether only one that is called so is taken.
     """
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
@@ -56,7 +59,7 @@ def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None,
     named = [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
     # Without a name to go by, the first column that increases all along is taken, but for numbers
     # of rows. The result names it, so that a wrong guess is seen.
-    others = [n for n in increasing if not _counts(n, values[n])]
+    others = [n for n in increasing if not by_name and not _counts(n, values[n])]
     for name in (*named, *others):
         return _with_unit(table, name, values[name])
     return None, False

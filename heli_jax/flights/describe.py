@@ -253,8 +253,10 @@ def describe_table(
         name = counter_of(surveys) if name is None else _asked_time(table, surveys, name).name
         signal, guessed, unit = by_rate(rate, name), False, None
     elif time is None:
-        signal, guessed = guess_clock(table, surveys)
-        if signal is None and (stated := stated_rate(surveys)) is not None:
+        # A rate in the file goes before what merely increases, as a distance may.
+        stated = stated_rate(surveys)
+        signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
+        if signal is None and stated is not None:
             (found, said), unit = stated, None
             signal, guessed = by_rate(found, counter_of(surveys)), True
     else:

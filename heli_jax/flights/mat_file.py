@@ -25,6 +25,8 @@ _LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"}
 """encodings by the number that the format has for each type of text"""
 _LONGEST_TEXT = 1000
 """bytes of a name or a unit: longer texts are passed over"""
+_MOST_LETTERS = 20_000
+"""bytes of a list of names"""
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 _MOST_BYTES = 2 * 10**9
 """of all arrays once they are unpacked"""
@@ -180,6 +182,12 @@ def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_
     elif kind == _CHAR and shape.size == 2 and shape[0] == 1:
         if text := _text(_element(data, label.end, order), order):
             yield name, text
+    elif kind == _CHAR and shape.size == 2 and 0 < shape[0] <= _MOST_ELEMENTS:
+        # A list of names, filled up with blanks to one length; letters go down the columns.
+        text = _text(_element(data, label.end, order), order, _MOST_LETTERS)
+        if len(text) == np.prod(shape):
+            for i, path in enumerate(_indexed(name, shape[:1])):
+                yield path, text[i :: shape[0]].strip("\0 ")
     elif kind == _CELL:
         yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
     elif kind == _STRUCT:
@@ -193,14 +201,16 @@ def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_
         yield from _members(data, fields.end, order, paths, depth)
 
 
-def _text(element: _Element, order: str) -> str:
-    """A line of text; empty where it is long, or of no encoding that is known."""
+def _text(element: _Element, order: str, longest: int = 0) -> str:
+    """A line of text; empty where it is long, or of no encoding that is known. As it is, with the
+    blanks around it, where it may be `longest` bytes."""
     encoding = _LETTERS.get(element.kind, "")
-    if not encoding or len(element.data) > _LONGEST_TEXT:
+    if not encoding or len(element.data) > (longest or _LONGEST_TEXT):
         return ""
     if encoding == "utf-16":
         encoding += "-le" if order == "<" else "-be"
-    return bytes(element.data).decode(encoding, "replace").strip("\0 ")
+    text = bytes(element.data).decode(encoding, "replace")
+    return text if longest else text.strip("\0 ")
 
 
 def _field_names(text: bytes, width: int) -> list[str]:
