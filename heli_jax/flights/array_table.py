@@ -174,22 +174,22 @@ def open_netcdf(path: Path) -> ArrayTable:
 
     import xarray
 
-    def read() -> _DataSets:
+    def read() -> DataSets:
         # Nothing is decoded: times stay numbers, of which `time_unit` knows what they are, and
         # numbers are unpacked here as those of HDF5 are.
         # The engine is named, so that what else is installed does not decide which library reads
         # the file.
         with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_cf=False) as file:
             _require_few_cells(path, sum(v.size for v in file.variables.values()))
-            read = _DataSets()
+            read = DataSets()
             for name, variable in file.variables.items():
                 read.add(str(name), np.asarray(variable.values), variable.attrs)
             return read
 
-    return _guarded(path, "NetCDF file", read).table(str(path), "netcdf", data)
+    return guarded(path, "NetCDF file", read).table(str(path), "netcdf", data)
 
 
-class _DataSets:
+class DataSets:
     """What is read of a file whose data sets have attributes."""
 
     def __init__(self) -> None:
@@ -199,6 +199,16 @@ class _DataSets:
         self._scaled: dict[str, None] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
+        self._notes: list[str] = []
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the data sets."""
+        return tuple(self._stored)
+
+    def note(self, words: str) -> None:
+        """What else is to be said of the file."""
+        self._notes.append(words)
 
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
@@ -230,7 +240,7 @@ class _DataSets:
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or self._units[name]
-        return ArrayTable(path, kind, data, arrays, units, (*notes, *named.notes))
+        return ArrayTable(path, kind, data, arrays, units, (*notes, *self._notes, *named.notes))
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -253,8 +263,8 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem) from e
 
-    def read() -> _DataSets:
-        read = _DataSets()
+    def read() -> DataSets:
+        read = DataSets()
         cells, claimed = 0, 0
 
         # Any: h5py's classes cannot be named where it is not installed.
@@ -262,11 +272,13 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
             nonlocal cells, claimed
             if not isinstance(item, h5py.Dataset):
                 return
+            # Of a damaged file h5py gives names that are no text as bytes.
+            name = name.decode("utf-8", "replace") if isinstance(name, bytes) else name
             dotted = name.replace("/", ".") if kind == "mat 7.3" else name
             if (texts := hdf5_texts.list_of(item)) is not None:
                 read.add_texts(dotted, texts)
                 return
-            if not _holds_numbers(item.dtype, item.ndim) or hdf5_texts.is_text(item):
+            if not holds_numbers(item.dtype, item.ndim) or hdf5_texts.is_text(item):
                 return
             if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
                 return
@@ -295,10 +307,10 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
                 read.add(name, np.array([number]), {})
         return read
 
-    return _guarded(path, "HDF5 file", read).table(str(path), kind, data)
+    return guarded(path, "HDF5 file", read).table(str(path), kind, data)
 
 
-def _holds_numbers(kind: np.dtype, dimensions: int) -> bool:
+def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
     """Whether a data set is an array of numbers, or a table of named fields that are."""
     return dimensions <= (1 if kind.names else 2) and (bool(kind.names) or kind.kind in "biuf")
 
@@ -331,7 +343,7 @@ def _require_few_cells(path: Path, count: int) -> None:
         raise wrong(str(path), f"expected at most {_MOST_CELLS} values, got {count}")
 
 
-def _guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
+def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
     """What a library reads; whatever it raises of a damaged file is an error of that file."""
     import warnings
 

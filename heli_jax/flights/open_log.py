@@ -6,9 +6,13 @@ from pathlib import Path
 
 from heli_jax.flights import (
     array_table,
+    arrow_table,
     blackbox_header,
     dataflash,
     dataflash_text,
+    foreign_files,
+    json_log,
+    numpy_file,
     progress,
     ulog,
 )
@@ -28,8 +32,8 @@ _AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
 """what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
-    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet), arrays (.mat, .nc, .h5,"
-    " .hdf5) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .json), arrays "
+    "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
 )
 
 
@@ -137,6 +141,7 @@ def _reader(path: Path) -> _Reader:
         return open_csv
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
+    foreign_files.refuse(path, head)
     marked = _by_content(head)
     # What such a file begins with is the user's own text, which may look like the mark of any
     # other; but an autopilot's log may have been given the name of a table.
@@ -156,6 +161,9 @@ def _reader(path: Path) -> _Reader:
         ".bbl": open_blackbox,
         ".bfl": open_blackbox,
     }
+    by_ending |= dict.fromkeys((".npy", ".npz"), numpy_file.open_numpy)
+    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), arrow_table.open_arrow)
+    by_ending |= dict.fromkeys((".json", ".jsonl", ".ndjson"), json_log.open_json)
     if ending not in by_ending:
         raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
     return by_ending[ending]
@@ -179,6 +187,10 @@ def _by_content(head: bytes) -> _Reader | None:
         return array_table.open_netcdf
     if head.startswith(array_table.HDF5_MAGIC):
         return array_table.open_hdf5
+    if head.startswith(numpy_file.MAGIC):
+        return numpy_file.open_numpy
+    if head.startswith(arrow_table.MARK):
+        return arrow_table.open_arrow
     if dataflash_text.is_dataflash_text(head):
         return _one(dataflash_text.open_dataflash_text)
     return None

@@ -75,16 +75,17 @@ def _check_end(path: str, file: BinaryIO, size: int) -> None:
         raise wrong(path, f"expected a footer of at most {words}")
 
 
-class ParquetTable:
-    """A `Table` on a Parquet file; only the columns asked for are read."""
+class ColumnTable:
+    """A `Table` on columns of Arrow, which come in pieces."""
 
-    format = "parquet"
+    format = "arrow"
     notes: tuple[str, ...] = ()
 
-    def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
+    def __init__(
+        self, path: str, size: int, digest: Digest, schema: "pa.Schema", n_rows: int
+    ) -> None:
         self.path, self.size = path, size
-        self._digest, self._file = digest, file
-        self._schema = file.schema_arrow
+        self._digest, self._schema, self._n_rows = digest, schema, n_rows
         self.names: tuple[str, ...] = tuple(self._schema.names)
         stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
         self.units: Mapping[str, str] = {
@@ -114,7 +115,7 @@ class ParquetTable:
         needed = sorted(set(names))
         # Each piece goes to its place as it is decoded: all of them together, and an array made of
         # them, would be three times the numbers.
-        numbers = {name: np.empty(self._file.metadata.num_rows) for name in needed}
+        numbers = {name: np.empty(self._n_rows) for name in needed}
         first = 0
         for piece in self._pieces(needed):
             for name in needed:
@@ -136,7 +137,7 @@ class ParquetTable:
         surveys = []
         for name, is_nested in zip(self.names, nested, strict=True):
             if is_nested:
-                surveys.append(Survey(name, None, self._file.metadata.num_rows))
+                surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)
             values = _floats(x) if _is_number(x.type) else None
@@ -169,6 +170,20 @@ class ParquetTable:
         return pa.Table.from_batches(list(self._pieces(names)))
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
+        """The columns in pieces, in their order; all without names."""
+        raise NotImplementedError
+
+
+class ParquetTable(ColumnTable):
+    """A `Table` on a Parquet file; only the columns asked for are read."""
+
+    format = "parquet"
+
+    def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
+        super().__init__(path, size, digest, file.schema_arrow, file.metadata.num_rows)
+        self._file = file
+
+    def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
         """The columns in pieces, of as many rows together as the file says that it has.
 
         Raises:
@@ -176,7 +191,7 @@ class ParquetTable:
         """
         import pyarrow as pa
 
-        n_rows, count = self._file.metadata.num_rows, len(names or self.names)
+        n_rows, count = self._n_rows, len(names or self.names)
         if n_rows * count > _MOST_CELLS:
             problem = f"expected at most {_MOST_CELLS} values in the columns read, got"
             words = f"{problem} {n_rows * count}; read fewer columns, or resample the log"

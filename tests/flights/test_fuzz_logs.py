@@ -3,11 +3,13 @@
 `experiments/fuzz_logs.py` does the same more often.
 """
 
+import json
 import runpy
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.feather
 import pyarrow.parquet
 import pytest
 import scipy.io
@@ -43,6 +45,10 @@ FORMATS = {
     "flight.csv": csv,
     "flight.dat": csv,
     "flight.parquet": lambda path: pyarrow.parquet.write_table(pa.table({"t": T, "x": X}), path),
+    "flight.feather": lambda path: pyarrow.feather.write_feather(pa.table({"t": T, "x": X}), path),
+    "flight.npz": lambda path: np.savez_compressed(path, t=T, x=X),
+    "flight.npy": lambda path: np.save(path, np.stack([T, X], axis=1)),
+    "flight.json": lambda path: path.write_text(json.dumps({"t": T.tolist(), "x": X.tolist()})),
     "flight.mat": lambda path: scipy.io.savemat(path, {"log": {"t": T, "x": X}}),
     "flight.nc": lambda path: xarray.Dataset({"t": ("n", T), "x": ("n", X)}).to_netcdf(
         path, engine="scipy"

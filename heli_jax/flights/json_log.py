@@ -1,0 +1,160 @@
+"""Logs in JSON: records one by one or a line each (.jsonl, .ndjson), or columns by name.
+
+Records within records and lists within them are named by path, `imu.p`, `gyro[0]`, as arrays of
+MATLAB are.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax.flights.array_table import ArrayTable, DataSets
+from heli_jax.flights.csv_dates import is_date, seconds_of_dates
+from heli_jax.flights.table import shown, wrong
+from heli_jax.regular_file import read_regular
+
+_LARGEST = 500 * 10**6
+"""bytes: as objects of Python numbers take several times as much"""
+_MOST_COLUMNS = 10_000
+_MOST_TEXTS = 100
+_DEEPEST = 8
+
+
+def open_json(path: Path) -> ArrayTable:
+    """A file of JSON, or of a record a line.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no columns of numbers.
+        OSError: it cannot be read.
+    """
+    where = str(path)
+    data = read_regular(path, "a log in JSON", _LARGEST)
+    content = _parsed(where, data)
+    found = DataSets()
+    texts: list[str] = []
+    for name, values in _columns(where, content).items():
+        _add(found, name, values, texts)
+    if texts:
+        more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
+        found.note(f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}")
+    return found.table(where, "json", data)
+
+
+def _parsed(where: str, data: bytes) -> Any:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise wrong(where, "is no text in UTF-8, as JSON is") from e
+    try:
+        return json.loads(text)
+    except RecursionError as e:
+        raise wrong(where, "has records within records without end, expected a log") from e
+    except ValueError as e:
+        whole = e
+    # A record a line; the last may be cut off where a logger lost its power.
+    lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
+    records = []
+    for place, (number, line) in enumerate(lines):
+        try:
+            records.append(json.loads(line))
+        except (ValueError, RecursionError) as e:
+            if len(records) > 1 and place == len(lines) - 1:
+                break
+            problem = "is no whole JSON" if not records else "holds no record in JSON"
+            at = str(whole) if not records else str(e)
+            raise wrong(where, f"{problem} ({at})", f"line {number}") from e
+    return records
+
+
+def _columns(where: str, content: Any) -> dict[str, Any]:
+    """Columns of a file, each a list or an array, by path."""
+    if isinstance(content, list):
+        return _of_rows(where, content)
+    if isinstance(content, dict):
+        columns = dict(_within(content, "", 0))
+        if len(columns) <= _MOST_COLUMNS:
+            return columns
+    raise wrong(where, "holds no records and no columns, expected a log")
+
+
+def _within(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    """The lists in records within records by path; numbers that stand alone too, such as a rate."""
+    for key, value in record.items():
+        name = f"{path}.{key}" if path else str(key)
+        if isinstance(value, dict) and depth < _DEEPEST:
+            # Columns of pandas: {"0": 0.1, "1": 0.2}.
+            if len(value) > 1 and all(map(str.isdigit, value)):
+                yield name, list(value.values())
+            else:
+                yield from _within(value, name, depth + 1)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            yield from ((f"{name}.{n}", x) for n, x in _of_rows(name, value).items())
+        elif isinstance(value, list):
+            yield name, value
+        elif isinstance(value, int | float):
+            yield name, [value]
+
+
+def _of_rows(where: str, rows: list[Any]) -> dict[str, Any]:
+    """Columns of records or rows; what one of them lacks is missing there."""
+    if not rows or not isinstance(rows[0], dict):
+        return {"data": rows}
+    columns: dict[str, list[Any]] = {}
+    for i, row in enumerate(rows):
+        for name, value in _cells(row, "", 0) if isinstance(row, dict) else ():
+            column = columns.setdefault(name, [])
+            # Rows before that had none of this.
+            column.extend([None] * (i - len(column)))
+            column.append(value)
+        if len(columns) > _MOST_COLUMNS:
+            raise wrong(where, f"expected at most {_MOST_COLUMNS} columns")
+    return {n: x + [None] * (len(rows) - len(x)) for n, x in columns.items()}
+
+
+def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    for key, value in record.items():
+        name = f"{path}.{key}" if path else str(key)
+        if isinstance(value, dict) and depth < _DEEPEST:
+            yield from _cells(value, name, depth + 1)
+        elif isinstance(value, list):
+            yield from ((f"{name}[{i}]", x) for i, x in enumerate(value[:100]))
+        else:
+            yield name, value
+
+
+def _add(found: DataSets, name: str, values: list[Any], texts: list[str]) -> None:
+    filled = [x for x in values if x is not None]
+    if filled and all(isinstance(x, str) for x in filled):
+        if is_date(filled[0]):
+            dates = seconds_of_dates(values, None)
+            if not isinstance(dates, int):
+                found.add(name, dates.seconds, {"units": "s"})
+                return
+        if len(values) <= _MOST_TEXTS:
+            found.add_texts(name, values)
+        else:
+            texts.append(name)
+        return
+    try:
+        if filled and isinstance(filled[0], list):
+            array = np.array([[_number(x) for x in row] for row in values], np.float64)
+        else:
+            array = np.array([_number(x) for x in values], np.float64)
+    # Rows of several lengths, or something else than numbers.
+    except (TypeError, ValueError, OverflowError):
+        texts.append(name)
+        return
+    if array.size:
+        found.add(name, array, {})
+
+
+def _number(value: Any) -> float:
+    if value is None:
+        return math.nan
+    if not isinstance(value, int | float):
+        raise TypeError
+    return float(value)

@@ -1,0 +1,104 @@
+"""Arrays as NumPy saves them: one in a .npy file, several by name in an .npz archive.
+
+Without pickle, which would run what a file says: arrays of Python's objects are passed over.
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax.flights import array_table, mat_file
+from heli_jax.flights.array_table import ArrayTable, DataSets
+from heli_jax.flights.table import shown, wrong
+from heli_jax.regular_file import read_regular
+
+MAGIC = b"\x93NUMPY"
+_LARGEST = 10**9
+_MOST_TEXTS, _LONGEST = 100, 1000
+"""of a list of names, and letters of each: others are data"""
+_MOST_ARRAYS = 1000
+_TICKS = {"s": "s", "ms": "ms", "us": "us", "ns": "ns"}
+
+
+def open_numpy(path: Path) -> ArrayTable:
+    """A file of NumPy.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    where = str(path)
+    data = read_regular(path, "a file of NumPy", _LARGEST)
+    found, objects = DataSets(), []
+
+    def read() -> None:
+        for name, content in _members(where, data):
+            array = _array(content)
+            if array is None:
+                objects.append(name)
+            else:
+                _add(found, name, array)
+
+    array_table.guarded(path, "file of NumPy", read)
+    if objects:
+        listed = ", ".join(map(shown, objects[:6]))
+        words = f"objects of Python, which are not read: {listed}"
+        if not found.names:
+            problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
+            raise wrong(where, problem)
+        found.note(words)
+    return found.table(where, "numpy", data)
+
+
+def _members(where: str, data: bytes) -> Iterator[tuple[str, bytes]]:
+    """The arrays of a file by name, each as a .npy file has it."""
+    if data.startswith(MAGIC):
+        yield "data", data
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()[:_MOST_ARRAYS]
+        try:
+            mat_file.require_few_bytes(sum(m.file_size for m in members), len(data))
+        except mat_file.LargeMatFile as e:
+            raise wrong(where, str(e)) from e
+        for member in members:
+            if member.filename.endswith(".npy"):
+                yield member.filename.removesuffix(".npy"), archive.read(member)
+
+
+def _array(content: bytes) -> np.ndarray | None:
+    """The array of a .npy file; None where it holds objects."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+    shape, by_columns, dtype = (read or np.lib.format.read_array_header_2_0)(file)
+    if dtype.hasobject:
+        return None
+    count = int(np.prod(shape, dtype=object)) if shape else 1
+    begin = file.tell()
+    if count < 0 or not dtype.itemsize or count * dtype.itemsize > len(content) - begin:
+        raise ValueError("cut off")
+    array = np.frombuffer(content, dtype, count, begin)
+    return array.reshape(shape, order="F" if by_columns else "C")
+
+
+def _add(found: DataSets, name: str, array: np.ndarray) -> None:
+    if array.dtype.names is not None:
+        for field in array.dtype.names:
+            _add(found, f"{name}.{field}" if name != "data" else field, array[field])
+        return
+    kind = array.dtype.kind
+    if kind in "US" and 0 < array.size <= _MOST_TEXTS:
+        found.add_texts(name, [str(x)[:_LONGEST] for x in array.astype(str).ravel()])
+    elif kind in "mM":
+        unit, count = np.datetime_data(array.dtype)
+        if unit in _TICKS and count == 1:
+            ticks = array.astype(np.int64).astype(np.float64)
+            ticks[np.isnat(array)] = np.nan
+            found.add(name, ticks, {"units": _TICKS[unit]})
+    elif array_table.holds_numbers(array.dtype, array.ndim):
+        # In the machine's own order of bytes.
+        found.add(name, array.astype(array.dtype.newbyteorder("=")), {})

@@ -1,0 +1,126 @@
+"""Logs as users of Python and of web tools store them, and files that are refused in words."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pyarrow as pa
+import pyarrow.feather
+import pyarrow.ipc
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights.describe import describe_log
+from heli_jax.flights.open_log import open_table
+
+N = 60
+T, P = 0.02 * np.arange(N), np.sin(np.arange(N))
+FRAME = pandas.DataFrame({"t": T, "p": P})
+
+
+def arrow(path: Path, new) -> None:
+    table = pa.table({"t": T, "p": P})
+    with new(path, table.schema) as writer:
+        writer.write_table(table)
+
+
+RECORD = np.rec.fromarrays([T, P], names="t,p")
+WRITERS = {
+    "a.npz": lambda path: np.savez(path, t=T, p=P),
+    "b.npz": lambda path: np.savez_compressed(path, t=T.astype(">f8"), p=P),
+    "c.npy": lambda path: np.save(path, RECORD),
+    "d.npz": lambda path: np.savez(path, p=P, t=(T * 1e3).astype("m8[ms]")),
+    "a.feather": lambda path: pyarrow.feather.write_feather(pa.table({"t": T, "p": P}), path),
+    "a.arrow": lambda path: arrow(path, pa.ipc.new_file),
+    "a.arrows": lambda path: arrow(path, pa.ipc.new_stream),
+    "a.json": lambda path: FRAME.to_json(path, orient="records", double_precision=15),
+    "b.json": lambda path: FRAME.to_json(path, double_precision=15),
+    "c.json": lambda path: path.write_text(json.dumps({"t": T.tolist(), "p": P.tolist()})),
+    "a.jsonl": lambda path: FRAME.to_json(path, orient="records", lines=True, double_precision=15),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_columns_are_what_was_stored(tmp_path: Path, name) -> None:
+    path = tmp_path / name
+    WRITERS[name](path)
+    read = open_table(path).numbers(["t", "p"])
+    np.testing.assert_allclose(read["p"], P, rtol=0, atol=1e-14)
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.column, info.time.duration) == ("t", pytest.approx(T[-1]))
+
+
+def test_matrices_and_their_names(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.stack([T, P]))
+    assert open_table(tmp_path / "a.npy").names == ("data[0]", "data[1]")
+    np.savez(tmp_path / "a.npz", data=np.stack([T, P], axis=1), columns=["t", "p"])
+    np.testing.assert_array_equal(open_table(tmp_path / "a.npz").numbers(["data.p"])["data.p"], P)
+    FRAME.to_json(tmp_path / "a.json", orient="split", double_precision=15)
+    assert {"data.t", "data.p"} <= set(open_table(tmp_path / "a.json").names)
+
+
+def test_records_within_records_gaps_in_them_and_dates(tmp_path: Path) -> None:
+    stamps = np.datetime64("2024-03-01T12:00:00", "ms") + (1000 * T).astype("m8[ms]")
+    rows = [
+        {"time": str(s), "imu": {"gyro": [p, 2 * p]}, "mode": "hover"}
+        for s, p in zip(stamps, P.tolist(), strict=True)
+    ]
+    rows[7] = {"time": rows[7]["time"], "baro": 1.0}
+    path = tmp_path / "a.jsonl"
+    path.write_text("\n".join(map(json.dumps, rows)) + '\n{"time": "2024')
+    read = open_table(path).numbers(["imu.gyro[1]", "baro"])
+    np.testing.assert_allclose(read["imu.gyro[1]"], np.where(np.arange(N) == 7, np.nan, 2 * P))
+    assert np.flatnonzero(np.isfinite(read["baro"])).tolist() == [7]
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.column, info.time.duration) == ("time", pytest.approx(T[-1]))
+
+
+def test_no_object_of_python_is_made(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "ran",))
+
+    objects = np.array([Trap(), 1], dtype=object)
+    np.savez(tmp_path / "a.npz", allow_pickle=True, x=objects)
+    with pytest.raises(InputError, match=r"objects of Python.*numpy\.savez\(FILE, t=t, p=p\)"):
+        open_table(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", allow_pickle=True, x=objects, t=T, p=P)
+    table = open_table(tmp_path / "b.npz")
+    assert table.names == ("t", "p")
+    assert "'x'" in table.notes[0]
+    assert not (tmp_path / "ran").exists()
+
+
+def archive(name: str) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as packed:
+        packed.writestr(name, "x")
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.xlsx", archive("[Content_Types].xml"), "spreadsheet; save its sheet as CSV"),
+        ("a.csv", archive("[Content_Types].xml"), "spreadsheet; save its sheet as CSV"),
+        ("a.dat", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(99), "spreadsheet; save"),
+        ("a.zip", archive("a.csv"), "archive; unpack it"),
+        ("a.mcap", b"\x89MCAP0\r\n", "MCAP.*export its topics to CSV"),
+        ("a.db3", b"SQLite format 3\0", "bag of ROS 2; export"),
+        ("a.bag", b"#ROSBAG V2.0\n", "bag of ROS 1; export"),
+        ("a.tlog", bytes(99), "telemetry of MAVLink.*mavlogdump"),
+        ("a.pkl", b"\x80\x04", r"pickle of Python.*to_parquet"),
+        ("a.xyz", b"t,p\n", "cannot be read, expected a table"),
+    ],
+)
+def test_what_is_not_read_is_refused_with_what_to_do(tmp_path: Path, name, content, words) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        open_table(path)
+    assert "\n" not in str(caught.value)
