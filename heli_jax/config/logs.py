@@ -83,7 +83,8 @@ def _read_flight(
     instruments = instrument_signals(model, f.signals, f"{where}.signals")
     try:
         # A flight as it is unless asked otherwise: parts have initial states of their own.
-        flights = (read_parts if f.gaps == "split" else _read_one)(
+        runs = (time.runs if time is not None else None) or ""
+        flights = (read_parts if f.gaps == "split" or runs else _read_one)(
             path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=_clock(time),
@@ -98,6 +99,7 @@ def _read_flight(
             number=f.flight,
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
             follows=follows(experiment, f.rate, inputs),
+            runs=runs,
         )
     except InputError:
         raise  # it names the log and the line already

@@ -60,6 +60,8 @@ class TimeConfig(_Strict):
     """of the stamps: s, ms, us or ns"""
     rate: Positive | None = None
     """samples a second [Hz] of a file without times: of its rows, or of what `signal` counts"""
+    runs: str | None = None
+    """the column that numbers the runs of a file that holds several: each becomes a flight"""
 
     @model_validator(mode="after")
     def _one_clock(self) -> "TimeConfig":

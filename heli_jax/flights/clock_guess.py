@@ -7,6 +7,7 @@ import numpy as np
 
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.runs import restarts
 from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import likely_unit, split_unit
 
@@ -59,6 +60,7 @@ def guess_clock(
     named = [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
     # Without a name to go by, the first column that increases all along is taken, but for numbers
     # of rows. The result names it, so that a wrong guess is seen.
+    increasing += [n for n in numeric if n not in increasing and restarts(values[n]).size]
     others = [n for n in increasing if not by_name and not _counts(n, values[n])]
     for name in (*named, *others):
         return _with_unit(table, name, values[name])

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from heli_jax import units
-from heli_jax.errors import nearest
 from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import arrival_notes, counter_notes, counter_of, guess_clock
+from heli_jax.flights.clock_guess import arrival_notes, counter_notes
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -27,16 +26,16 @@ from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.row_clock import ROWS, by_rate, stated_rate
+from heli_jax.flights.row_clock import ROWS
+from heli_jax.flights.runs import clock_scale, numbering, numbering_notes, restarts, with_runs
 from heli_jax.flights.table import (
     Survey,
     Table,
-    column,
-    require_columns,
     sample_count,
     shown,
     wrong,
 )
+from heli_jax.flights.table_clock import table_clock
 from heli_jax.flights.table_view import without_copies
 from heli_jax.flights.time_units import SECONDS
 
@@ -89,6 +88,8 @@ class TimeInfo:
     they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
     `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
     clock and the rows do (`heli_jax.flights.row_clock.ROWS`); `said` where the file says so.
+    Where the time begins anew the table holds several `runs`, put one after another; where it goes
+    on `numbering` is the column that numbers them.
     """
 
     column: str
@@ -102,6 +103,8 @@ class TimeInfo:
     guessed: bool = False
     counted: float | None = None
     said: str = ""
+    runs: int = 1
+    numbering: str = ""
 
 
 @dataclass(frozen=True)
@@ -245,34 +248,20 @@ def describe_table(
     Raises:
         InputError: it has no such column.
     """
-    surveys, said = table.survey(), ""
-    if rate is not None:
-        if not (rate > 0 and np.isfinite(rate)):
-            raise wrong(table.path, f"expected a positive number of samples a second, got {rate:g}")
-        name = time.name if isinstance(time, Signal) else time
-        name = counter_of(surveys) if name is None else _asked_time(table, surveys, name).name
-        signal, guessed, unit = by_rate(rate, name), False, None
-    elif time is None:
-        # A rate in the file goes before what merely increases, as a distance may.
-        stated = stated_rate(surveys)
-        signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
-        if signal is None and stated is not None:
-            (found, said), unit = stated, None
-            signal, guessed = by_rate(found, counter_of(surveys)), True
-    else:
-        signal, guessed = _asked_time(table, surveys, time), False
-    # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
-    # guess.
-    if signal is not None and unit is not None:
-        signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    surveys = table.survey()
+    signal, guessed, said = table_clock(table, surveys, time, unit, rate)
+    starts = np.zeros(0, int)
+    if signal is not None and signal.name != ROWS:
+        table, surveys, starts = _with_runs(table, surveys, signal)
     if signal is not None and signal.name != ROWS:
         once = without_copies(table, signal.name, surveys)
         if once is not table:
             table, surveys = once, once.survey()
     marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
-    if clock is not None and said:
-        clock = replace(clock, said=said)
+    if clock is not None:
+        numbered = "" if starts.size or clock.gaps else numbering(surveys)
+        clock = replace(clock, said=said, runs=starts.size + 1, numbering=numbered)
     return LogInfo(
         path=table.path,
         format=table.format,
@@ -291,6 +280,7 @@ def describe_table(
                 if clock is None
                 else arrival_notes(clock.column, table.names)
             ),
+            *numbering_notes(clock.numbering if clock else ""),
             *marks,
         ),
     )
@@ -334,21 +324,20 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers, unit, rows=rows)
 
 
-def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Signal:
-    signal = Signal(time, "s", "s") if isinstance(time, str) else time
-    require_columns(table.path, table.names, [signal.name])
-    if _values(surveys, signal.name) is None:
-        raise wrong(table.path, "holds text, expected times", column(signal.name))
-    if signal.unit not in SECONDS:
-        if not units.is_unit(signal.unit):
-            # Of the units of time alone: the nearest of all units may be one of capacity.
-            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, SECONDS)}"
-            raise wrong(table.path, problem, column(signal.name))
-        try:
-            units.factor(signal.unit, "s")
-        except ValueError as e:
-            raise wrong(table.path, str(e), column(signal.name)) from e
-    return signal
+def _with_runs(
+    table: Table, surveys: list[Survey], signal: Signal
+) -> tuple[Table, list[Survey], np.ndarray]:
+    """The table with its runs one after another, its columns, and the rows in which the runs begin,
+    but for the first."""
+    stamps = _values(surveys, signal.name)
+    assert stamps is not None  # only a column of numbers is taken for a clock
+    starts = restarts(stamps)
+    if not starts.size:
+        return table, surveys, starts
+    found = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
+    apart = found.numbers([signal.name])[signal.name]
+    changed = [replace(s, values=apart) if s.name == signal.name else s for s in surveys]
+    return found, changed, starts
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:

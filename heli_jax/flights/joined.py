@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax import units
 from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.repeats import carried_on, first_of_each
 from heli_jax.flights.request import Request
+from heli_jax.flights.runs import clock_scale
 from heli_jax.flights.slower import SLOWER, usual_step
 from heli_jax.flights.table import Table, shown
 
@@ -110,9 +110,7 @@ def joined_log(
         return None
     signals = {s.name: numbers[s.name] for s in request.signals.values()}
     inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
-    scale = request.time.scale
-    if scale == 1.0:
-        scale = units.factor(table.time_unit(request.time.name) or request.time.unit, "s")
+    scale = clock_scale(table, request.time)
     seconds = stamps * scale
     if is_joined(seconds, signals, inputs):
         topics = topics_of(seconds, signals, table.units, request.time.name)

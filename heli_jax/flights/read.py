@@ -79,7 +79,8 @@ def read_parts(
     options: ReadOptions = _DEFAULT,
     **keywords: Any,
 ) -> tuple[Flight, ...]:
-    """Read one run from a log, split where a gap is too long to be bridged.
+    """Read one run from a log, split where a gap is too long to be bridged, or the runs of a table
+    in which the time begins anew.
 
     Args:
         path: as of `read_flight`, and so are the others.
@@ -97,7 +98,7 @@ def read_parts(
     Raises:
         InputError: as `read_flight`, or no part is left.
     """
-    options = dataclasses.replace(options, **keywords)
+    options = dataclasses.replace(options, **keywords, split=True)
     logs, request, finish = _opened(path, time, inputs, outputs, options)
     # A slow sensor whose rows are padded with marks is needed at its own instants alone.
     signals = {

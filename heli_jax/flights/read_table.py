@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
+from heli_jax.flights.clock_faults import remedy, unit_notes
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Signal, Source
@@ -22,7 +22,6 @@ from heli_jax.flights.grid import (
     Uneven,
     not_increasing,
     rounding_of,
-    shared_stamps,
     uniform_grid,
     without_overflow,
 )
@@ -49,15 +48,11 @@ from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.row_clock import ROWS, counted
+from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.slower import Timed
-from heli_jax.flights.table import Table, column, sample_count, shown, wrong
+from heli_jax.flights.table import Table, column, sample_count, wrong
 from heli_jax.flights.table_view import first_of_copies, seen_once
-from heli_jax.flights.time_units import require_likely, split_unit
-
-_MANY = 0.1
-"""part of the stamps that are not later than the one before, which no hand takes out"""
-_FEW_ROWS = 10
-"""rows out of order that are left out by hand"""
+from heli_jax.flights.time_units import require_likely
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +84,8 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     else:
         table = counted(table, request.time)
     numbers = table.numbers(request.columns)
+    if request.options.split:
+        table, numbers = _with_runs(table, request, numbers)
     joined = joined_log(table, request, numbers)
     if joined is not None:
         return joined
@@ -100,6 +97,20 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
             table = seen_once(table, rows)
         numbers = table.numbers(request.columns)
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
+
+
+def _with_runs(
+    table: Table, request: Request, numbers: dict[str, np.ndarray]
+) -> tuple[Table, dict[str, np.ndarray]]:
+    """The table with its runs one after another, and its columns (N,)."""
+    assert request.time is not None  # or `load_table` would have refused it
+    clock, runs = request.time, request.options.runs
+    inner = table.table if isinstance(table, DerivedTable) else table
+    found = with_runs(inner, clock.name, numbers, clock_scale(table, clock), runs)
+    if found is inner:
+        return table, numbers
+    whole = DerivedTable(found, table.swashplate) if isinstance(table, DerivedTable) else found
+    return whole, whole.numbers(request.columns)
 
 
 def table_window_note(loaded: LoadedTable, request: Request) -> tuple[str, ...]:
@@ -227,13 +238,10 @@ class _Stamps:
 def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
     """The stamps, finite and increasing."""
     place = column(time.name)
-    # A column of time stamps says by its type what its ticks are, whatever the user thinks.
-    stated = table.time_unit(time.name)
-    is_counted = time.scale != 1.0
-    scale = time.scale if is_counted else units.factor(stated or time.unit, "s")
+    stated, scale = table.time_unit(time.name), clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
-    is_sure = is_counted or (stated and not table.units.get(time.name))
-    said = () if is_sure else _unit_notes(time, stated)
+    is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
+    said = () if is_sure else unit_notes(time, stated)
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
@@ -246,47 +254,11 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         row, fault = back
         after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
         problem = f"the time {fault}, got {now} after {after}, expected increasing times"
-        remedy = _remedy(table, stamps, row)
-        raise wrong(table.path, f"{problem}; {remedy}", table.place(row), place)
+        words = f"{problem}; {remedy(table, stamps, row)}"
+        raise wrong(table.path, words, table.place(row), place)
     if said and not stated:
         require_likely(table.path, time.name, time.unit, stamps)
     return _Clock(stamps, scale, (*notes, *said), said)
-
-
-def _unit_notes(time: Signal, stated: str | None) -> tuple[str, ...]:
-    """A note where the file, or the name of its clock, says another unit than the configuration.
-
-    Args:
-        time: the clock and its unit, as configured.
-        stated: its unit, as the file has it.
-    """
-    named = split_unit(time.name)[1]
-    factor = units.factor(time.unit, "s")
-    if stated and not math.isclose(units.factor(stated, "s"), factor):
-        words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
-        return (f"{words}, and not in {time.unit}",)
-    if not stated and named and not math.isclose(units.factor(named, "s"), factor):
-        words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
-        return (f"{words}: if that is right, state unit: {named} beside it",)
-    return ()
-
-
-def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
-    """What to do about a stamp that is not later than the one before it, in words."""
-    # Where the one before is left out the times go on: it is the wrong one.
-    if row > 1 and stamps[row - 2] < stamps[row] and stamps[row] < stamps[row - 1]:
-        return f"{table.place(row - 1)} is out of order with those around it: leave it out"
-    steps = np.diff(stamps)
-    if shared := shared_stamps(stamps):
-        return shared
-    if np.count_nonzero(steps < 0) > _MANY * stamps.size:
-        return "sort the rows by time"
-    later = np.flatnonzero(stamps[row:] > stamps[row - 1])
-    if later.size and later[0] <= _FEW_ROWS:
-        last = row + int(later[0]) - 1
-        what = table.place(row) if last == row else f"{table.place(row)} to {table.place(last)}"
-        return f"leave {what} out"
-    return f"make two files of it, the second from {table.place(row)} on"
 
 
 def _rows(

@@ -67,6 +67,10 @@ class ReadOptions:
     follows: Mapping[tuple[str, str], bool] = field(default_factory=dict)
     """the inputs that an output follows within a sample of the rate, as (input, output), and
     whether it does so at the very sample; such held inputs are low-passed as the output is"""
+    runs: str = ""
+    """the column of a table that numbers its runs"""
+    split: bool = False
+    """whether runs are told by a time that begins anew, to become flights of their own"""
 
 
 class Request:
@@ -105,7 +109,8 @@ class Request:
     def columns(self) -> list[str]:
         """The columns to read, each once, the time first."""
         time = [] if self.time is None else [self.time.name]
-        return list(dict.fromkeys([*time, *(s.name for s in self.signals.values())]))
+        runs = [self.options.runs] if self.options.runs else []
+        return list(dict.fromkeys([*time, *(s.name for s in self.signals.values()), *runs]))
 
     def of_kind[V](self, kind: str, samples: Mapping[tuple[str, str], V]) -> dict[str, V]:
         """The samples of all inputs or of all outputs by the model's name, in the user's order."""

@@ -7,10 +7,12 @@ from dataclasses import replace
 from heli_jax.errors import InputError
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.describe import TimeInfo, describe_table
+from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.row_clock import ROWS, CountedTable
+from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.flights.table_view import numbers_once
 
@@ -86,6 +88,17 @@ def require_clocks(
         notes.append(f"{words}, of {size} samples, for which there is no clock")
 
 
+def in_runs(table: Table, clock: TimeInfo) -> Table:
+    """A table whose runs follow one another, where its clock begins anew."""
+    if clock.runs < 2:
+        return table
+    # As `describe_table` saw them.
+    scale = clock_scale(
+        table, Signal(clock.column, clock.unit, "s", scale=1.0 / (clock.counted or 1.0))
+    )
+    return with_runs(table, clock.column, table.numbers([clock.column]), scale)
+
+
 def clock_words(clock: TimeInfo) -> str:
     """What is taken for a clock of so many samples a second, in words."""
     what = "rows" if clock.column == ROWS else shown(clock.column)
@@ -134,6 +147,9 @@ def _table_topic(
     # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
+    if clock.runs > 1:
+        table = in_runs(table, clock)
+        notes += table.notes[-1:]
     if is_rows:
         numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
     else:

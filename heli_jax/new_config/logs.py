@@ -17,7 +17,7 @@ from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.flights.table_topics import clock_words
+from heli_jax.flights.table_topics import clock_words, in_runs
 from heli_jax.flights.table_view import numbers_once
 from heli_jax.new_config.guess import Series
 
@@ -101,8 +101,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
     if time.said:
         notes = (f"{clock_words(time)}, as the file says: {time.said}",)
     clock = time.column
-    if clock == ROWS:
-        table = CountedTable(table)
+    table = CountedTable(table) if clock == ROWS else in_runs(table, time)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
@@ -118,6 +117,8 @@ def _read_table(table: Table, rate: float | None) -> Log:
         if n != clock and _is_known(values[n])
     }
     notes += arrival_notes(clock, names)
+    if time.runs > 1:
+        notes += table.notes[-1:]
     if others:
         listed = ", ".join(map(shown, others[:6]))
         words = shown(clock) if clock != ROWS else "the others"

@@ -177,9 +177,11 @@ def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
     if not time.uniform or time.gaps:
         longest = max((g.length for g in time.gaps), default=0.0)
-        words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s"
+        words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s; fail refuses long ones"
+        if time.runs > 1:
+            words = f"{time.runs} runs, in each of which the time begins anew"
         lines += [
-            f"    gaps: split                  # {words}; fail refuses long ones",
+            f"    gaps: split                  # {words}",
             f"    rate: {rate or two_digits(time.rate):g}".ljust(33)
             + ("# Hz; the log has no even steps" if rate is None else _ROWS_OF_TOPICS),
         ]
@@ -225,17 +227,21 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
 
 def _time(time: TimeInfo) -> str:
     """The clock of a table."""
+    runs = f", runs: {_value(time.numbering)}" if time.numbering else ""
     if time.counted is None:
         unit = "" if time.unit == "s" else f", unit: {time.unit}"
-        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
-        return f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}"
+        guesses = ["the unit, by its steps"] * time.guessed + ["that each run is a flight"] * bool(
+            runs
+        )
+        guessed = f"   # GUESS: {'; '.join(guesses)}" if guesses else ""
+        return f"      time: {{signal: {_value(time.column)}{unit}{runs}}}{guessed}"
     counter = "" if time.column == ROWS else f"signal: {_value(time.column)}, "
     if math.isnan(time.counted):
         return (
             f"      time: {{{counter}rate: {EDIT}}}   # Hz, samples a second: no column is a time"
         )
     said = f"   # GUESS: the file says {_comment(time.said)}" if time.said else ""
-    return f"      time: {{{counter}rate: {time.counted:.10g}}}{said}"
+    return f"      time: {{{counter}rate: {time.counted:.10g}{runs}}}{said}"
 
 
 def _preset(preset: str, outputs: Sequence[str]) -> list[str]:

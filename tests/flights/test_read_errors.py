@@ -181,7 +181,7 @@ def test_file_that_may_not_be_read(tmp_path, monkeypatch):
     refused(path, "Permission denied")
 
 
-@pytest.mark.parametrize("ending", [".xlsx", ""])
+@pytest.mark.parametrize("ending", [".sav", ""])
 def test_other_formats(tmp_path, ending):
     path = tmp_path / f"flight{ending}"
     path.write_bytes(b"ULog")
