@@ -10,7 +10,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
-from heli_jax.new_config import _names
+from heli_jax.new_config import _names, guess
 from heli_jax.new_config.guess import (
     Series,
     by_motion,
@@ -508,3 +508,14 @@ def test_numbered_channels_are_guesses_and_what_follows_one_goes_before(tmp_path
     taken = next(line for line in out.read_text().splitlines() if "lat: {" in line)
     assert "chan2_raw" in taken
     assert "rollspeed follows it" in taken
+
+
+def test_counts_of_a_converter_are_no_degrees() -> None:
+    counts = Series(T, np.rint(2048 + 300 * np.sin(3 * T)))
+    for si in ("rad", "rad/s"):
+        found = guess.scaled("gyro_x_raw", counts, si)
+        assert (found.unit, found.scale, found.offset) == (si, "EDIT", pytest.approx(2048, abs=50))
+    # Neither a heading in whole degrees nor the speed of a rotor is one.
+    heading = Series(T, np.rint(200 + 90 * np.sin(3 * T)))
+    assert guess.scaled("heading", heading, "rad").unit == "deg"
+    assert guess.scaled("headspeed", counts, "rad/s").scale == 1.0

@@ -119,11 +119,15 @@ def open_mat(path: Path) -> ArrayTable:
         return _from_hdf5(path, "mat 7.3", data)
     try:
         read = mat_file.read_mat(data)
-        whole, units, notes = labelled(*read)
+        whole, units, notes = labelled(read.arrays, read.texts)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
     except mat_file.LargeMatFile as e:
         raise wrong(str(path), str(e)) from e
+    if read.objects:
+        _require_arrays(path, whole, read.objects)
+        listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
+        notes = (*notes, f"objects of MATLAB are left out: {listed}")
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     real = {name: np.real(array) for name, array in whole.items()}
@@ -139,6 +143,27 @@ def open_mat(path: Path) -> ArrayTable:
     words = f"complex numbers, of which the real part is read: {complex_ones}"
     notes = (*notes, words) if complex_ones else notes
     return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
+
+
+_WAYS = {
+    "timetable": "writetimetable({0}, 'flight.csv') writes what is read",
+    "table": "writetable({0}, 'flight.csv') writes what is read",
+    "timeseries": "save its numbers: t = {0}.Time; y = {0}.Data; save('flight.mat', 't', 'y')",
+    "iddata": "save its numbers: y = {0}.OutputData; u = {0}.InputData; Ts = {0}.Ts; "
+    "save('flight.mat', 'y', 'u', 'Ts')",
+}
+"""by class of MATLAB what makes a log of an object"""
+
+
+def _require_arrays(
+    path: Path, arrays: Mapping[str, np.ndarray], objects: Mapping[str, str]
+) -> None:
+    """Refuse a file whose numbers are all in objects."""
+    if any(x.size > 1 for x in arrays.values()):
+        return
+    name, kind = next(iter(objects.items()))
+    way = _WAYS.get(kind, "save its numbers as arrays, save('flight.mat', 't', 'y')").format(name)
+    raise wrong(str(path), f"holds {shown(name)}, a {kind} of MATLAB, which is no array; {way}")
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

@@ -2,7 +2,7 @@
 
 Source: 'MAT-File Format' of The MathWorks, levels 4 and 5. SciPy's reader is not used: of a file
 with a few flipped bytes it ends the process. What is read are numbers, structures and cells, and
-short texts; sparse arrays and objects are passed over.
+short texts; sparse arrays are passed over, and objects are named.
 """
 
 import struct
@@ -19,7 +19,7 @@ _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _CHAR, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 4, 6, 15
+_CELL, _STRUCT, _CHAR, _FIRST_NUMERIC, _LAST_NUMERIC, _OBJECT = 1, 2, 4, 6, 15, 17
 _COMPLEX = 0x800
 _LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"}
 """encodings by the number that the format has for each type of text"""
@@ -58,11 +58,18 @@ class _Element(NamedTuple):
 
 
 class MatFile(NamedTuple):
-    """The arrays of numbers of a file by path, `log.roll.data`, `runs[0].phi`, and its short texts
-    in structures and cells, `runs[0].label`."""
+    """The arrays of numbers of a file by path, `log.roll.data`, `runs[0].phi`, its short texts in
+    structures and cells, `runs[0].label`, and the classes of its objects, which are not read."""
 
     arrays: dict[str, np.ndarray]
     texts: dict[str, str]
+    objects: dict[str, str]
+
+
+class _Object(NamedTuple):
+    """A table, a timetable or another object, of which only its class is known."""
+
+    kind: str
 
 
 def read_mat(data: bytes) -> MatFile:
@@ -81,15 +88,17 @@ def read_mat(data: bytes) -> MatFile:
         else:
             found = dict(_level_4(memoryview(data)))
         return MatFile(
-            {name: x for name, x in found.items() if not isinstance(x, str)},
+            # What MATLAB keeps of objects stands behind them without a name.
+            {name: x for name, x in found.items() if isinstance(x, np.ndarray) and name},
             {name: text for name, text in found.items() if isinstance(text, str)},
+            {name: x.kind for name, x in found.items() if isinstance(x, _Object)},
         )
     except (struct.error, ValueError, UnicodeDecodeError, zlib.error) as e:
         raise DamagedMatFile("a piece of it is no array") from e
 
 
-type _Content = tuple[str, np.ndarray | str]
-"""the path of an array or a text, and what it is"""
+type _Content = tuple[str, np.ndarray | str | _Object]
+"""the path of an array, a text or an object, and what it is"""
 
 
 def _level_5(data: memoryview, order: str) -> Iterator[_Content]:
@@ -164,6 +173,14 @@ def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_
     # The class of an array is the lowest byte; those above say whether it is complex or logical.
     word = struct.unpack_from(f"{order}I", flags.data)[0]
     kind, is_complex = word & 0xFF, bool(word & _COMPLEX)
+    if kind == _OBJECT:
+        # Without a shape: its name, the system that made its class (MCOS), and the class.
+        name, system = _element(data, flags.end, order), None
+        if not prefix:
+            system = _element(data, name.end, order)
+        made = _element(data, (system or name).end, order)
+        yield prefix or _letters(name), _Object(_letters(made))
+        return
     shape, at = _numbers(data, flags.end, order)
     # As floating point: the product of what a damaged shape claims could overflow integers, and
     # come out small.
@@ -211,6 +228,10 @@ def _text(element: _Element, order: str, longest: int = 0) -> str:
         encoding += "-le" if order == "<" else "-be"
     text = bytes(element.data).decode(encoding, "replace")
     return text if longest else text.strip("\0 ")
+
+
+def _letters(element: _Element) -> str:
+    return bytes(element.data[:_LONGEST_TEXT]).decode("utf-8", "replace").strip("\0 ")
 
 
 def _field_names(text: bytes, width: int) -> list[str]:

@@ -33,6 +33,7 @@ _PULSES = (700.0, 2300.0)
 """us: what receivers and servos are sent"""
 _FULL_PULSE = 500.0
 """us from the middle to the end"""
+_ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
 _FULL_COMMAND = 500.0
 """at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
 _PARTS = 1.5
@@ -281,6 +282,8 @@ def scaled(channel: str, series: Series, si: str, full: float | None = None) -> 
         return Guess(channel, stated, remarks=(f"unit by {source}",))
     if _PULSES[0] < low and high < _PULSES[1] and high - low > 20:
         return _of_pulses(channel, values, si)
+    if _are_counts(channel, values, si):
+        return _of_counts(channel, values, si)
     if si == "rad":
         # A heading may count from 0 to a turn; a pitch angle ends at a quarter of it.
         most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
@@ -322,6 +325,21 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
         remark = f"{remark}, {_FULL_PULSE:g} us to the stop"
         return Guess(channel, "1", 1.0 / _FULL_PULSE, rest, (remark,))
     return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
+
+
+def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
+    """Whether whole numbers far from zero are those of a converter, and no angle or rate."""
+    low, high = float(np.min(values)), float(np.max(values))
+    if not _are_whole(values) or low < 0.1 * high or _ROTORS & set(words_of(channel)):
+        return False
+    # A heading has 360 degrees; nothing turns by more than 100 deg/s all the time.
+    return (si == "rad" and high > 2 * 360.0) or (si == "rad/s" and low > 100.0)
+
+
+def _of_counts(channel: str, values: np.ndarray, si: str) -> Guess:
+    rest = float(np.median(values[: max(len(values) // 100, 5)]))
+    words = f"GUESS: counts, {rest:g} at the beginning; scale: {si} for a count"
+    return Guess(channel, si, EDIT, rest, (words,))
 
 
 def _of_stick(channel: str, low: float, high: float, full: float | None) -> Guess:

@@ -1,6 +1,7 @@
 """MATLAB, NetCDF, HDF5 and columns with blanks between them, beside what SciPy and xarray wrote."""
 
 import io
+import struct
 import sys
 
 import numpy as np
@@ -160,3 +161,37 @@ def test_labels_that_tell_nothing_apart_are_no_names(tmp_path):
     assert {"out.signals[0].values", "out.signals[1].values", "out.signals.lat"} < set(table.names)
     assert {"imu.t", "imu.gyro"} < set(table.names)
     assert not table.units["imu.t"]
+
+
+def an_object(name: str, kind: str) -> bytes:
+    """A variable of MATLAB whose class is its own, as 'MAT-File Format' leaves it undescribed."""
+
+    def element(code: int, data: bytes) -> bytes:
+        return struct.pack("<2I", code, len(data)) + data + bytes(-len(data) % 8)
+
+    inner = element(6, struct.pack("<2I", 17, 0)) + element(1, name.encode())
+    inner += element(1, b"MCOS") + element(1, kind.encode())
+    return element(14, inner + element(14, bytes(40)))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [
+        ("T", "timetable", r"writetimetable\(T, 'flight.csv'\)"),
+        ("flight", "table", r"writetable\(flight"),
+        ("ts", "timeseries", r"t = ts\.Time"),
+        ("z", "iddata", r"Ts = z\.Ts"),
+        ("x", "my.class", "save its numbers as arrays"),
+    ],
+)
+def test_objects_of_matlab_are_named_with_what_to_do(tmp_path, name, kind, words):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"n": 1.0})
+    path.write_bytes(path.read_bytes() + an_object(name, kind))
+    with pytest.raises(InputError, match=f"'{name}', a {kind} of MATLAB.*{words}"):
+        open_table(path)
+    scipy.io.savemat(path, {"t": np.arange(9.0)})
+    path.write_bytes(path.read_bytes() + an_object(name, kind))
+    table = open_table(path)
+    assert table.names == ("t",)
+    assert table.notes == (f"objects of MATLAB are left out: '{name}' ({kind})",)
