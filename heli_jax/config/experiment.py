@@ -209,12 +209,30 @@ def _index(at: list[Any], name: str, where: str) -> int:
 
 def _validated(content: dict[str, Any], where: str) -> Config:
     try:
-        return Config.model_validate(content)
+        config = Config.model_validate(content)
     except pydantic.ValidationError as e:
         # An unknown key is the likeliest cause of the others (what it was meant for is missing), so
         # it comes first. One error at a time: a list of twenty is not read.
         errors = sorted(e.errors(), key=lambda error: error["type"] != "extra_forbidden")
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
+    # Where a text may stand it would be a channel's name, or a unit.
+    if place := next(_still_to_edit(content), None):
+        raise InputError(f"{where}: {_edit_words(place)}")
+    return config
+
+
+def _still_to_edit(at: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """The places in which a user has to say something yet."""
+    if at == EDIT and place:
+        yield place
+    children = at.items() if isinstance(at, dict) else enumerate(at) if isinstance(at, list) else ()
+    for key, value in children:
+        yield from _still_to_edit(value, (*place, key))
+
+
+def _edit_words(place: tuple[str | int, ...]) -> str:
+    expected = _MEANT.get(str(place[-1]), "your number")
+    return f"{_place(place)}: is still {EDIT}, expected {expected}"
 
 
 def _sentence(error: ErrorDetails) -> str:
@@ -228,9 +246,7 @@ def _sentence(error: ErrorDetails) -> str:
     if error["type"] == "missing":
         return f"{place}: missing"
     if value == EDIT:
-        return (
-            f"{place}: is still {EDIT}, expected {_MEANT.get(str(error['loc'][-1]), 'your number')}"
-        )
+        return _edit_words(error["loc"])
     # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
@@ -244,6 +260,9 @@ def _sentence(error: ErrorDetails) -> str:
 
 
 _MEANT = {
+    "signal": "the channel in the log; an output that was not logged is taken out",
+    "unit": "that of the channel's numbers in the log",
+    "rate": "samples a second, in Hz",
     "scale": "how much of the stated unit one unit of the log's own numbers is: the input's full "
     "travel in that unit over its full travel in the log",
     "start": "a value of the parameter to begin from, right to a factor of three or so",
