@@ -61,6 +61,8 @@ _SOUGHT = "no line of names stands right above rows of as many cells, most of th
 """of a file in whose first 1 MB a table was sought"""
 _FIRST = 100
 """rows in which a column's first filled cell is looked for"""
+_LARGEST_SEARCHED = 250 * 10**6
+"""bytes of rows among which comments are looked for, which needs them twice in memory"""
 _LARGEST_TEXT = 2 * 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
 
@@ -299,7 +301,7 @@ class CsvTable:
 
     def _passed_over(self) -> bool:
         """Whether comments stood among the rows, which are without them from now on."""
-        if self._is_searched or self._body.size > _LARGEST_TEXT:
+        if self._is_searched or self._body.size > _LARGEST_SEARCHED:
             return False
         self._is_searched = True
         found = without_comments(self._body)
