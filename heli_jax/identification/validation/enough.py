@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
@@ -68,7 +69,7 @@ def is_it_enough(
         *stuck(flights),
         *strays(flights),
         *quantisation(flights, at.noise.sd),
-        *smoothed(problem),
+        *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
         *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
         *late_angles(problem),
