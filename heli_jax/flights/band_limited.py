@@ -234,13 +234,7 @@ def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) 
     taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
     # As the mirror image through each end goes on: value and slope stay.
     padded = np.pad(even, taps, mode="reflect", reflect_type="odd")
-    # The kernel is tabled and interpolated: the Bessel function of its window would else be
-    # computed anew for every weight.
-    x = np.linspace(0, 1, _TABLE)
-    window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
-    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
-    # in its argument, which is the sum of the two.
-    kernel = np.sinc((PASSED + STOPPED) * _REACH * x) * window
+    x, kernel = _kernel()
     filtered = np.empty(times.size)
     at_once = max(1, _AT_ONCE // taps)
     for begin in range(0, times.size, at_once):
@@ -253,3 +247,17 @@ def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) 
         # kernel falls between samples.
         filtered[begin : begin + at_once] = np.sum(weights * samples, 1) / np.sum(weights, 1)
     return filtered
+
+
+@functools.cache
+def _kernel() -> tuple[np.ndarray, np.ndarray]:
+    """The low-pass filter's kernel at distances from 0 to its reach, which is 1.
+
+    Tabled and interpolated: the Bessel function of its window would else be computed anew for every
+    weight.
+    """
+    x = np.linspace(0, 1, _TABLE)
+    window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
+    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
+    # in its argument, which is the sum of the two.
+    return x, np.sinc((PASSED + STOPPED) * _REACH * x) * window
