@@ -1,11 +1,14 @@
 """A flybarless helicopter's roll from a real log: does a model with servo, rate loop and delay
 follow it better than a first-order lag, and does it predict what it was not fitted to?
 
-    .venv/bin/python experiments/trex550.py LOG
+    .venv/bin/python experiments/trex550.py LOG [FURTHER ...]
 
 LOG is Pitchtest.csv of github.com/dronefreak/system-identification-helicopter (MIT): an Align
-T-Rex 550, 67 s near hover at 100 Hz, with columns t, lat, p and others. Both models are fitted to
-the lateral doublets (18 to 32 s) and then fly the whole record.
+T-Rex 550, 67 s near hover at 100 Hz, with columns t, lat, p and others. The models are fitted to
+the lateral doublets (18 to 32 s) and then fly the whole record, and each FURTHER log (Hovertest.csv
+of the same machine). Beside the whole of it stands what they predict where the lateral stick moves:
+where its sd over the 4 s about a sample (two periods of a doublet) is at least a share of its sd
+over the fitted doublets.
 """
 
 import argparse
@@ -14,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy.ndimage
 
 from heli_jax import (
     Flight,
@@ -33,6 +37,10 @@ from heli_jax.naming import Scalar
 
 jax.config.update("jax_enable_x64", True)
 WINDOW = (18.0, 32.0)
+AROUND = 4.0
+"""[s] about a sample over which the stick is asked whether it moves: two periods of a doublet"""
+SHARES = (0.2, 0.25, 0.3)
+"""of the stick's sd over the fitted doublets, from which on it moves"""
 CONFIG = Path(__file__).parents[1] / "configs" / "trex550-roll.yaml"
 
 
@@ -90,12 +98,31 @@ def read(path: str, **options: Any) -> Flight:
     )
 
 
+def _flown(model: Model, params: Any, log: Flight) -> tuple[np.ndarray, np.ndarray]:
+    """Roll rate measured and simulated (N,) [rad/s]."""
+    return np.asarray(log.outputs["p"]), np.asarray(simulate(model, params, log).outputs.p)
+
+
+def _fitted(log: Flight) -> np.ndarray:
+    """Which samples (N,) lie in the fitted window."""
+    t = np.arange(log.outputs["p"].size) * log.dt
+    return (t >= WINDOW[0]) & (t <= WINDOW[1])
+
+
+def stick_sd(log: Flight) -> np.ndarray:
+    """Of the lateral stick over the `AROUND` seconds about each sample (N,)."""
+    lat, n = np.asarray(log.inputs["lat"]), round(AROUND / log.dt)
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return scipy.ndimage.uniform_filter1d(x, n)
+
+    return np.sqrt(np.maximum(mean(lat**2) - mean(lat) ** 2, 0.0))
+
+
 def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
     """VAF in the fitted window, of the whole record, and of the record without the window."""
-    flown = simulate(model, params, whole).outputs.p
-    simulated, measured = np.asarray(flown), np.asarray(whole.outputs["p"])
-    t = np.arange(measured.size) * whole.dt
-    fitted = (t >= WINDOW[0]) & (t <= WINDOW[1])
+    measured, simulated = _flown(model, params, whole)
+    fitted = _fitted(whole)
     return {
         "18-32 s": vaf(measured[fitted], simulated[fitted]),
         "whole": vaf(measured, simulated),
@@ -103,8 +130,31 @@ def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
     }
 
 
-def main(path: str) -> None:
+def where_the_stick_moves(
+    model: Model, params: Any, log: Flight, doublets: float, kept: np.ndarray
+) -> dict[float, tuple[float, float]]:
+    """Of kept samples (N,), by the share from which on the stick moves: seconds, and their VAF.
+
+    Args:
+        model: flies the log in one piece.
+        params: its parameters.
+        log: with the stick `lat` and the rate `p`.
+        doublets: the stick's sd over the fitted doublets.
+        kept: which samples may count (N,).
+    """
+    measured, simulated = _flown(model, params, log)
+    found = {}
+    for share in SHARES:
+        moves = kept & (stick_sd(log) >= share * doublets)
+        if moves.any():
+            agreed = vaf(measured[moves], simulated[moves])
+            found[share] = float(np.sum(moves) * log.dt), agreed
+    return found
+
+
+def main(path: str, further: list[str]) -> None:
     window, whole = read(path, window=WINDOW), read(path)
+    doublets = float(np.std(window.inputs["lat"]))
     print("| model | VAF 18-32 s | whole record | rest | estimates |")
     print("|---|---|---|---|---|")
     candidates = (
@@ -112,10 +162,12 @@ def main(path: str) -> None:
         flybarless(path, feedforward=False),
         flybarless(path, feedforward=True),
     )
+    moving = []
     for model, params, free in candidates:
         estimate = fit(Problem(model, params, [window], free))
         values = {n: e.value for n, e in estimate.estimates.items()}
-        seen = agreement(model, naming.replace(params, **values), whole)
+        fitted = naming.replace(params, **values)
+        seen = agreement(model, fitted, whole)
         numbers = ", ".join(
             f"{n} {e.value:.3g}" + ("" if e.sd is None else f" +- {e.sd:.1g}")
             for n, e in estimate.estimates.items()
@@ -123,6 +175,26 @@ def main(path: str) -> None:
         name = model.name + (", feed-forward" if "Kff_lat" in free else "")
         shares = " | ".join(f"{v:.4f}" for v in seen.values())
         print(f"| {name} | {shares} | {estimate.status}: {numbers} |")
+        rest = where_the_stick_moves(model, fitted, whole, doublets, ~_fitted(whole))
+        moving += [(name, Path(path).stem + ", rest", rest)]
+        for other in further:
+            log = read(other)
+            kept = np.ones(log.outputs["p"].size, bool)
+            seen_there = where_the_stick_moves(model, fitted, log, doublets, kept)
+            moving += [
+                (name, Path(other).stem, {0.0: _as_a_whole(model, fitted, log), **seen_there})
+            ]
+    print()
+    print("| model | log | stick's sd at least, of the doublets' | s | VAF |")
+    print("|---|---|---|---|---|")
+    for name, log_name, found in moving:
+        for share, (seconds, agreed) in found.items():
+            print(f"| {name} | {log_name} | {share:g} | {seconds:.1f} | {agreed:.3f} |")
+
+
+def _as_a_whole(model: Model, params: Any, log: Flight) -> tuple[float, float]:
+    measured, simulated = _flown(model, params, log)
+    return measured.size * log.dt, vaf(measured, simulated)
 
 
 if __name__ == "__main__":
@@ -130,4 +202,6 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("log", metavar="LOG")
-    main(parser.parse_args().log)
+    parser.add_argument("further", metavar="FURTHER", nargs="*", help="flown, and not fitted to")
+    options = parser.parse_args()
+    main(options.log, options.further)

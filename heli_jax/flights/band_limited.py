@@ -17,6 +17,7 @@ At 200 Hz with a fifth of a step of jitter and 5 % of the samples lost, what lie
 lost samples cannot be made up for, and a part folds; even samples have no such limit.
 """
 
+import functools
 from typing import Any, cast
 
 import numpy as np
@@ -145,33 +146,16 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
     What is looked for is the difference from straight lines (K,), so that a gap is bridged by one.
     """
     from scipy.linalg import solveh_banded
-    from scipy.signal import firwin
 
     half = _TAPS // 2
     # Behind both ends the line goes on, for the taps that reach there.
     padded = np.pad(line, half, mode="reflect", reflect_type="odd")
-    base = np.floor(at).astype(np.int64) + 1
-    columns = base[:, None] + np.arange(_TAPS)
-    weights = _sinc(at[:, None] + half - columns)
-    weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
-    # Diagonals from the middle down: LAPACK takes ten times as long for those above it.
-    # The equations of least squares: a sample and another share a weight only within the taps, so
-    # the matrix is a band.
-    band = np.zeros((_TAPS, padded.size))
-    for lag in range(_TAPS):
-        products = weights[:, : _TAPS - lag] * weights[:, lag:]
-        to = columns[:, : _TAPS - lag].ravel()
-        band[lag] += np.bincount(to, products.ravel(), padded.size)
+    columns, weights, shared = _equations(np.ascontiguousarray(at).tobytes(), padded.size)
     missing = values - np.sum(weights * padded[columns], axis=1)
     right = np.bincount(columns.ravel(), (weights * missing[:, None]).ravel(), padded.size)
-    # Any: the stubs know neither windows with a parameter nor that this one returns one array.
-    taps: Any = firwin(_TAPS - 1, 0.85, pass_zero=False, window=cast(Any, ("kaiser", 6.0)))
-    high = _PENALTY * np.asarray(taps)
-    high -= high.mean()  # straight lines, however steep, cost nothing
-    energy = np.convolve(high, high[::-1])
+    energy = _penalty()
     middle = energy.size // 2
-    for lag in range(middle + 1):
-        band[lag, : padded.size - lag] += energy[middle + lag]
+    band = shared.copy()
     # Within a gap a slow signal costs neither misfit nor penalty, and the matrix would be singular.
     # The ridge draws the difference from the line to zero.
     band[0] += ridge
@@ -186,6 +170,49 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
     # samples.
     correction = solveh_banded(band, right, lower=True)
     return (padded + correction)[half : half + line.size]
+
+
+# The channels of a topic have one clock, and each tries several ridges: two sets of stamps, those
+# that choose among them and all, serve them all.
+@functools.lru_cache(maxsize=2)
+def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which even samples each sample is a sum of (N, taps), with which weights (N, taps), and the
+    diagonals (taps, size) of the equations of least squares, with the penalty.
+
+    Args:
+        stamps: where the samples stand (N,) in steps, float64.
+        size: how many even samples there are, with those that the taps reach behind both ends.
+    """
+    at = np.frombuffer(stamps)
+    columns = np.floor(at).astype(np.int64)[:, None] + 1 + np.arange(_TAPS)
+    weights = _sinc(at[:, None] + _TAPS // 2 - columns)
+    weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
+    # Diagonals from the middle down: LAPACK takes ten times as long for those above it.
+    # A sample and another share a weight only within the taps, so the matrix is a band.
+    band = np.zeros((_TAPS, size))
+    for lag in range(_TAPS):
+        products = weights[:, : _TAPS - lag] * weights[:, lag:]
+        to = columns[:, : _TAPS - lag].ravel()
+        band[lag] += np.bincount(to, products.ravel(), size)
+    energy = _penalty()
+    middle = energy.size // 2
+    for lag in range(middle + 1):
+        band[lag, : size - lag] += energy[middle + lag]
+    for array in (columns, weights, band):
+        array.setflags(write=False)
+    return columns, weights, band
+
+
+@functools.cache
+def _penalty() -> np.ndarray:
+    """The autocorrelation of the filter whose output's energy is held small."""
+    from scipy.signal import firwin
+
+    # Any: the stubs know neither windows with a parameter nor that this one returns one array.
+    taps: Any = firwin(_TAPS - 1, 0.85, pass_zero=False, window=cast(Any, ("kaiser", 6.0)))
+    high = _PENALTY * np.asarray(taps)
+    high -= high.mean()  # straight lines, however steep, cost nothing
+    return np.convolve(high, high[::-1])
 
 
 def _sinc(x: np.ndarray) -> np.ndarray:
@@ -207,13 +234,7 @@ def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) 
     taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
     # As the mirror image through each end goes on: value and slope stay.
     padded = np.pad(even, taps, mode="reflect", reflect_type="odd")
-    # The kernel is tabled and interpolated: the Bessel function of its window would else be
-    # computed anew for every weight.
-    x = np.linspace(0, 1, _TABLE)
-    window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
-    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
-    # in its argument, which is the sum of the two.
-    kernel = np.sinc((PASSED + STOPPED) * _REACH * x) * window
+    x, kernel = _kernel()
     filtered = np.empty(times.size)
     at_once = max(1, _AT_ONCE // taps)
     for begin in range(0, times.size, at_once):
@@ -226,3 +247,17 @@ def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) 
         # kernel falls between samples.
         filtered[begin : begin + at_once] = np.sum(weights * samples, 1) / np.sum(weights, 1)
     return filtered
+
+
+@functools.cache
+def _kernel() -> tuple[np.ndarray, np.ndarray]:
+    """The low-pass filter's kernel at distances from 0 to its reach, which is 1.
+
+    Tabled and interpolated: the Bessel function of its window would else be computed anew for every
+    weight.
+    """
+    x = np.linspace(0, 1, _TABLE)
+    window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
+    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
+    # in its argument, which is the sum of the two.
+    return x, np.sinc((PASSED + STOPPED) * _REACH * x) * window

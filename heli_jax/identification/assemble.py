@@ -254,7 +254,8 @@ def assemble(
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False
-    notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
+    correlated = correlated if errors.coloured else {}
+    notes = fit_notes(problem, search, optimum, e, numbers, correlated, all_white)
     notes += [*limit_notes(errors.limits), *excitation.aliasing(fast)]
     told = any(not f.by_amplitude for f in lacking)
     notes += [*closed_loop, *feedback_trust_notes(moved, Loop(found, instruments, stays))]

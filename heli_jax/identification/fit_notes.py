@@ -73,6 +73,7 @@ def fit_notes(
     e: Evaluation,
     numbers: Numbers,
     correlated: dict[str, float],
+    white: bool,
 ) -> list[str]:
     """Of the optimum, of what the method takes for granted, and of the numbers.
 
@@ -83,6 +84,7 @@ def fit_notes(
         e: at the optimum.
         numbers: all that was estimated.
         correlated: by pair of outputs the correlations that the intervals allow for.
+        white: whether all residuals, or innovations, are white.
     """
     layout, data, best = search.layout, search.data, optimum.best
     none, absent = no_disturbance(optimum), absent_names(layout, optimum)
@@ -92,7 +94,7 @@ def fit_notes(
         *bound_notes(numbers.of_interest),
         # Rounding has a remedy of its own.
         *([] if numbers.ill else _stopped_notes(layout, best, optimum)),
-        *_disturbance_notes(optimum.ratio if none else None),
+        *_disturbance_notes(optimum.ratio if none else None, white),
         *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
         *_absent_notes(layout, optimum.absent),
         *of_disturbances(layout, e, absent),
@@ -130,12 +132,18 @@ def _correlation_notes(correlated: dict[str, float]) -> list[str]:
     return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
 
 
-def _disturbance_notes(ratio: float | None) -> list[str]:
+def _disturbance_notes(ratio: float | None, white: bool) -> list[str]:
     if ratio is None:
         return []
+    gained = f"(twice the log-likelihood gained by one is {ratio:.2g})"
+    if white:
+        words = "output error suffices, and these are its numbers."
+        return [f"No disturbance shows in the record {gained}: {words}"]
+    # Output error by its own name allows for what is left; a filter's intervals do not.
     return [
-        "No disturbance shows in the record (twice the log-likelihood gained by one is "
-        f"{ratio:.2g}): output error suffices, and these are its numbers."
+        f"No disturbance of this kind shows in the record {gained}: these are the estimates of "
+        "output error, whose residuals are not white, and the intervals are too narrow. "
+        "output-error by name has intervals that allow for it."
     ]
 
 

@@ -26,6 +26,11 @@ from heli_jax.identification.estimation.measured_signals import (
     measured_signals,
     signals,
 )
+from heli_jax.identification.estimation.noiseless_outputs import (
+    REMEDY,
+    noiseless,
+    noiseless_words,
+)
 from heli_jax.identification.estimation.noisy_scales import (
     free_scales,
     not_attenuating,
@@ -257,12 +262,7 @@ class FilterError(Estimator):
     ) -> list[str]:
         """What is wrong with the filter, and the remedy."""
         if ill:
-            return [
-                "The Kalman filter is ill-conditioned: next to the disturbance the measurement "
-                "noise is too small for the digits of a computer. These numbers are no result. "
-                "State a measurement noise (sd) of at least the log's resolution, or begin with a "
-                "smaller sigma_w."
-            ]
+            return [_ILL + (_of_noiseless(data) or _OF_LITTLE_NOISE)]
         if layout.concentrated:
             return []
         size = float(np.sqrt(innovation_sums(e, noise)[0] / measured_count(data)))
@@ -273,6 +273,27 @@ class FilterError(Estimator):
             f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
             "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
         ]
+
+
+_ILL = (
+    "The Kalman filter is ill-conditioned: next to the disturbance the measurement noise is too "
+    "small for the digits of a computer. These numbers are no result. "
+)
+_OF_LITTLE_NOISE = (
+    "State a measurement noise (sd) of at least the log's resolution, or begin with a smaller "
+    "sigma_w."
+)
+
+
+def _of_noiseless(data: Data) -> str:
+    """Why there is no noise to be found, and what to do, of the first flight with outputs that have
+    none; "" where all have some."""
+    for flight in data.flights:
+        outputs = {n: np.asarray(y) for n, y in flight.outputs.items()}
+        if names := noiseless(outputs):
+            words = noiseless_words({n: outputs[n] for n in names}, float(flight.dt))
+            return f"{words}. {REMEDY}"
+    return ""
 
 
 def filtered_flights(

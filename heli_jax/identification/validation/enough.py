@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
@@ -35,6 +36,7 @@ from heli_jax.identification.validation.signal_signs import (
     rate_against_angle,
     sticks_of,
 )
+from heli_jax.identification.validation.smoothed import smoothed
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -67,6 +69,7 @@ def is_it_enough(
         *stuck(flights),
         *strays(flights),
         *quantisation(flights, at.noise.sd),
+        *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
         *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
         *late_angles(problem),
@@ -113,5 +116,8 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
     if present:
         doubts = [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
         return [*doubts, *aside]
-    words = f"no input follows the response (p {least.p_value:.2g} of {least.input})."
+    words = (
+        "no input follows what is unforeseen of the response (p-value "
+        f"{least.p_value:.2g} for {least.input})."
+    )
     return [Finding("feedback", "ok", words, least.p_value, criterion), *aside]
