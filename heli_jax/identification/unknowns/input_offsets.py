@@ -23,6 +23,8 @@ from heli_jax.vehicle import of_helicopter
 
 _EXPLAINED = 1e-6
 """part of an offset's response that initial states and biases leave over where they explain it"""
+_ALLOWED = 10.0
+"""times what was measured: the sd of the weak prior of a bias or an initial state"""
 _HUGE = 1e100
 _POINTS = 200
 """samples at which the responses are compared"""
@@ -101,7 +103,7 @@ def _unexplained(model: Model, params: Any, flight: Flight) -> np.ndarray:
     measured = np.array([_rms(flight.outputs[n]) for n in sorted(flight.outputs)])
     by_output = columns.reshape(_POINTS + 1, p, -1)
     shown = np.sqrt(np.mean(np.square(by_output), axis=0)) / measured[:, None]
-    return np.where(np.max(shown, axis=0) @ needed > 1.0, 1.0, left)
+    return np.where(np.max(shown, axis=0) @ needed > _ALLOWED, 1.0, left)
 
 
 def _excursions(model: Model, flight: Flight) -> np.ndarray:
