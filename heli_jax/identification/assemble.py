@@ -75,6 +75,7 @@ from heli_jax.identification.validation.inputs_explain import unless_inputs_expl
 from heli_jax.identification.validation.late_stick import late_stick, with_late_stick
 from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
+from heli_jax.identification.validation.noisy_inputs import noisy_inputs, with_noisy_inputs
 from heli_jax.identification.validation.unmodelled import unasked, unmodelled, with_unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
@@ -249,6 +250,9 @@ def assemble(
         named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
         late = late_stick(problem, solution, e, named)
         adequacy = with_late_stick(adequacy, late)
+    if bool(best.converged) and not (ahead or instruments):
+        named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
+        adequacy = with_noisy_inputs(adequacy, noisy_inputs(problem, solution, e, named))
     adequacy = adequacy.doubted(delay_doubts(problem, estimates))
     stays = stays and WRONG_OPTIMUM not in adequacy.advice
     if adequacy.by_chance:

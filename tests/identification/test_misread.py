@@ -1,12 +1,16 @@
 """Numbers that are hardly what they are taken for, from the table to the first line of a fit."""
 
+import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import yaml
 
 from heli_jax import config as configuration
+from heli_jax import models
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.identification.validation.late_angles import lateness
@@ -19,6 +23,10 @@ DT, N = 0.02, 1000
 T = DT * np.arange(N)
 U = 0.1 * np.sign(np.sin(2.3 * T) + 0.5 * np.sin(5.1 * T)) + 0.02 * np.sin(11.0 * T)
 P = 0.4 * np.sin(1.7 * T) + 0.2 * np.cos(4.3 * T)
+
+
+class Motor(NamedTuple):
+    tau: float
 
 
 def facts(problem):
@@ -57,8 +65,6 @@ def flights(experiment):
 
 def of(found):
     """The parts of a problem that these questions ask for."""
-    from types import SimpleNamespace
-
     from heli_jax import linear_model
 
     return SimpleNamespace(training=found, model=linear_model("roll-flybarless").model)
@@ -165,3 +171,17 @@ def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
         assert lateness(log[angle], log[rate], 0.01) is None
         ratio = angle_over_rate(log[angle], log[rate], 0.01)
         assert ratio is None or ratio[0] > 0
+
+
+def test_the_shaft_of_a_motor_may_turn(load):
+    found = of(flights(load(100.0 * P, unit_of_p="rad/s")))
+    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
+    [flight] = found.training
+    renamed = dataclasses.replace(
+        flight,
+        outputs={"speed": flight.outputs["p"]},
+        source=dataclasses.replace(flight.source, outputs={"speed": flight.source.outputs["p"]}),
+    )
+    # No attitude and no rate of a fuselage: of how fast it may turn nothing is known.
+    motor = dataclasses.replace(models.roll_on_stand, axes=(), Params=Motor)
+    assert misread(SimpleNamespace(training=(renamed,), model=motor)) == []

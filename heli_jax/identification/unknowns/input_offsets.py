@@ -23,6 +23,8 @@ from heli_jax.vehicle import of_helicopter
 
 _EXPLAINED = 1e-6
 """part of an offset's response that initial states and biases leave over where they explain it"""
+_ALLOWED = 10.0
+"""times what was measured: the sd of the weak prior of a bias or an initial state"""
 _HUGE = 1e100
 _POINTS = 200
 """samples at which the responses are compared"""
@@ -68,7 +70,9 @@ def _unexplained(model: Model, params: Any, flight: Flight) -> np.ndarray:
     """Of the response to a constant offset of each input (m,) the part that no initial state and no
     constant in the outputs explains, of the model linearised at the flight's mean inputs.
 
-    1 for all of them where the model cannot be linearised there or is unstable over the record.
+    1 for all of them where the model cannot be linearised there or is unstable over the record, and
+    for an input whose offset, as large as its largest excursion, only initial states or constants
+    explain that are larger than what was measured.
     """
     response = _responses(model, params, flight)
     n, m = len(naming.names(model.State)), len(naming.names(model.Inputs))
@@ -85,11 +89,37 @@ def _unexplained(model: Model, params: Any, flight: Flight) -> np.ndarray:
     )
     Q, R = factors[:2]
     # Pivoted, so that dependent columns come last: an angle's initial value is a constant in it.
-    Q = Q[:, np.abs(np.diag(R)) > 1e-10 * np.abs(R[0, 0])]
+    kept = np.abs(np.diag(R)) > 1e-10 * np.abs(R[0, 0])
+    Q, R = Q[:, kept], R[np.ix_(kept, kept)]
     rest = driven - Q @ (Q.T @ driven)
     size = np.linalg.norm(driven, axis=0)
     # An input that no output shows has no offset to be found.
-    return np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros(m), where=size > 0)
+    left = np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros(m), where=size > 0)
+    # A slow mode (the spiral of an aeroplane) goes far in the end, though not in the record: a
+    # constant that stands for its whole way is one that the weak prior of the bias forbids.
+    needed = np.abs(scipy.linalg.solve_triangular(R, Q.T @ driven))
+    needed *= _excursions(model, flight)
+    columns = (others / np.where(sizes > 0, sizes, 1.0))[:, factors[2][kept]]
+    measured = np.array([_rms(flight.outputs[n]) for n in sorted(flight.outputs)])
+    by_output = columns.reshape(_POINTS + 1, p, -1)
+    shown = np.sqrt(np.mean(np.square(by_output), axis=0)) / measured[:, None]
+    return np.where(np.max(shown, axis=0) @ needed > _ALLOWED, 1.0, left)
+
+
+def _excursions(model: Model, flight: Flight) -> np.ndarray:
+    """How far each input goes from its mean (m,)."""
+    return np.array(
+        [
+            np.ptp(flight.inputs[n]) / 2.0 if n in flight.inputs else 0.0
+            for n in naming.names(model.Inputs)
+        ]
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    """Of what was measured; infinite where nothing was."""
+    rms = float(np.sqrt(np.nanmean(np.square(values)))) if np.isfinite(values).any() else 0.0
+    return rms if rms > 0 else np.inf
 
 
 def _responses(model: Model, params: Any, flight: Flight) -> np.ndarray:

@@ -27,11 +27,14 @@ from heli_jax.identification.validation.signal_quality import (
     facts_of,
 )
 from heli_jax.identification.validation.signal_signs import contradictions, rate_against_angle
+from heli_jax.vehicle import of_helicopter
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
 """rad and rad/s that a small helicopter does not exceed, but for its heading"""
 _LINEAR_ANGLE, _LINEAR_RATE = np.pi / 2, 8.0
 """rad and rad/s up to which a linear model may mean something"""
+_ATTITUDE = {"p", "q", "r", "phi", "theta", "psi", "roll", "pitch", "yaw"}
+"""what the outputs of models without axes (kinematics) and of files are called then"""
 _FLOWN_TURNS = 5.0
 """turns that rolls and loops may add up to in an angle without jumps"""
 _HEADING_TURNS = 20.0
@@ -151,7 +154,10 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
             continue
         seen = np.abs(values[np.isfinite(values)])
-        if not seen.size:
+        unit = "deg" if signal.unit == "rad" else "deg/s"
+        # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage.
+        judged = _of_fuselage(problem, str(name)) or signal.contradicted == unit
+        if not seen.size or not judged:
             continue
         size, linear = float(np.percentile(seen, _MOST)), problem.model.linear
         if signal.unit == "rad/s":
@@ -163,7 +169,6 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         impossible, most = limits[0], limits[1] if linear else limits[0]
         if size <= most:
             continue
-        unit = "deg" if signal.unit == "rad" else "deg/s"
         whose = (
             "a linear model says nothing of" if size <= impossible else "no small helicopter has"
         )
@@ -185,6 +190,13 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         certain = (size > impossible and not flown) or signal.contradicted == unit
         sure = f"{name} looks like {unit} read as {signal.unit}" if certain else ""
         yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
+
+
+def _of_fuselage(problem: Problem, name: str) -> bool:
+    """Whether an output is an attitude or a rate of the machine, and no other angle of it."""
+    model = problem.model
+    of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
+    return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
 
 
 def _flown(problem: Problem, flight: Flight, name: str, size: float) -> bool:

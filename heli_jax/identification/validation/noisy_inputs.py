@@ -1,0 +1,196 @@
+"""Inputs that were measured with noise: errors in variables.
+
+A rotor's speed or the position of a surface is an input that a sensor measured. The model is driven
+by its noise as well, which the machine never felt: estimates are drawn towards less response
+(attenuation; Fuller, Measurement Error Models, 1987), with residuals that hardly
+show it. A command is another matter: its noise acts. What tells the two apart is the residual: the
+noise of a sensor is in it with the response that the model has to it, that of a command is not.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.signal
+
+from heli_jax import naming
+from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Solution
+from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.other_hold import pseudoinverse
+from heli_jax.numerics.white_noise import white_part
+
+_MATTERS = 0.5
+"""sds of an estimate by which the noise has to move it"""
+_CLEAR = 4.0
+"""sds from zero of the part of the noise that the residual has in it"""
+_MOST_OFF = 4.0
+"""sds from one of that part"""
+_DRAWS = 3
+"""of noise, each with either sign, by which the shift is found"""
+_WINDOW = 9
+"""samples of the parabola that is taken for the motion"""
+_FEWEST = 100
+"""samples of a flight"""
+_MOST = 3
+"""parameters that are named"""
+
+
+class NoisyInput(NamedTuple):
+    """An input whose noise no machine felt."""
+
+    name: str
+    unit: str | None
+    noise: float
+    """its sd, in the input's unit"""
+    moved: Mapping[str, tuple[float, float]]
+    """by parameter how far it moves the estimate: part of its value, and sds"""
+
+    @property
+    def words(self) -> str:
+        """For the verdict."""
+        return f"{self.name} is measured with noise, which moves {_largest(self.moved)[0][0]}"
+
+    @property
+    def sentence(self) -> str:
+        """For the notes of a fit."""
+        each = [
+            f"{n} by about {100 * part:+.2g} % ({abs(sds):.2g} sd)"
+            for n, (part, sds) in _largest(self.moved)
+        ]
+        return (
+            f"{self.name} was measured, with a noise of {self.noise:.2g} {self.unit or ''}".rstrip()
+            + f" that the machine did not feel and the model is driven by: it moves "
+            f"{', '.join(each)}, and no interval allows for that. A lower rate of the flight "
+            "averages it out; where what is commanded was logged, that is the better input."
+        )
+
+
+def noisy_inputs(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    estimates: Mapping[str, tuple[float, float | None]],
+) -> tuple[NoisyInput, ...]:
+    """The inputs whose noise is a sensor's and moves an estimate by half its sd or more.
+
+    Args:
+        problem: what was fitted.
+        at: where the fit ended.
+        e: the evaluation there.
+        estimates: value and sd of those of interest, SI.
+    """
+    layout = at.layout
+    if is_kinematic(layout.model) or layout.estimator.noise_spectrum or problem.window is not None:
+        return ()
+    found = [_of_input(problem, at, e, estimates, n) for n in naming.names(layout.model.Inputs)]
+    return tuple(one for one in found if one is not None)
+
+
+def with_noisy_inputs(adequacy: Adequacy, noisy: tuple[NoisyInput, ...]) -> Adequacy:
+    """The adequacy, no plain yes where the noise of an input moves an estimate."""
+    for one in noisy:
+        words = [*([adequacy.limited] if adequacy.limited else []), one.words]
+        remarks = (one.sentence, *adequacy.remarks)
+        adequacy = adequacy._replace(limited="; ".join(words), remarks=remarks)
+    return adequacy
+
+
+def _of_input(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    estimates: Mapping[str, tuple[float, float | None]],
+    name: str,
+) -> NoisyInput | None:
+    flights = problem.training
+    # A command in steps has no noise of a sensor; of short flights little is known.
+    if any(f.hold[name] != "linear" or f.n_samples < _FEWEST for f in flights):
+        return None
+    noise = [white_part(f.inputs[name]) for f in flights]
+    if not max(noise) > 1e-4 * max(float(np.std(f.inputs[name])) for f in flights):
+        return None
+    # By one evaluation; how far it moves the estimates takes several.
+    if not _in_residual(at, e, name):
+        return None
+    moved = _moved(problem, at, e, estimates, name, noise)
+    if not any(abs(sds) > _MATTERS for _, sds in moved.values()):
+        return None
+    return NoisyInput(name, naming.unit(at.layout.model.Inputs, name), max(noise), moved)
+
+
+def _moved(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    estimates: Mapping[str, tuple[float, float | None]],
+    name: str,
+    noise: list[float],
+) -> dict[str, tuple[float, float]]:
+    """By parameter how far noise of these sds, one of each flight, moves its estimate."""
+    # As much noise again moves the estimates as much again (Cook and Stefanski, 1994). With either
+    # sign of each draw what is of first order in it, which has no mean, goes out.
+    rng = np.random.default_rng(29)
+    q = len(at.layout.of_interest)
+    change = np.zeros(q)
+    for _ in range(_DRAWS):
+        draw = [
+            sd * rng.standard_normal(f.n_samples)
+            for sd, f in zip(noise, problem.training, strict=True)
+        ]
+        for sign in (1.0, -1.0):
+            other = evaluate(
+                at.layout, _added(at.data, name, [sign * n for n in draw]), at.noise, at.z
+            )
+            if not (np.isfinite(other.r).all() and np.isfinite(other.J).all()):
+                return {}
+            step = pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
+            change += step / (2 * _DRAWS)
+    moved = {}
+    for k, parameter in enumerate(at.layout.of_interest):
+        value, by = float(np.asarray(e.named)[k]), float(change[k] * np.asarray(e.slopes)[k])
+        sd = estimates.get(parameter, (value, None))[1]
+        if parameter in at.layout.free and value and sd:
+            moved[parameter] = (by / value, by / sd)
+    return moved
+
+
+def _in_residual(at: Solution, e: Evaluation, name: str) -> bool:
+    """Whether the residual has the response to the input's fast part in it, once."""
+    fast = [-_fast(np.asarray(getattr(f.inputs, name))) for f in at.data.flights]
+    smooth = evaluate(at.layout, _added(at.data, name, fast), at.noise, at.z)
+    d = np.asarray(smooth.r) - np.asarray(e.r)
+    if not np.isfinite(d).all():
+        return False
+    Q, _ = np.linalg.qr(np.asarray(e.J) / np.maximum(np.linalg.norm(e.J, axis=0), 1e-300))
+    d = d - Q @ (Q.T @ d)
+    power = float(d @ d)
+    if not power > 0:
+        return False
+    r = np.asarray(e.r)
+    part = -float(d @ r) / power
+    # Rows that are not white tell less than as many that are: by the products themselves.
+    sd = float(np.linalg.norm(d * (r + part * d))) / power
+    return part > _CLEAR * sd and abs(part - 1.0) < max(_MOST_OFF * sd, 0.3)
+
+
+def _largest(moved: Mapping[str, tuple[float, float]]) -> list[tuple[str, tuple[float, float]]]:
+    return sorted(moved.items(), key=lambda item: -abs(item[1][1]))[:_MOST]
+
+
+def _fast(u: np.ndarray) -> np.ndarray:
+    """What of an input (N,) is faster than a parabola over a few samples follows."""
+    return u - scipy.signal.savgol_filter(u, _WINDOW, 2)
+
+
+def _added(data: Data, name: str, more: list[np.ndarray]) -> Data:
+    """With this added to an input, one array of each flight."""
+    flights = []
+    for flight, add in zip(data.flights, more, strict=True):
+        inputs = naming.asdict(flight.inputs)
+        inputs[name] = np.asarray(inputs[name]) + np.asarray(add, np.asarray(inputs[name]).dtype)
+        flights.append(flight._replace(inputs=type(flight.inputs)(**inputs)))
+    return data._replace(flights=jax.device_put(tuple(flights)))
