@@ -175,6 +175,7 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
     layout, data, noise, z = at
     errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
     sums: dict[str, np.ndarray] = {}
+    sizes: dict[int, np.ndarray] = {}
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
         flight, part = problem.training[record.flight], slice(record.first, record.last)
         names = layout.outputs[record.flight]
@@ -185,10 +186,12 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
             continue
         X = _lines(drives, record.lines)
         y = _lines([flight.outputs[n][part] for n in names], record.lines)
-        W = np.asarray(W)
-        # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
-        S = np.linalg.inv(np.conj(np.swapaxes(W, 1, 2)) @ W)
-        size = np.sqrt(np.real(np.einsum("kii->ki", S)))
+        # Records of one length share their whitening.
+        if id(W) not in sizes:
+            root = np.linalg.inv(np.asarray(W))
+            # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
+            sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
+        size = sizes[id(W)]
         for name, found in zip(names, _in_bands(e, y, size, X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {

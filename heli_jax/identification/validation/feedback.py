@@ -108,7 +108,11 @@ def feedback(
         k, b = min(
             np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
         )
-        p, correlation, output = float(each.p_value[k, b]), float(each.correlation[k, b]), outputs[k]
+        p, correlation, output = (
+            float(each.p_value[k, b]),
+            float(each.correlation[k, b]),
+            outputs[k],
+        )
         lag, label = (blocks[b][0] * dt, blocks[b][1] * dt), flight.name or "flight 1"
         late = steps.get(name, 0) * flight.dt
         found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
@@ -433,7 +437,9 @@ class _Past:
         self._whole: np.ndarray | None = None
         # Of few signals the columns fit into the cache, and one product is quicker than many.
         few = self.z.shape[1] * _ORDERS[-1] <= _FEW
-        self._matrix = self._columns(np.arange(len(self.z) - _ORDERS[-1]), _ORDERS[-1]) if few else None
+        self._matrix = (
+            self._columns(np.arange(len(self.z) - _ORDERS[-1]), _ORDERS[-1]) if few else None
+        )
 
     def rows_of(self, y: Float[np.ndarray, "N p"]) -> tuple[np.ndarray, int]:
         """The rows (N - longest,) at which y and its past were measured, and the highest order that
@@ -442,7 +448,9 @@ class _Past:
         for order in reversed(_ORDERS):
             rows = seen
             if self.missing is not None:
-                rows = seen & ~np.any([self._lag(self.missing, k + 1) for k in range(order)], axis=0)
+                rows = seen & ~np.any(
+                    [self._lag(self.missing, k + 1) for k in range(order)], axis=0
+                )
             if rows.sum() >= _PER_UNKNOWN * (order * self.z.shape[1] + 1):
                 return rows, order
         return np.zeros(0, bool), 0
