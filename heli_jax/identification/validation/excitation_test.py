@@ -145,7 +145,7 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
             continue
         count = flight.n_samples // 2
         X, y = _lines(drives, count), _lines([flight.outputs[n] for n in names], count)
-        for name, found in zip(names, _in_bands(y, y, np.ones(y.shape), X), strict=True):
+        for name, found in zip(names, _in_bands(y, y, np.ones((len(y), 1)), X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {
         name: float(scipy.special.chdtrc(freedom, statistic))
@@ -212,11 +212,12 @@ def _lines(signals: list[np.ndarray], count: int) -> Complex[np.ndarray, "K c"]:
 def _in_bands(
     e: Complex[np.ndarray, "K p"],
     y: Complex[np.ndarray, "K p"],
-    size: Float[np.ndarray, "K p"],
+    size: Float[np.ndarray, "K s"],
     X: Complex[np.ndarray, "K m"],
 ) -> Float[np.ndarray, "p 4"]:
     """By output the test's statistic and degrees of freedom, and the powers that follow the
-    excitation of the residual and of what was measured, less what chance makes."""
+    excitation of the residual and of what was measured, less what chance makes; of one size each,
+    or (s = 1) all of the same."""
     first, lines = 0, float(max(_FIRST, 4 * X.shape[1]))
     total = np.zeros((e.shape[1], 4))
     while first + int(lines) <= len(e):
@@ -227,7 +228,8 @@ def _in_bands(
         Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
         along = np.abs(np.einsum("pii->pi", R))
         kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)
-        Q, m = np.where(kept[:, None, :], Q, 0.0), np.sum(kept, axis=1)
+        Q = np.where(kept[:, None, :], Q, 0.0)
+        m = np.broadcast_to(np.sum(kept, axis=1), (e.shape[1],))
         both = np.stack([e[band].T * over, y[band].T * over], axis=2)
         whole = np.sum(np.abs(both) ** 2, axis=1)
         parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ both) ** 2, axis=1)

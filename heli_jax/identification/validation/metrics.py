@@ -1,6 +1,6 @@
 """How well a simulated signal agrees with a measured one, and whether what is left is white."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import scipy.fft
@@ -99,7 +99,7 @@ def _padded(n: int, lags: int) -> int:
     """Samples of a transform of n, by which products up to so many lags are told from those of the
     record's end with its beginning."""
     # Beyond the lags asked for the end may wrap round.
-    return scipy.fft.next_fast_len(n + lags, real=True)
+    return cast(int, scipy.fft.next_fast_len(n + lags, real=True))
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
