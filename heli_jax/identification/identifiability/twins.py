@@ -81,8 +81,8 @@ def _alike(
 ) -> list[tuple[str, str]]:
     """Of the pairs those whose exchange leaves all linearised responses alike, up to gains."""
     flight = problem.training[0]
-    free = {n: jnp.asarray(values[n]) for n in problem.free}
-    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+    free = {n: jnp.asarray(values[n], jnp.result_type(float)) for n in problem.free}
+    known = {n: jnp.asarray(v, jnp.result_type(float)) for n, v in flight.known.items()}
     params = naming.replace(problem.vehicle, **(free | known))
     about = operating_point(
         problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps

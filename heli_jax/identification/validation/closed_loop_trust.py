@@ -305,23 +305,32 @@ def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.nd
         white = [np.einsum("kij,kj->ki", W, v) for v in (y - e, e)]
         pairs.append(np.concatenate(white, axis=1))
     p, per_line, records = lines.W[0].shape[1], 2.0 * np.pi**0.5, len(pairs)
-    shares, chances = [], []
-    for S in smoothed(pairs, _PART):
+    shares, chances = {}, {}
+    spectra = smoothed(pairs, _PART)
+    for S in spectra:
+        # Records of one length have one spectrum.
+        if len(S) in shares:
+            continue
         crossed = S[:, p:, :p]
         solved = np.linalg.solve(S[:, p:, p:], crossed)
         explained = np.einsum("kia,kia->k", np.conj(crossed), solved)
-        shares.append(np.real(explained / np.einsum("kii->k", S[:, :p, :p])))
+        shares[len(S)] = np.real(explained / np.einsum("kii->k", S[:, :p, :p]))
         width = np.maximum(LEAST, _PART * np.arange(1, len(S) + 1))
-        chances.append(np.minimum(p / (per_line * width * records), 1.0))
-    return shares, chances, per_line * LEAST * records
+        chances[len(S)] = np.minimum(p / (per_line * width * records), 1.0)
+    each = [[of[len(S)] for S in spectra] for of in (shares, chances)]
+    return each[0], each[1], per_line * LEAST * records
 
 
 def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency the part of the input that a constant gain may have brought in."""
     joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
     spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
-    direct = np.array(lines.direct)
-    return [_room(*of_record, direct) for of_record in zip(*spectra, strict=True)]
+    direct, made = np.array(lines.direct), {}
+    for W, S, See in zip(*spectra, strict=True):
+        # Records of one length have one spectrum, and one whitening.
+        if len(S) not in made:
+            made[len(S)] = _room(W, S, See, direct)
+    return [made[len(W)] for W in lines.W]
 
 
 def _room(

@@ -145,7 +145,7 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
             continue
         count = flight.n_samples // 2
         X, y = _lines(drives, count), _lines([flight.outputs[n] for n in names], count)
-        for name, found in zip(names, _in_bands(y, y, np.ones(y.shape), X), strict=True):
+        for name, found in zip(names, _in_bands(y, y, np.ones((len(y), 1)), X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {
         name: float(scipy.special.chdtrc(freedom, statistic))
@@ -175,6 +175,7 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
     layout, data, noise, z = at
     errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
     sums: dict[str, np.ndarray] = {}
+    sizes: dict[int, np.ndarray] = {}
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
         flight, part = problem.training[record.flight], slice(record.first, record.last)
         names = layout.outputs[record.flight]
@@ -185,10 +186,12 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
             continue
         X = _lines(drives, record.lines)
         y = _lines([flight.outputs[n][part] for n in names], record.lines)
-        W = np.asarray(W)
-        # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
-        S = np.linalg.inv(np.conj(np.swapaxes(W, 1, 2)) @ W)
-        size = np.sqrt(np.real(np.einsum("kii->ki", S)))
+        # Records of one length share their whitening.
+        if id(W) not in sizes:
+            root = np.linalg.inv(np.asarray(W))
+            # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
+            sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
+        size = sizes[id(W)]
         for name, found in zip(names, _in_bands(e, y, size, X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {
@@ -209,11 +212,12 @@ def _lines(signals: list[np.ndarray], count: int) -> Complex[np.ndarray, "K c"]:
 def _in_bands(
     e: Complex[np.ndarray, "K p"],
     y: Complex[np.ndarray, "K p"],
-    size: Float[np.ndarray, "K p"],
+    size: Float[np.ndarray, "K s"],
     X: Complex[np.ndarray, "K m"],
 ) -> Float[np.ndarray, "p 4"]:
     """By output the test's statistic and degrees of freedom, and the powers that follow the
-    excitation of the residual and of what was measured, less what chance makes."""
+    excitation of the residual and of what was measured, less what chance makes; of one size each,
+    or (s = 1) all of the same."""
     first, lines = 0, float(max(_FIRST, 4 * X.shape[1]))
     total = np.zeros((e.shape[1], 4))
     while first + int(lines) <= len(e):
@@ -224,7 +228,8 @@ def _in_bands(
         Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
         along = np.abs(np.einsum("pii->pi", R))
         kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)
-        Q, m = np.where(kept[:, None, :], Q, 0.0), np.sum(kept, axis=1)
+        Q = np.where(kept[:, None, :], Q, 0.0)
+        m = np.broadcast_to(np.sum(kept, axis=1), (e.shape[1],))
         both = np.stack([e[band].T * over, y[band].T * over], axis=2)
         whole = np.sum(np.abs(both) ** 2, axis=1)
         parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ both) ** 2, axis=1)

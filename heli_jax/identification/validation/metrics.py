@@ -1,8 +1,9 @@
 """How well a simulated signal agrees with a measured one, and whether what is left is white."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
+import scipy.fft
 import scipy.special
 
 
@@ -94,12 +95,18 @@ class Whiteness(NamedTuple):
     """autocorrelation at one sample, or at the shortest lag of which enough pairs are seen"""
 
 
+def _padded(n: int, lags: int) -> int:
+    """Samples of a transform of n, by which products up to so many lags are told from those of the
+    record's end with its beginning."""
+    # Beyond the lags asked for the end may wrap round.
+    return cast(int, scipy.fft.next_fast_len(n + lags, real=True))
+
+
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
     """Autocorrelation (lags + 1,) from lag 0, by the biased estimate; NaN counts as the mean."""
     r = _centred(residual)
     n = r.size
-    # Padded to twice the length, or the end of the record would wrap round onto its beginning.
-    size = 1 << (2 * n - 1).bit_length()
+    size = _padded(n, lags)
     spectrum = np.abs(np.fft.rfft(r, size)) ** 2
     # Divided by n, not by the pairs at each lag: only so is the sequence positive semi-definite.
     c = np.fft.irfft(spectrum, size)[: lags + 1] / n
@@ -116,7 +123,7 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
     """
     a, b = _centred(u), _centred(residual)
     n = a.size
-    size = 1 << (2 * n - 1).bit_length()
+    size = _padded(n, lags)
     # Gaps are at the mean and divided by n all the same: they draw the correlation towards zero.
     c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
     # The inverse transform keeps negative lags at its end.
@@ -189,15 +196,16 @@ def seen_autocorrelation(
     seen = ~np.isnan(residual)
     r = _centred(residual)
     n, count = r.size, int(seen.sum())
-    size = 1 << (2 * n - 1).bit_length()
+    at = np.arange(1, max(n // 4, 1) + 1)
+    size = _padded(n, int(at[-1]))
 
     def products(x: np.ndarray) -> np.ndarray:
         return np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)
 
     # How many pairs are seen at each lag is the autocorrelation of the mask, whole numbers but for
     # the rounding of the transform.
-    pairs, c = np.round(products(seen.astype(float))), products(r)
-    at = np.arange(1, max(n // 4, 1) + 1)
+    all_seen = n - np.arange(at[-1] + 1.0)
+    pairs, c = all_seen if count == n else np.round(products(seen.astype(float))), products(r)
     # With every second sample missing no pair is an odd lag apart; a lag of few pairs is noise that
     # the division by them would blow up.
     at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]

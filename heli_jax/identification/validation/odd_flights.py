@@ -12,7 +12,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex
 
-from heli_jax.analysis.spectra import segment_transforms, without
+from heli_jax.analysis.spectra import segment_transforms
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
@@ -73,6 +73,9 @@ class OddFlight(NamedTuple):
 class _Spectra(NamedTuple):
     inputs: Complex[np.ndarray, "k segments m"]
     outputs: Mapping[str, Complex[np.ndarray, "k segments"]]
+    inverse: Complex[np.ndarray, "k m segments"]
+    """pseudoinverse of the inputs: two sticks that move as one have no unique gains, but a
+    projection"""
 
 
 def odd_flights(flights: Sequence[Flight]) -> list[OddFlight]:
@@ -104,14 +107,19 @@ def _of_group(flights: list[Flight], names: list[str], indices: list[int]) -> li
     if not moving or length < _SHORTEST:
         return []
     spectra = [_spectra(f, moving, length) for f in flights]
-    leading = [i for i, s in enumerate(spectra) if any(_followed(s, n).any() for n in s.outputs)]
+    leading = [
+        i
+        for i, s in enumerate(spectra)
+        if any(_followed(s, n, len(s.outputs)).any() for n in s.outputs)
+    ]
     found = []
     for i, (flight, own) in enumerate(zip(flights, spectra, strict=True)):
         others = [spectra[j] for j in leading if j != i]
         # Of two that both answer, each in its own way, nobody knows which is the odd one.
         if len(others) < (2 if i in leading else 1):
             continue
-        left = {n: x for n in own.outputs if (x := _left(own, others, n)) is not None}
+        joined: dict[tuple[int, ...], _Spectra] = {}
+        left = {n: x for n in own.outputs if (x := _left(own, others, n, joined)) is not None}
         bad = tuple(n for n, x in left.items() if x > _LEFT)
         if bad:
             still = tuple(n for n in moving if not np.ptp(flight.inputs[n]) > 0)
@@ -125,7 +133,8 @@ def _spectra(flight: Flight, moving: list[str], length: int) -> _Spectra:
     seen = seen_parts([flight])
     parts = [p for p in seen.parts if p.n_samples >= length]
     if not parts or not seen.outputs:
-        return _Spectra(np.zeros((1, 0, len(moving)), complex), {})
+        nothing = np.zeros((1, 0, len(moving)), complex)
+        return _Spectra(nothing, {}, np.swapaxes(nothing, 1, 2))
     channels = [
         np.stack([p.inputs[n] for n in moving] + [p.outputs[n] for n in seen.outputs])
         for p in parts
@@ -133,12 +142,13 @@ def _spectra(flight: Flight, moving: list[str], length: int) -> _Spectra:
     made = [segment_transforms(x, flight.dt, length)[1] for x in channels]
     # Without zero frequency, which the straight lines took, and Nyquist's.
     both, m = np.concatenate(made, axis=1)[1:-1], len(moving)
-    return _Spectra(both[:, :, :m], {n: both[:, :, m + i] for i, n in enumerate(seen.outputs)})
+    outputs = {n: both[:, :, m + i] for i, n in enumerate(seen.outputs)}
+    return _Spectra(both[:, :, :m], outputs, np.linalg.pinv(both[:, :, :m]))
 
 
-def _followed(s: _Spectra, name: str) -> np.ndarray:
-    """At which frequencies (k,) an output follows the inputs, more than by chance; at none where
-    they are too few to be a band."""
+def _followed(s: _Spectra, name: str, asked: int) -> np.ndarray:
+    """At which frequencies (k,) one output of so many follows the inputs, more than by chance; at
+    none where they are too few to be a band."""
     k, segments, m = s.inputs.shape
     y = s.outputs[name]
     # Half-overlapping Hann windows are worth about 0.9 of their number.
@@ -146,30 +156,43 @@ def _followed(s: _Spectra, name: str) -> np.ndarray:
     if free < 1.0:
         return np.zeros(k, bool)
     # Of m inputs that explain nothing the multiple coherence is distributed as Beta(m, n - m).
-    chance = float(scipy.special.betaincinv(m, free, 1.0 - _CHANCE / (k * len(s.outputs))))
+    chance = float(scipy.special.betaincinv(m, free, 1.0 - _CHANCE / (k * asked)))
     power = np.sum(np.abs(y) ** 2, axis=1)
-    left = np.sum(np.abs(without(s.inputs, y)) ** 2, axis=1)
+    explained = (s.inputs @ (s.inverse @ y[:, :, None]))[:, :, 0]
+    left = np.sum(np.abs(y - explained) ** 2, axis=1)
     good = 1.0 - left / np.maximum(power, 1e-300) >= max(_COHERENT, chance)
     runs = np.convolve(good, np.ones(_BINS), "valid") == _BINS if k >= _BINS else np.zeros(0)
     return good if np.any(runs) else np.zeros(k, bool)
 
 
-def _left(own: _Spectra, others: list[_Spectra], name: str) -> float | None:
+def _together(those: Sequence[_Spectra]) -> _Spectra:
+    """Flights as one, with the outputs that all of them have."""
+    U = np.concatenate([s.inputs for s in those], axis=1)
+    names = [n for n in those[0].outputs if all(n in s.outputs for s in those)]
+    Y = {n: np.concatenate([s.outputs[n] for s in those], axis=1) for n in names}
+    return _Spectra(U, Y, np.linalg.pinv(U))
+
+
+def _left(
+    own: _Spectra, others: list[_Spectra], name: str, joined: dict[tuple[int, ...], _Spectra]
+) -> float | None:
     """Part of the power of an output that the response of other flights leaves; None where that
     cannot be asked, 0 where it leaves no more than of those."""
-    others = [s for s in others if name in s.outputs]
-    if not others:
+    those = tuple(i for i, s in enumerate(others) if name in s.outputs)
+    if not those:
         return None
-    U = np.concatenate([s.inputs for s in others], axis=1)
-    Y = np.concatenate([s.outputs[name] for s in others], axis=1)
-    good = _followed(_Spectra(U, {name: Y}), name)
+    # Outputs that the same flights have are asked of the same inputs.
+    if those not in joined:
+        joined[those] = _together([others[i] for i in those])
+    both = joined[those]
+    U, Y, good = both.inputs, both.outputs[name], _followed(both, name, 1)
     if not good.any() or not own.outputs[name].shape[1]:
         return None
     U, Y, u, y = U[good], Y[good], own.inputs[good], own.outputs[name][good]
     powers = [np.mean(np.sum(np.abs(x) ** 2, axis=0), axis=0) for x in (u, U)]
     if np.any(powers[1] < _EXCITED * powers[0]):
         return None
-    response = np.linalg.pinv(U) @ Y[:, :, None]
+    response = both.inverse[good] @ Y[:, :, None]
     left = np.mean(np.sum(np.abs(y - (u @ response)[:, :, 0]) ** 2, axis=0))
     of_others = np.mean(np.sum(np.abs(Y - (U @ response)[:, :, 0]) ** 2, axis=0))
     power = np.mean(np.sum(np.abs(y) ** 2, axis=0))

@@ -26,6 +26,10 @@ NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
 BROAD = NARROW[2:]
 _SURROGATES = 99
+_FIRST = 24
+"""of them that are asked first"""
+_CLEARLY = 0.1
+"""chance by these above which no more are asked: it is no news, however well it is known"""
 _LINES = 16_000
 """of all records together at most, the lowest of each"""
 _LEAST = 20
@@ -109,6 +113,7 @@ def strongest(
     *,
     beside: Sequence[int] = (),
     plain: bool = False,
+    least: float = 0.0,
 ) -> Strongest:
     """The strongest answer of the residual to a drive through a filter of a bank.
 
@@ -118,6 +123,7 @@ def strongest(
         bank: damping of the filters and the logarithm between their frequencies.
         beside: columns whose answer through the same filter is taken off first.
         plain: whether the drives are tried without any filter as well.
+        least: gain up to which nothing but the gain is asked, as where another answer has as much.
     """
     most = _LINES // len(records)
     records = [
@@ -139,16 +145,23 @@ def strongest(
     k = int(np.argmax(gains))
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
-    if not gain > _AT_LEAST:
+    if not gain > max(_AT_LEAST, least):
         return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])))
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
-    turns = (2.0 * np.pi * turns).astype(np.float32)
-    phases = np.cos(turns) + 1j * np.sin(turns)
-    anew = _without(known.astype(np.float32), _real(_complex(white).astype(phases.dtype) * phases))
-    anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-    chance = _by_chance(gain, _gains(asked, _complex(anew)).max(axis=(0, 1)))
+    turns, basis = (2.0 * np.pi * turns).astype(np.float32), known.astype(np.float32)
+
+    def of_chance(turns: np.ndarray) -> np.ndarray:
+        phases = np.cos(turns) + 1j * np.sin(turns)
+        anew = _without(basis, _real(_complex(white).astype(phases.dtype) * phases))
+        anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
+        return _gains(asked, _complex(anew)).max(axis=(0, 1))
+
+    others = of_chance(turns[:, :_FIRST])
+    if _by_chance(gain, others) < _CLEARLY:
+        others = np.concatenate([others, of_chance(turns[:, _FIRST:])])
+    chance = _by_chance(gain, others)
     G = asked.filters[k // len(drives), :, None]
     columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
     return Strongest(gain, chance, drive, *one, *_steps(_real(J), columns, _real(e[:, None])))

@@ -327,11 +327,15 @@ def _of_output(
     m, columns = len(moving), lines[0].drives.shape[1]
     constant = columns - changing[flights[0]].shape[1]
     linear = strongest(lines, range(m), NARROW)
-    curved = strongest(lines, range(m, constant), BROAD, beside=range(m), plain=True)
-    changed = strongest(lines, range(constant, columns), (), plain=True)
+    # Of three answers the best one, of equal ones the first: chance is asked of no other.
+    curved = strongest(
+        lines, range(m, constant), BROAD, beside=range(m), plain=True, least=linear.statistic
+    )
+    most = max(linear.statistic, curved.statistic)
+    changed = strongest(lines, range(constant, columns), (), plain=True, least=most)
     # Two numbers a line, each of the variance size**2.
     deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
-    # Of three answers the best one: each takes up a part of the others.
+    # Each takes up a part of the others.
     best = max((linear, curved, changed), key=lambda s: s.statistic)
     return _Asked(best, best is curved, best is changed, float(deviance))
 
