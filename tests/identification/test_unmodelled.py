@@ -208,7 +208,7 @@ def test_a_hole_in_the_record_makes_no_answer():
     rng = np.random.default_rng(5)
     p, joined = [], []
     for _ in range(20):
-        # Two things that know nothing of each other, both slow: both jump where samples are missing.
+        # Two slow things that know nothing of each other: both jump where samples are missing.
         u, e = wandering(rng), wandering(rng)
         columns = [with_a_hole(v) for v in (e, np.arange(N)[:, None] / N, u[:, None])]
         p.append(strongest([lines_of(*columns, [700])], [0], NARROW).p_value)
