@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,16 +17,13 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import WORST, plain_words, rounded, terse, vaf_text
+from heli_jax.numbers import WORST, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.tables.handling import handling_lines
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
-
-if TYPE_CHECKING:
-    pass
 
 
 def print_fit(run: FitRun) -> None:
@@ -48,12 +44,12 @@ def print_fit(run: FitRun) -> None:
         tell(_determined(c))
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        print_table(table.head, table.rows)
+        _tell_table(table)
         for sentence in supplementary.intervals.sentences:
             tell(f"! {sentence}")
     if supplementary.methods is not None:
         side_by_side = report_tables.methods(supplementary.methods)
-        print_table(side_by_side.head, side_by_side.rows)
+        _tell_table(side_by_side)
         for sentence in supplementary.methods.sentences:
             tell(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
@@ -73,13 +69,13 @@ def print_fit(run: FitRun) -> None:
         _print_agreement(f"{name}, held out, one step ahead", m)
     _print_handling(run)
     if (responses := report_tables.responses(fit)) is not None:
-        print_table(responses.head, responses.rows)
+        _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     tell(f"acceptance card: {summary(card(problem, fit), _GATES)}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
-        print_table(compared.head, compared.rows)
+        _tell_table(compared)
         for sentence in supplementary.choice.sentences:
             tell(sentence)
     if run.baseline is not None:
@@ -154,7 +150,13 @@ def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
     tell(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
         if table.rows:
-            print_table(table.head, table.rows)
+            _tell_table(table)
+
+
+def _tell_table(table: report_tables.Table) -> None:
+    """A table of the page, its numbers and units in ASCII as all of the terminal's."""
+    rows = [tuple(plain_cell(cell) for cell in row) for row in table.rows]
+    print_table(table.head, rows)
 
 
 def _determined(c: Combination) -> str:
