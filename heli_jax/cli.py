@@ -171,6 +171,12 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
         jax.config.update("jax_compilation_cache_dir", str(_cache()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    from heli_jax.numerics import stored
+
+    # What was traced lies beside what was compiled of it, and is kept where that is.
+    compiled: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    if compiled and jax.config.jax_enable_compilation_cache:  # pyright: ignore
+        stored.keep_in(Path(compiled) / "heli_jax-traced")
     if cpu_devices is not None:
         # Once JAX is in use their number stays as it is.
         with contextlib.suppress(RuntimeError):

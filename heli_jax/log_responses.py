@@ -19,6 +19,7 @@ from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.numbers import number, plain_words
+from heli_jax.terminal_table import print_table, tell
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
@@ -120,9 +121,9 @@ def run_responses(
         say(note)
     print_responses(found)
     for line in handling_lines(handling):
-        print(plain_words(line))
+        tell(plain_words(line))
     for sentence in (*handling_sentences(handling), *gaps):
-        print(f"! {sentence}")
+        tell(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
 
 
@@ -144,7 +145,6 @@ def not_usable(found: FlightResponses) -> tuple[str, ...]:
 def print_responses(found: FlightResponses) -> None:
     """What each response is good for, and the transfer functions, on standard output."""
     from heli_jax.report.responses import FIT_HEAD, fit_row, useful_band
-    from heli_jax.terminal_table import print_table
 
     rows = []
     for name, output in found.outputs.items():
@@ -156,17 +156,15 @@ def print_responses(found: FlightResponses) -> None:
     print_table(head, rows)
     for wanted, fit in found.fits:
         orders = f"{wanted.zeros} zeros, {wanted.poles} poles"
-        print(f"{wanted.input} to {wanted.output}, {orders}:")
+        tell(f"{wanted.input} to {wanted.output}, {orders}:")
         for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
-            print(f"  {head}: {cell}")
+            tell(f"  {head}: {cell}")
         if not fit.determined:
-            print(
-                "  the response does not determine it: fewer poles, or more excitation, is needed"
-            )
+            tell("  the response does not determine it: fewer poles, or more excitation, is needed")
         elif not fit.converged:
-            print("  the search did not converge: these numbers are no result")
+            tell("  the search did not converge: these numbers are no result")
         elif fit.chi_squared > _TOO_LARGE:
-            print(
+            tell(
                 f"  squared errors are {number(fit.chi_squared, 2)} times what the random errors "
                 "let expect: the order is too low, the machine is not linear, or a window of "
                 f"{found.window:.3g} s does not resolve it"

@@ -18,6 +18,7 @@ from heli_jax.identification.validation.chosen_windows import DETERMINES, ENOUGH
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
 from heli_jax.numerics.white_noise import noise_guess
+from heli_jax.terminal_table import print_table, tell
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""
@@ -122,12 +123,11 @@ def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -
 
 def print_ranking(ranking: Ranking) -> None:
     """The windows, best first, and those that are enough together, on standard output."""
-    from heli_jax.terminal_table import print_table
 
     if cannot_be_fitted(ranking):
         # What a window expects of a model that the samples cannot show is no recommendation.
         _print_doubts(ranking)
-        print(f"No window of {ranking.length:.3g} s is recommended.")
+        tell(f"No window of {ranking.length:.3g} s is recommended.")
         return
     taken = [choice.window for choice in ranking.taken]
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]
@@ -146,16 +146,16 @@ def print_ranking(ranking: Ranking) -> None:
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
         words = "window that says less is" if unshown == 1 else "windows that say less are"
-        print(f"{unshown} further {words} not shown.")
+        tell(f"{unshown} further {words} not shown.")
     for w in ranking.windows:
         if w.excluded:
-            print(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")
+            tell(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")
     last = ranking.taken[-1]
     together = ", ".join(
         f"{n} {_percent(s)} ({_percent(a)})"
         for n, s, a in zip(ranking.parameters, last.sd, ranking.all_sd, strict=True)
     )
-    print(
+    tell(
         f"{len(taken)} of {len(ranking.windows)} windows of {ranking.length:.3g} s say "
         f"{100 * last.efficiency:.0f} % of what all say together (at least {100 * ENOUGH:.0f} % "
         f"asked); expected sd of these (of all): {together}. At the start values, from white noise."
@@ -177,17 +177,17 @@ def not_determined(ranking: Ranking) -> tuple[str, ...]:
 def _print_doubts(ranking: Ranking) -> None:
     """What the numbers of a ranking rest on, and what speaks against the record."""
     for finding in ranking.record:
-        print(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
+        tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:
-        print(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
+        tell(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
     if sentence := too_good(finite, bool(ranking.guessed)):
-        print(f"! {sentence}")
+        tell(f"! {sentence}")
     for note in ranking.notes:
-        print(f"! {note}")
+        tell(f"! {note}")
     if names := not_determined(ranking):
         whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
-        print(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")
+        tell(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")
 
 
 def _of(w: Window) -> tuple[str, ...]:

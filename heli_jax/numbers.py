@@ -117,6 +117,15 @@ def plain_words(text: str) -> str:
     return _NUMBER.sub(lambda m: "+-" if m[0] == "±" else plain(m[0]), text)
 
 
+_POWER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
+_OF_UNITS = str.maketrans({"²": "^2", "³": "^3", "⁴": "^4", "−": "-", "∞": "inf"})
+
+
+def plain_cell(text: str) -> str:
+    """A cell of a page's table for the terminal: powers of ten, signs and units in ASCII."""
+    return _POWER.sub(lambda m: plain(m[0]), text).translate(_OF_UNITS)
+
+
 def aligned(values: Sequence[float], step: float) -> tuple[str, ...]:
     """Numbers that a step tells apart, as of an axis: all with one power of ten and as many places.
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,16 +17,13 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import WORST, plain_words, rounded, terse, vaf_text
+from heli_jax.numbers import WORST, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.tables.handling import handling_lines
-from heli_jax.terminal_table import print_table
+from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
-
-if TYPE_CHECKING:
-    pass
 
 
 def print_fit(run: FitRun) -> None:
@@ -42,20 +38,20 @@ def print_fit(run: FitRun) -> None:
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     print_table((*head[:3], fit.interval, *head[4:]), rows)
     if note := report_tables.prior_note(problem, fit):
-        print(f"! {note}")
+        tell(f"! {note}")
     # Where no optimum was reached nothing is determined.
     for c in () if stopped else fit.verdict.combinations:
-        print(_determined(c))
+        tell(_determined(c))
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        print_table(table.head, table.rows)
+        _tell_table(table)
         for sentence in supplementary.intervals.sentences:
-            print(f"! {sentence}")
+            tell(f"! {sentence}")
     if supplementary.methods is not None:
         side_by_side = report_tables.methods(supplementary.methods)
-        print_table(side_by_side.head, side_by_side.rows)
+        _tell_table(side_by_side)
         for sentence in supplementary.methods.sentences:
-            print(f"! {sentence}")
+            tell(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
     # of those held out, where a model that was fitted too closely shows.
     for name, m in fit.metrics.items():
@@ -66,26 +62,26 @@ def print_fit(run: FitRun) -> None:
         _print_agreement(f"{name}, held out, simulated", m)
     for name, m in fit.validation_free_run.items():
         if diverges(m):
-            print(f"{name}, held out, simulated in one piece: diverges")
+            tell(f"{name}, held out, simulated in one piece: diverges")
         else:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     _print_handling(run)
     if (responses := report_tables.responses(fit)) is not None:
-        print_table(responses.head, responses.rows)
+        _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    print(f"acceptance card: {summary(card(problem, fit), _GATES)}")
+    tell(f"acceptance card: {summary(card(problem, fit), _GATES)}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
-        print_table(compared.head, compared.rows)
+        _tell_table(compared)
         for sentence in supplementary.choice.sentences:
-            print(sentence)
+            tell(sentence)
     if run.baseline is not None:
         _print_baseline(run.baseline)
     if run.directory is not None:
-        print(f"report: {run.directory / 'report.html'}")
+        tell(f"report: {run.directory / 'report.html'}")
 
 
 def _print_outcome(fit: Fit) -> None:
@@ -101,10 +97,10 @@ def _print_outcome(fit: Fit) -> None:
     why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
     below = why and not fit.adequate and not fit.adequacy.unjudged
     adequate = "no (why: below)" if below else report_tables.adequate(fit)
-    print(f"{arrived}: {text} adequate: {adequate}{held}")
+    tell(f"{arrived}: {text} adequate: {adequate}{held}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
-        print(f"! {line}")
+        tell(f"! {line}")
 
 
 def _print_handling(run: FitRun) -> None:
@@ -112,10 +108,10 @@ def _print_handling(run: FitRun) -> None:
     if run.supplementary.responses is None:
         return
     for line in handling_lines(run.supplementary.responses.handling):
-        print(plain_words(line))
+        tell(plain_words(line))
     logged = {n for f in run.problem.training for n in f.outputs}
     for sentence in missing_handling(run.config, logged):
-        print(f"! {sentence}")
+        tell(f"! {sentence}")
 
 
 def run_compatibility(
@@ -137,24 +133,30 @@ def run_compatibility(
 
     place = run_directory.default_directory(Path(config)) if out is None else Path(out)
     found = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
-    print(found.verdict)
+    tell(found.verdict)
     for line in found.doubts:
-        print(f"! {line}")
+        tell(f"! {line}")
     print_table(*compatibility.table(found))
-    print(
+    tell(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
     )
-    print(f"corrections: {place / compatibility.FILE}")
-    print(f"report: {place / 'report.html'}")
+    tell(f"corrections: {place / compatibility.FILE}")
+    tell(f"report: {place / 'report.html'}")
     return found.compatible
 
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
-    print(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
+    tell(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
         if table.rows:
-            print_table(table.head, table.rows)
+            _tell_table(table)
+
+
+def _tell_table(table: report_tables.Table) -> None:
+    """A table of the page, its numbers and units in ASCII as all of the terminal's."""
+    rows = [tuple(plain_cell(cell) for cell in row) for row in table.rows]
+    print_table(table.head, rows)
 
 
 def _determined(c: Combination) -> str:
@@ -186,10 +188,10 @@ _NEAR = 10.0
 def _print_agreement(what: str, m: Metrics) -> None:
     # An unstable machine leaves any record: numbers would say nothing.
     if diverges(m, FAR):
-        print(f"{what}: diverges")
+        tell(f"{what}: diverges")
         return
     fit = "worse than the mean" if m.vaf < WORST else f"{m.nrmse_fit_percent:.1f} %"
-    print(f"{what}: VAF {vaf_text(m.vaf, '.5f')}, fit {fit}, TIC {m.tic:.4f}")
+    tell(f"{what}: VAF {vaf_text(m.vaf, '.5f')}, fit {fit}, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:
@@ -199,9 +201,9 @@ def _print_baseline(b: Baseline) -> None:
         if math.isfinite(b.metrics.vaf)
         else "its simulation diverges"
     )
-    print(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
+    tell(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
     for sentence in b.sentences:
-        print(f"  ! {sentence}")
+        tell(f"  ! {sentence}")
 
 
 def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
@@ -221,7 +223,7 @@ def print_check(check: Check) -> None:
     """The identifiability at the initial guess, on standard output."""
     verdict = check.verdict
     # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
-    print("At the start values (the fit judges at its estimates, which may differ):")
+    tell("At the start values (the fit judges at its estimates, which may differ):")
     _print_verdict(verdict)
     rows = []
     for i, name in enumerate(verdict.names):
@@ -233,13 +235,13 @@ def print_check(check: Check) -> None:
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
-        print(f"noise of {name}: {terse(sd, 3)}{guess}")
+        tell(f"noise of {name}: {terse(sd, 3)}{guess}")
     follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
     sds = np.sqrt(np.diag(verdict.covariance))
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
-        print(f"! {sentence}")
+        tell(f"! {sentence}")
     for note in check.further_notes:
-        print(f"! {note}")
+        tell(f"! {note}")
     _print_findings(check.findings)
 
 
@@ -247,21 +249,21 @@ def _print_findings(findings: Sequence[Finding]) -> None:
     """Whether the log is enough, a line each, what is worst first."""
     if not findings:
         return
-    print("\nIs this log enough?")
+    tell("\nIs this log enough?")
     for f in findings:
-        print(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
+        tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
 
 
 _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
 
 
 def _print_verdict(verdict: Verdict) -> None:
-    print(verdict.text)
+    tell(verdict.text)
     values = ", ".join(terse(s, 3) for s in verdict.singular_values)
-    print(
+    tell(
         f"rank {verdict.rank} of {len(verdict.names)} ({verdict.rank_without_priors} without "
         f"priors), condition number {terse(verdict.condition, 3)}, singular values {values}"
     )
     for direction in verdict.null_directions:
         words = ", ".join(f"{n} {v:+.4f}" for n, v in direction.items())
-        print(f"null direction (log coordinates): {words}")
+        tell(f"null direction (log coordinates): {words}")

@@ -10,7 +10,7 @@ from typing import Any
 from heli_jax import run_directory
 from heli_jax.errors import InputError
 from heli_jax.numbers import adequacy_of
-from heli_jax.terminal_table import print_table
+from heli_jax.terminal_table import print_table, tell
 
 _DEEPEST = 3
 """folders below the one that is asked for"""
@@ -78,11 +78,11 @@ def compare(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
-        print(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
+        tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
     for table in (numbered.estimates, numbered.agreement):
         print_table(table.head, list(table.rows))
     for note in numbered.notes:
-        print(f"! {note}")
+        tell(f"! {note}")
     if place is None:
         return 0
     run_directory.require_place(place, f"--out {place}")

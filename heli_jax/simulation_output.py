@@ -16,7 +16,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.flights import write as tables
 from heli_jax.numbers import terse
-from heli_jax.terminal_table import print_table
+from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def print_sweep(out: Path) -> None:
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
     # A store of an earlier version does not say: there was no other.
     backend = totals["split"].get("backend", "xla")
-    print(f"{_counted(totals['elements'])} of {totals['model']}: {words}; backend {backend}")
+    tell(f"{_counted(totals['elements'])} of {totals['model']}: {words}; backend {backend}")
     rows = []
     for name, result in totals["results"].items():
         numbers = [
@@ -154,25 +154,25 @@ def print_sweep(out: Path) -> None:
             at = ", ".join(f"{n} = {terse(v)}" for n, v in element["axes"].items())
             unit = totals["results"].get(name, {}).get("unit", "")
             value = f"{terse(element['value'])} {unit if unit != '1' else ''}".rstrip()
-            print(f"{words} {name}: {value}, element {element['element']}, {at}")
+            tell(f"{words} {name}: {value}, element {element['element']}, {at}")
     for note in totals["notes"]:
-        print(f"! {note}")
+        tell(f"! {note}")
     for name, result in totals["results"].items():
         # Quantiles are of the finite values alone: how many were not is part of the answer.
         apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}
         if sum(apart.values()):
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
             of = result["n"] + sum(apart.values())
-            print(f"! {name}: of {of} values {words}, which its line leaves out")
+            tell(f"! {name}: of {of} values {words}, which its line leaves out")
     if not totals["status"].get("ok"):
-        print("! no element is ok: see docs/sweeps.md for what each status means")
+        tell("! no element is ok: see docs/sweeps.md for what each status means")
     timing = totals["timing"]
     # A sweep that was resumed when all was there has computed nothing, and has no rate.
     if timing["computed_elements"]:
-        print(
+        tell(
             f"{_counted(timing['computed_elements'])} in {terse(timing['seconds'], 3)} s "
             f"({terse(timing['elements_per_s'], 3)} a second, with compilation)"
         )
-    print(f"store: {out / 'sweep.zarr'}")
+    tell(f"store: {out / 'sweep.zarr'}")
     if (out / "report.html").is_file():
-        print(f"report: {out / 'report.html'}")
+        tell(f"report: {out / 'report.html'}")

@@ -14,7 +14,7 @@ from heli_jax import cli_options, run_directory
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
 from heli_jax.numbers import rounded
-from heli_jax.terminal_table import print_table
+from heli_jax.terminal_table import print_table, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -74,7 +74,7 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
         carrying = studies.Options(options.resume, workers, dask, options.reports, progress, say)
         result = studies.run(study, out, carrying)
     print_study(result)
-    print(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
+    tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
     return _code(result)
 
 
@@ -96,7 +96,7 @@ def print_study(result: "xr.Dataset") -> None:
     status = [str(s) for s in flat["status"].to_numpy()]
     counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
     fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
-    print(f"{fits}: {counts}")
+    tell(f"{fits}: {counts}")
     rows = []
     for i in range(min(len(status), _MOST_ROWS)):
         one = flat.isel(fit=i)
@@ -107,10 +107,10 @@ def print_study(result: "xr.Dataset") -> None:
     outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
     print_table((*axes, "status", *parameters, *outputs), rows)
     if len(status) > _MOST_ROWS:
-        print(f"... and {len(status) - _MOST_ROWS} more")
+        tell(f"... and {len(status) - _MOST_ROWS} more")
     _print_scatter(flat, parameters)
     for run, sentence in _failures(flat):
-        print(f"! {run}: {sentence}")
+        tell(f"! {run}: {sentence}")
 
 
 def _axis(value: Any) -> str:

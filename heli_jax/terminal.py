@@ -5,12 +5,13 @@ import sys
 from collections.abc import Iterator
 
 from heli_jax import reading_progress, stage_display
+from heli_jax.terminal_table import tell
 
 
 def say(text: str) -> None:
     """Print a line."""
     # On standard error: standard output is for results, which may be piped on.
-    print(f"heli-jax: {text}", file=sys.stderr, flush=True)
+    tell(f"heli-jax: {text}", sys.stderr)
 
 
 def silent(_: str) -> None:

@@ -1,12 +1,41 @@
-"""Tables on the terminal: none of their numbers is ever cut off."""
+"""Tables and sentences on the terminal: none of their numbers is ever cut off or in two."""
 
 import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
+from typing import TextIO
 
 type _Row = tuple[str, ...]
 _BETWEEN = 3
 """columns from one column's end to the next one's beginning"""
+
+
+def tell(text: str, file: TextIO | None = None) -> None:
+    """Print sentences, on a terminal with new lines between words.
+
+    Args:
+        text: what is told; a new line in it stays one.
+        file: standard output unless given.
+    """
+    stream = sys.stdout if file is None else file
+    if stream.isatty():
+        width = shutil.get_terminal_size().columns
+        text = "\n".join(_folded(line, width) for line in text.split("\n"))
+    print(text, file=stream, flush=stream is sys.stderr)
+
+
+def _folded(line: str, width: int) -> str:
+    # A terminal would begin a new line within a number. What is one word, such as a path, it may.
+    indent = " " * (len(line) - len(line.lstrip()) + 2)
+    return textwrap.fill(
+        line,
+        max(width, 20),
+        subsequent_indent=indent,
+        replace_whitespace=False,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def print_table(head: _Row, rows: list[_Row]) -> None:

@@ -29,7 +29,7 @@ ALLOWED = {
     "units": {"errors", "unit_spelling"},
     "pickled": set(),
     "naming": {"pickled"},
-    "numerics": {"naming"},
+    "numerics": {"naming", "versions"},
     "versions": set(),
     "yaml_file": {"errors", "regular_file"},
     "numbers": set(),

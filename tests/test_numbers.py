@@ -78,3 +78,17 @@ def test_a_vaf_far_below_zero_is_a_bound():
 def test_what_is_worse_than_the_mean_explains_none():
     assert numbers.explained_text(-3571.35) == "none"
     assert numbers.explained_text(0.356) == "36 %"
+
+
+@pytest.mark.parametrize(
+    ("page", "terminal"),
+    [
+        ("0.4·10⁻⁴ to 7.5·10⁻⁴", "4e-05 to 7.5e-04"),
+        ("−1.5·10⁻³ ± 0.2·10⁻³", "-1.5e-03 ± 2e-04"),
+        ("kg m²", "kg m^2"),
+        ("a-b 1.20", "a-b 1.20"),
+        ("−∞ to 3", "-inf to 3"),
+    ],
+)
+def test_cells_of_tables_on_the_terminal(page, terminal):
+    assert numbers.plain_cell(page) == terminal

@@ -71,6 +71,17 @@ def test_a_wrong_argument_is_told_what_to_pass(arguments: tuple, words: str) -> 
         Problem(*arguments)
 
 
+def test_an_empty_list_of_flights_is_said_to_be_empty() -> None:
+    with pytest.raises(ValueError, match="the list of flights is empty"):
+        Problem(LINEAR.model, PARAMS, [], FREE)
+
+
+def test_models_show_themselves_in_a_line() -> None:
+    shown = repr(models.roll_on_stand)
+    assert shown.startswith("Model roll-on-stand: inputs x_roll; states ")
+    assert len(shown) < 200
+
+
 def test_a_configuration_is_no_problem() -> None:
     with pytest.raises(TypeError, match="load_config"):
         heli_jax.fit("configs/bench-roll.yaml")  # pyright: ignore[reportArgumentType]

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from heli_jax.terminal_table import print_table
+from heli_jax.terminal_table import print_table, tell
 
 HEAD = ("parameter", "estimate", "95 % (autocorrelated residuals)", "unit", "of another method")
 ROWS = [
@@ -32,3 +32,26 @@ def test_every_cell_is_whole_and_lines_fit(
         assert any("Yv" in line and "0.04023" in line for line in lines)
     elif width >= 50:
         assert max(map(len, lines)) <= width
+
+
+@pytest.mark.parametrize("width", [None, 80, 50])
+def test_sentences_begin_new_lines_between_words(
+    width: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sentences = (
+        "determined: a/Ixx = 215.3, sd 8.3, 95 % interval 199.75 to 232.1",
+        "! x_roll to roll: bandwidth [rad/s] model 6.8 (6.24 to 7.43), 1.08 Hz, data not known",
+        f"report: {'runs/' * 20}report.html",
+    )
+    if width is not None:
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    for sentence in sentences:
+        tell(sentence)
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(" ".join(lines).split()) == " ".join(sentences)
+    if width is None:
+        # A program that reads them finds each in a line of its own.
+        assert lines == list(sentences)
+    else:
+        assert all(len(line) <= width or " " not in line.strip() for line in lines)

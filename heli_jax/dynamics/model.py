@@ -158,6 +158,13 @@ class Model(eqx.Module):
     def __reduce__(self) -> tuple[Any, ...]:
         return by_value(self)
 
+    def __repr__(self) -> str:
+        """One line: its functions say nothing that their names do not."""
+        kinds = (("inputs", self.Inputs), ("states", self.State), ("outputs", self.Outputs))
+        return f"Model {self.name}: " + "; ".join(
+            f"{kind} {', '.join(naming.names(record))}" for kind, record in kinds
+        )
+
     @property
     def delay_parameters(self) -> tuple[str, ...]:
         """The parameters that are delays of inputs or outputs."""

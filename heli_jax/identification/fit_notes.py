@@ -171,6 +171,7 @@ def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> li
             f"each of them; or {remedy}"
         )
     return [
-        f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
+        f"The optimiser stopped after {steps} step{'s' * (steps != 1)} without arriving: these "
+        "numbers are no result. "
         f"Remedy: {remedy}."
     ]

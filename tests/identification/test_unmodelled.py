@@ -13,6 +13,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.validation.adequacy import Adequacy, by_responses
+from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
 from heli_jax.identification.validation.unmodelled import Unmodelled, with_unmodelled
 
@@ -192,6 +193,50 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
     # Beside the same filter of the drive nothing of it is left to its cube.
     both = lines_of(e, u[:, None], np.stack([u, u**3], axis=1))
     assert strongest([both], [1], BROAD, beside=[0], plain=True).p_value > 0.01
+
+
+def wandering(rng):
+    """What gusts leave of a simulation: slow, and far larger than what comes new with a sample."""
+    return scipy.signal.lfilter([1.0], [1.0, -1.99, 0.9905], rng.standard_normal(N))
+
+
+def with_a_hole(values, first=700, count=40):
+    return np.delete(values, slice(first, first + count), axis=0)
+
+
+def test_a_hole_in_the_record_makes_no_answer():
+    rng = np.random.default_rng(5)
+    p, joined = [], []
+    for _ in range(20):
+        # Two slow things that know nothing of each other: both jump where samples are missing.
+        u, e = wandering(rng), wandering(rng)
+        columns = [with_a_hole(v) for v in (e, np.arange(N)[:, None] / N, u[:, None])]
+        p.append(strongest([lines_of(*columns, [700])], [0], NARROW).p_value)
+        joined.append(strongest([lines_of(*columns)], [0], NARROW).p_value)
+    assert np.sum(np.array(p) < 0.01) < 3
+    # As if no sample were missing, most of them are answers.
+    assert np.sum(np.array(joined) < 0.01) > 10
+
+
+def test_an_answer_is_found_beside_a_hole():
+    rng = np.random.default_rng(6)
+    u = steps(rng)
+    answer = scipy.signal.lfilter([1.0], [1.0, -1.95, 0.96], u)
+    e = rng.standard_normal(N) + 0.4 * answer / answer.std()
+    columns = [with_a_hole(v) for v in (e, u[:, None], u[:, None])]
+    assert strongest([lines_of(*columns, [700])], [0], NARROW).p_value < 0.001
+
+
+def test_where_samples_are_missing():
+    seen = np.ones(2000, bool)
+    seen[[300, 301, 700]] = False
+    own = own_samples(seen)
+    assert own.every == 1
+    assert own.holes == (300, 698)
+    # A sensor of 7 grid steps, whose clock drifts by one now and then, and one sample of it lost.
+    slow = np.zeros(2000, bool)
+    slow[np.cumsum([0, *([7] * 100), 8, *([7] * 50), 14, *([7] * 50)])] = True
+    assert own_samples(slow).holes == (152,)
 
 
 def test_records_too_short_are_not_asked():

@@ -15,7 +15,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
@@ -157,6 +156,9 @@ def _with_the_same(
     if not np.isfinite(start).all():
         return None
     others = [k for k in range(start.size) if k != held]
+
+    # Here: `check` and most fits never ask for it, and its import takes as long as a small search.
+    import scipy.optimize
 
     def partly(x: np.ndarray) -> np.ndarray:
         z = start.copy()

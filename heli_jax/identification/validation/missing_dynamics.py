@@ -5,7 +5,7 @@ are missing leave a residual that is a filtered input (Ljung, 1999, section 16.6
 does not.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -82,11 +82,11 @@ def missing_dynamics(
     # By output and input over all flights, so that one missing servo is one sentence.
     found: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
-        e, u, dt = flight.residuals[output], flight.inputs[name], flight.dt
+        e, u, dt, holes = flight.residuals[output], flight.inputs[name], flight.dt, ()
         own = own_samples(np.isfinite(e))
         if own is not None and own.every > 1:
-            e, u, dt = e[own.rows], own.of_input(u), own.every * dt
-        one = explained_by(e, u, dt, by_chance=_BY_CHANCE / len(pairs))
+            e, u, dt, holes = e[own.rows], own.of_input(u), own.every * dt, own.holes
+        one = explained_by(e, u, dt, by_chance=_BY_CHANCE / len(pairs), holes=holes)
         if one is None or one.share < _WORTH_IT:
             continue
         known = found.get((output, name))
@@ -133,8 +133,21 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
     return begun + f"{one.lag:.2g} s after it moved{f': {remedy.strip()}' if remedy else '.'}"
 
 
+def across(holes: Sequence[int], size: int) -> np.ndarray:
+    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    after = np.zeros(size, bool)
+    for first in holes:
+        after[first : first + ORDER] = True
+    return after
+
+
 def explained_by(
-    residual: np.ndarray, u: np.ndarray, dt: float, *, by_chance: float = 1.0
+    residual: np.ndarray,
+    u: np.ndarray,
+    dt: float,
+    *,
+    by_chance: float = 1.0,
+    holes: Sequence[int] = (),
 ) -> Explained | None:
     """What the last samples of an input explain of a residual; None where nothing can be told.
 
@@ -146,6 +159,7 @@ def explained_by(
         u: the input (N,), any unit.
         dt: [s].
         by_chance: p value above which nothing is told either, in half of the time.
+        holes: the samples before which others are missing.
     """
     lags = _lags(dt)
     seen = np.isfinite(residual)
@@ -157,12 +171,14 @@ def explained_by(
         return None
     # The filter of the residual is put on the input as well: prewhitening leaves the response
     # between the two as it was, and makes the F test's independent errors true.
-    h = whitening(e)
+    h = whitening(e, holes)
     e, drive = (np.convolve(v, h)[: v.size] for v in (e, drive))
     # Row k is the input k samples before; the first samples have no past.
     first = max(lags, ORDER)
-    X = np.stack([drive[first - k : drive.size - k] for k in range(lags)])
-    y = e[first:] - e[first:].mean()
+    whole = ~across(holes, e.size)[first:]
+    X = np.stack([drive[first - k : drive.size - k] for k in range(lags)])[:, whole]
+    y = e[first:][whole]
+    y = y - y.mean()
     X -= X.mean(axis=1, keepdims=True)
     # An input held for several samples has rows that are the same: only their rank counts.
     # Of the rows' products, which halves the time of all: a share is told to six digits then.
@@ -211,12 +227,15 @@ def _lags(dt: float) -> int:
     return max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
 
 
-def whitening(e: np.ndarray) -> np.ndarray:
+def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
     """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
 
     Args:
         e: the signal (N,), of mean zero.
+        holes: the samples before which others are missing.
     """
+    # With zeros between no sample is compared with one beyond a hole.
+    e = np.insert(e, np.repeat(np.asarray(holes, int), ORDER), 0.0)
     c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(ORDER + 1)]) / e.size
     # A little white noise, so that a residual without any has a filter too.
     c[0] *= 1.0 + 1e-9

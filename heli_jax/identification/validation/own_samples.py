@@ -9,6 +9,8 @@ _REGULAR = 0.98
 """part of the steps between samples that are of one length, from which on they are a clock's"""
 _MOST = 50
 """grid steps between two samples at most"""
+_JITTERS = 5
+"""grid steps between two samples from which on a clock falls on the grid one sooner or later"""
 
 
 class OwnSamples(NamedTuple):
@@ -18,6 +20,13 @@ class OwnSamples(NamedTuple):
     """(M,) their numbers"""
     every: int
     """grid steps from one to the next"""
+
+    @property
+    def holes(self) -> tuple[int, ...]:
+        """Where in `rows` the sample before is missing: a slow residual jumps there, and so does an
+        input, which is no answer of one to the other."""
+        apart = np.diff(self.rows)
+        return tuple((np.flatnonzero(apart > self.every + (self.every >= _JITTERS)) + 1).tolist())
 
     def of_input(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
         """An input's mean from one sample to the next, so that nothing between them is lost; the
@@ -46,7 +55,7 @@ def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
     steps = np.diff(rows)
     usual = int(np.median(steps))
     # A clock that is no multiple of the grid's falls on its rows one sooner or later.
-    near = np.abs(steps - usual) <= (0 if usual < 5 else 1)
+    near = np.abs(steps - usual) <= (0 if usual < _JITTERS else 1)
     if usual > _MOST or np.mean(near) < _REGULAR:
         return None
     return OwnSamples(rows, usual)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.identification.validation.missing_dynamics import ORDER, whitening
+from heli_jax.identification.validation.missing_dynamics import ORDER, across, whitening
 
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
@@ -78,6 +78,7 @@ def lines_of(
     e: Float[np.ndarray, " N"],
     J: Float[np.ndarray, "N q"],
     drives: Float[np.ndarray, "N d"],
+    holes: Sequence[int] = (),
 ) -> Lines | None:
     """Whitened by the residual's autoregression; None of records too short or without a residual.
 
@@ -85,16 +86,20 @@ def lines_of(
         e: measured less simulated.
         J: its derivatives by the unknowns.
         drives: what may drive what the model lacks.
+        holes: the samples before which others are missing.
     """
     n = e.size - ORDER
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
         return None
-    h = whitening(e - e.mean())
+    h = whitening(e - e.mean(), holes)
     columns = np.concatenate([e[:, None], J, drives], axis=1)
     scales = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns - columns.mean(axis=0)
     # Differences with the filter's own order left out have no samples from before the record.
     white = np.stack([np.convolve(c, h)[ORDER : e.size] for c in columns.T], axis=1)
+    # What jumps because samples are missing is no answer: the filter's order after a hole is as if
+    # nothing had been measured.
+    white[across(holes, e.size)[ORDER:]] = 0.0
     v = np.fft.rfft(white, axis=0)[1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
     v = np.where(np.sqrt(np.mean(np.abs(v) ** 2, axis=0)) > _ROUNDING * scales, v, 0.0)

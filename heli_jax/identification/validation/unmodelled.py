@@ -320,7 +320,8 @@ def _of_output(
         else:
             drives = drives[own.rows]
         drives = np.concatenate([drives, changing[i][own.rows]], axis=1)
-        each.append(lines_of(np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows], drives))
+        left = np.asarray(e.raw[i][name])[own.rows]
+        each.append(lines_of(left, J[i, name][own.rows], drives, own.holes))
     lines = [one for one in each if one is not None]
     if not lines or not moving:
         return None
