@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Steps(Protocol):
-    """A run in its steps, as `heli_jax.simulation.accumulate.Samples`."""
+    """A run of one step a sample, as `heli_jax.simulation.accumulate.Steps`."""
 
     @property
     def carry(self) -> Any: ...
@@ -23,6 +23,7 @@ class Sensitive(NamedTuple):
 
     run: Callable[[Any], Steps]
     """of the unknowns (q,)"""
+    steps: int
     throughout: Sequence[int]
     """unknowns that act at every sample"""
     at_first: Sequence[int]
@@ -58,6 +59,11 @@ class Products:
         )
         m = len(shapes[0])
         return first, tangents, jnp.zeros((m * (m + 1) // 2,), self._z.dtype)
+
+    @property
+    def steps(self) -> int:
+        """How many: one less than samples."""
+        return self._of.steps
 
     def step(self, carry: Any, k: Any, /) -> Any:
         """The carry a sample after the k-th."""

@@ -45,7 +45,7 @@ def run_of(dtype=np.float64, function=jnp.tanh):
         (Argument((), np.dtype(dtype), False), Argument((2,), np.dtype(dtype), True)),
         (Argument((N,), np.dtype(dtype), True),),
         (Argument((2,), np.dtype(dtype), False),),
-        N,
+        N - 1,
     )
 
 

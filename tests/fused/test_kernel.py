@@ -37,7 +37,7 @@ def compiled(step, stays, carry, dtype=np.float64, vehicles=LANES, lanes=LANES):
         ),
         (Argument((N,), np.dtype(dtype), True),),
         (Argument((), np.dtype(dtype), False),),
-        N,
+        N - 1,
     )
     found = Kernel(run, lanes)(stays, [record], [carry], 1)
 
@@ -265,7 +265,7 @@ def test_threads_share_the_vehicles():
         (Argument((), np.dtype(float), False), Argument((), np.dtype(float), True)),
         (Argument((N,), np.dtype(float), True),),
         (Argument((), np.dtype(float), False),),
-        N,
+        N - 1,
     )
     kernel = Kernel(run, 16)
     for threads in (1, 2, 3, 9):
