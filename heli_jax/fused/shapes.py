@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.lookups import gathered, padded, searched, sorted_
 from heli_jax.fused.operands import (
     INDEX,
     LONG,
@@ -59,8 +60,6 @@ def _taken(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand
     indices = []
     for start, size, length in zip(starts, sizes, operand.shape, strict=True):
         start = converted(code, start, new_dtype=INDEX)
-        if not start.shared:
-            raise UnsupportedError("an index that is not the same for all vehicles")
         # Within the array whatever is asked for, as JAX has it.
         indices.append(
             OPERATIONS["clamp"](code, constant(0, INDEX), start, constant(length - size, INDEX))
@@ -241,9 +240,9 @@ def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     a, b = (elements(code, v) for v in inputs)
-    (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
-    if batch_a or batch_b:
-        raise UnsupportedError("a product of batches of matrices")
+    (of_a, of_b), (batch_a, _) = params["dimension_numbers"]
+    if batch_a:
+        return _products(code, a, b, params)
     free_a = [d for d in range(a.ndim) if d not in of_a]
     free_b = [d for d in range(b.ndim) if d not in of_b]
     shape = (*(a.shape[d] for d in free_a), *(b.shape[d] for d in free_b))
@@ -259,6 +258,28 @@ def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
             raise UnsupportedError("a product of nothing")
         result[i, j] = total
     return result.reshape(shape)
+
+
+def _products(code: Code, a: Elements, b: Elements, params: dict[str, Any]) -> Elements:
+    """Of batches, which come first in the result."""
+    (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
+    a = np.moveaxis(a, batch_a, range(len(batch_a)))
+    b = np.moveaxis(b, batch_b, range(len(batch_b)))
+
+    def within(axes: Any, batch: Any, ndim: int) -> tuple[int, ...]:
+        left = [d for d in range(ndim) if d not in batch]
+        return tuple(left.index(d) for d in axes)
+
+    numbers = (within(of_a, batch_a, a.ndim), within(of_b, batch_b, b.ndim)), ((), ())
+    batches = a.shape[: len(batch_a)]
+    each = [
+        _product(code, [a[at], b[at]], {"dimension_numbers": numbers}) for at in np.ndindex(batches)
+    ]
+    assert not any(isinstance(v, Stored) for v in each)
+    made = np.empty((len(each), *each[0].shape), object)
+    for k, value in enumerate(each):
+        made[k] = value
+    return made.reshape(*batches, *each[0].shape)
 
 
 SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
@@ -287,6 +308,10 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "cummin": _running("min"),
     "argmax": _where_extreme("ge"),
     "argmin": _where_extreme("le"),
+    "gather": gathered,
+    "SearchSorted": searched,
+    "pad": padded,
+    "sort": sorted_,
     "unvmap_any": _anywhere("or"),
     "unvmap_all": _anywhere("and"),
 }

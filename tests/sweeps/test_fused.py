@@ -43,7 +43,7 @@ def test_the_stand(bench30, record, solver, hold):
     flight = dataclasses.replace(record, hold={"x_roll": hold})
     design = sobol({"Ixx": Range(0.02, 0.05, "log"), "gain.x_roll": Range(0.5, 2.0)}, 20)
     reduce = BOTH | {n: Reduce(n, "roll") for n in ("rmse", "vaf", "tic", "final", "max")}
-    agree(1e-11, STAND, bench30, flight, design, reduce, solver=solver)
+    agree(1e-13, STAND, bench30, flight, design, reduce, solver=solver)
 
 
 def test_single_precision(bench30, record):
