@@ -134,28 +134,31 @@ def padded(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand
     return wide[cut]
 
 
-def sorted_(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-    """sort, of one array: neighbours are exchanged until all are in order."""
-    if len(inputs) != 1:
-        raise UnsupportedError("arrays that are sorted together")
+def in_order(code: Code, inputs: list[Operand], params: dict[str, Any]) -> list[Operand]:
+    """sort: neighbours are exchanged until the first array is in order, the others with it."""
+    if params["num_keys"] != 1:
+        raise UnsupportedError("a sorting by several numbers")
     axis = params["dimension"]
-    rows = np.array(np.moveaxis(elements(code, inputs[0]), axis, -1))
-    n = rows.shape[-1]
+    arrays = [np.array(np.moveaxis(elements(code, v), axis, -1)) for v in inputs]
+    *before, n = arrays[0].shape
     if n > _SORTED:
         raise UnsupportedError(f"the sorting of {n} numbers")
-    for at in np.ndindex(*rows.shape[:-1]):
+    for at in np.ndindex(*before):
         for turn in range(n):
             for k in range(turn % 2, n - 1, 2):
-                rows[(*at, k)], rows[(*at, k + 1)] = _in_order(
-                    code, rows[(*at, k)], rows[(*at, k + 1)]
-                )
-    return np.moveaxis(rows, -1, axis)
+                here, there = (*at, k), (*at, k + 1)
+                swap = _behind(code, arrays[0][here], arrays[0][there])
+                for array in arrays:
+                    a, b = array[here], array[there]
+                    array[here] = code.choose(swap, b, a)
+                    array[there] = code.choose(swap, a, b)
+    return [np.moveaxis(array, -1, axis) for array in arrays]
 
 
-def _in_order(code: Code, a: Value, b: Value) -> tuple[Value, Value]:
-    """Two numbers, what is not a number behind."""
-    swap = OPERATIONS["gt"](code, a, b)
-    if a.dtype.kind == "f":
-        nothing = code.operation("and", OPERATIONS["ne"](code, a, a), OPERATIONS["eq"](code, b, b))
-        swap = code.operation("or", swap, nothing)
-    return code.choose(swap, b, a), code.choose(swap, a, b)
+def _behind(code: Code, a: Value, b: Value) -> Value:
+    """Whether a number belongs behind another, as what is not a number does."""
+    greater = OPERATIONS["gt"](code, a, b)
+    if a.dtype.kind != "f":
+        return greater
+    nothing = code.operation("and", OPERATIONS["ne"](code, a, a), OPERATIONS["eq"](code, b, b))
+    return code.operation("or", greater, nothing)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
-from heli_jax.fused.lookups import gathered, padded, searched, sorted_
+from heli_jax.fused.lookups import gathered, padded, searched
 from heli_jax.fused.operands import (
     INDEX,
     LONG,
@@ -210,31 +210,50 @@ def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]]
 
 
 def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
-    """scatter, of one window of length one along the axes that are indexed: `.at[i, j].set(v)`."""
+    """scatter, of windows of length one along the axes that are indexed: `.at[i, j].set(v)`."""
 
     def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-        old, where, new = (elements(code, v) for v in inputs)
+        result, where, new = (elements(code, v) for v in inputs)
         numbers = params["dimension_numbers"]
         axes = tuple(numbers.scatter_dims_to_operand_dims)
-        plain = where.shape == (len(axes),) and set(axes) == set(numbers.inserted_window_dims)
-        # Whatever is asked for, GatherScatterMode.CLIP moves it into the array; all others leave
-        # out what is beyond it.
-        if not plain or "CLIP" in str(params["mode"]):
-            raise UnsupportedError("several places of an array that are written at once")
-        result = np.empty(old.shape, object)
-        for at in np.ndindex(old.shape):
-            # Any: an element, of which NumPy's types make an array as well.
-            before: Any = old[at]
-            value: Any = new[tuple(i for d, i in enumerate(at) if d not in axes)]
-            if operation is not None:
-                value = OPERATIONS[operation](code, before, value)
-            for index, axis in zip(where, axes, strict=True):
-                here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
-                value = code.choose(here, value, before)
-            result[at] = value
+        if set(axes) != set(numbers.inserted_window_dims) or numbers.operand_batching_dims:
+            raise UnsupportedError("windows of an array that are written at computed places")
+        batch, windows = where.shape[:-1], set(numbers.update_window_dims)
+        of_batch = [d for d in range(new.ndim) if d not in windows]
+        # One place after the other: what stands twice is added twice.
+        new = np.moveaxis(new, of_batch, range(len(batch)))
+        for at in np.ndindex(batch):
+            places = list(zip(where[at], axes, strict=True))
+            if "CLIP" in str(params["mode"]):
+                places = [(_within(code, i, result.shape[axis] - 1), axis) for i, axis in places]
+            result = _put_one(code, operation, result, places, new[at])
         return result
 
     return made
+
+
+def _within(code: Code, index: Value, most: int) -> Value:
+    low, high = constant(0, index.dtype), constant(most, index.dtype)
+    return OPERATIONS["clamp"](code, low, index, high)
+
+
+def _put_one(
+    code: Code, operation: str | None, old: Elements, places: list[tuple[Value, int]], new: Any
+) -> Elements:
+    """With a window written; nowhere if it is beyond the array."""
+    result, axes = np.empty(old.shape, object), [axis for _, axis in places]
+    for at in np.ndindex(old.shape):
+        # Any: an element, of which NumPy's types make an array as well.
+        before: Any = old[at]
+        window = tuple(i for d, i in enumerate(at) if d not in axes)
+        value: Any = new[window] if isinstance(new, np.ndarray) else new
+        if operation is not None:
+            value = OPERATIONS[operation](code, before, value)
+        for index, axis in places:
+            here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
+            value = code.choose(here, value, before)
+        result[at] = value
+    return result
 
 
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
@@ -311,7 +330,6 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "gather": gathered,
     "SearchSorted": searched,
     "pad": padded,
-    "sort": sorted_,
     "unvmap_any": _anywhere("or"),
     "unvmap_all": _anywhere("and"),
 }

@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.lookups import in_order
 from heli_jax.fused.loops import loop
 from heli_jax.fused.operands import (
     INDEX,
@@ -109,9 +110,14 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     if name in OPERATIONS:
         dtype = np.dtype(equation.outvars[0].aval.dtype)
         return [_elementwise(code, name, params, inputs, dtype)]
+    if name == "sort":
+        return in_order(code, inputs, params)
     if name == "split":
         cuts = np.cumsum(params["sizes"])[:-1]
         return list(np.split(elements(code, inputs[0]), cuts, params["axis"]))
+    if name == "unstack":
+        rows = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
+        return [rows[k, ...] for k in range(len(rows))]
     if name in SHAPED:
         return [SHAPED[name](code, inputs, params)]
     raise UnsupportedError(f"the operation {name}")
