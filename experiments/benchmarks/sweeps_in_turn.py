@@ -18,7 +18,7 @@ os.environ["JAX_NUM_CPU_DEVICES"] = str(len(os.sched_getaffinity(0)))
 import jax
 import numpy as np
 from kernels import compiled
-from sweeps import BACKENDS, BUILDS, SUBSTEPS, arrays, check, in_c, ours, record
+from sweeps import BACKENDS, BUILDS, arrays, check, in_c, ours, record
 
 SIZES = {"exact": (65_536, 131_072), "rk4": (8192, 16_384)}
 """whole chunks of a sweep"""
@@ -65,10 +65,7 @@ def main() -> None:
     )
     in_c = [name.startswith("C") for name in found]
     best = np.flatnonzero(in_c)[np.argmin(np.median(taken[:, in_c], axis=0))]
-    substeps = "" if solver == "exact" else f", {SUBSTEPS} steps a sample"
-    print(
-        f"{solver}{substeps}, 6000 samples, {len(jax.local_devices())} threads, medians of {rounds} rounds"
-    )
+    print(f"{solver}, {len(jax.local_devices())} threads, medians of {rounds} rounds")
     for k, name in enumerate(found):
         ratio = np.median(taken[:, k] / taken[:, best])
         print(f"{name:24} {np.median(taken[:, k]):8.2f} us a vehicle, {ratio:.2f} of the best C")

@@ -71,14 +71,16 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
         )
     # Every element is at hand in a register: the one that is meant is chosen among all.
     places = list(np.ndindex(operand.shape))
-    chosen: Value = operand[places[-1]]
+    # Any: of an array's element NumPy's types make an array as well.
+    chosen: Any = operand[places[-1]]
     for place in reversed(places[:-1]):
+        value: Any = operand[place]
         here = None
         for index, k in zip(at, place, strict=True):
             same = code.compare("icmp eq", index, constant(k, index.dtype))
             here = same if here is None else code.operation("and", here, same)
         assert here is not None
-        chosen = code.choose(here, operand[place], chosen)
+        chosen = code.choose(here, value, chosen)
     return chosen
 
 

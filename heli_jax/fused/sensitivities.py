@@ -15,7 +15,8 @@ class Steps(Protocol):
 
     @property
     def carry(self) -> Any: ...
-    def step(self, carry: Any, k: Any, /) -> Any: ...
+    @property
+    def step(self) -> Callable[[Any, Any], Any]: ...
 
 
 class Sensitive(NamedTuple):

@@ -135,7 +135,7 @@ def test_whole_helicopters(name):
     trimmed = Trimmed() if name == "helicopter" else None
     design = sobol({"Ixx": Range(0.15, 0.25, "log"), "offset.x_yaw": Range(0.0, 1e-3)}, 8)
     reduce = {n: Reduce("rms", n) for n in naming.names(model.Outputs)[:6]}
-    found = agree(1e-8, model, vehicle, flight, design, reduce, trimmed=trimmed)
+    found = agree(1e-12, model, vehicle, flight, design, reduce, trimmed=trimmed)
     if trimmed is not None:
         assert (found["status"] == 0).any()
 
