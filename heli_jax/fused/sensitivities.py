@@ -1,7 +1,7 @@
 """A run that carries its derivatives along, and sums the products of its rows and columns."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,20 +10,11 @@ import numpy as np
 # `Any` below: trees of arrays, of which JAX exports no type.
 
 
-class Steps(Protocol):
-    """A run of one step a sample, as `heli_jax.simulation.accumulate.Steps`."""
-
-    @property
-    def carry(self) -> Any: ...
-    @property
-    def step(self) -> Callable[[Any, Any], Any]: ...
-
-
 class Sensitive(NamedTuple):
     """What is differentiated."""
 
-    run: Callable[[Any], Steps]
-    """of the unknowns (q,)"""
+    run: Callable[[Any], Any]
+    """of the unknowns (q,): a run of one step a sample, as `heli_jax.simulation.accumulate.Steps`"""
     steps: int
     throughout: Sequence[int]
     """unknowns that act at every sample"""

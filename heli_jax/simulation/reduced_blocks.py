@@ -2,7 +2,7 @@
 
 From x[k] the state m samples on is A^m x[k] + ..., and each output between follows directly, as
 C A^j x[k] + ..., with coefficients of the vehicle's own. Of four states and one output four samples
-so take two thirds of the products that four steps take.
+so take two thirds of the products that four steps take, two samples three quarters.
 """
 
 from collections.abc import Callable
