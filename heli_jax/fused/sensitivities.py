@@ -14,7 +14,7 @@ class Sensitive(NamedTuple):
     """What is differentiated."""
 
     run: Callable[[Any], Any]
-    """of the unknowns (q,): a run of one step a sample, as `heli_jax.simulation.accumulate.Steps`"""
+    """of the unknowns (q,): a run of one step a sample, as `simulation.accumulate.Steps`"""
     steps: int
     throughout: Sequence[int]
     """unknowns that act at every sample"""
