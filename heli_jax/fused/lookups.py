@@ -79,7 +79,9 @@ def searched(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
         raise UnsupportedError("several tables that are searched at once")
     result = np.empty(asked.shape, object)
     for at in np.ndindex(*asked.shape):
-        result[at] = _place(code, table, asked[at], params["side"])
+        # Any: of an array's element NumPy's types make an array as well.
+        value: Any = asked[at]
+        result[at] = _place(code, table, value, params["side"])
     return result
 
 
