@@ -43,7 +43,8 @@ RUNAWAY = 1e12
 # `SimulationOptions.block`).
 _BLOCK = 4
 # The same for one program a run, where more coefficients a vehicle take longer to make than they
-# save: roll model, AVX2, a whole sweep takes 1.1 times as long with 4.
+# save: roll model, AVX2, busy machine, a whole sweep 7.5 and 8.0 us a vehicle with 2, 7.9 with 3,
+# 8.4 with 4 (one or two runs each).
 _FUSED_BLOCK = 2
 
 
