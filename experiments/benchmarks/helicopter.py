@@ -33,7 +33,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.traced import traced
 from heli_jax.naming import asdict, replace
-from heli_jax.simulation.accumulate import Samples, sample_by_sample
+from heli_jax.simulation.accumulate import Steps, in_steps
 from heli_jax.simulation.options import SimulationOptions
 
 jax.config.update("jax_enable_x64", True)
@@ -122,11 +122,11 @@ def batch(run: Run, model: Model = MODEL) -> Callable[[Array], Array]:
 def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
     """The same batch as one program, as sweeps run it."""
 
-    def steps(vehicle: Any, inputs: Any, Ixx: Any) -> Samples:
+    def steps(vehicle: Any, inputs: Any, Ixx: Any) -> Steps:
         options = SimulationOptions(
             dt=jnp.asarray(DT), initial_state=run.start, solver="rk4", substeps=SUBSTEPS
         )
-        return sample_by_sample(
+        return in_steps(
             model,
             replace(vehicle, Ixx=Ixx),
             inputs,

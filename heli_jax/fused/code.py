@@ -279,16 +279,30 @@ class Code:
         return self._whole.get(value.operand)
 
     def load(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
-        """The element of an array that all vehicles share."""
+        """The element of an array that all vehicles share; of each another where the index is."""
         at, kind = self.register(), type_of(np.dtype(dtype))
+        if not index.shared and self.lanes > 1:
+            return self._load_each(pointer, index, np.dtype(dtype))
         stored = "i8" if kind == "i1" else kind
         place = f"{type_of(index.dtype)} {index.operand}"
         self.write(f"{at} = getelementptr {stored}, {self.memory} {pointer}, {place}")
         right = f"load {stored}, {self.memory} {at}{self.unchanging}"
-        value = self.made(right, np.dtype(dtype), True)
+        value = self.made(right, np.dtype(dtype), index.shared)
         if kind != "i1":
             return value
-        return self.made(f"trunc i8 {value.operand} to i1", np.dtype(dtype), True)
+        return self.made(f"trunc i8 {value.operand} to i1", np.dtype(dtype), index.shared)
+
+    def _load_each(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
+        kind, vector, joined = type_of(index.dtype), self.typed(index.dtype, False), "poison"
+        for lane in range(self.lanes):
+            of_lane = f"extractelement {vector} {index.operand}, i64 {lane}"
+            at = self.made(of_lane, index.dtype, True)
+            value = self.load(pointer, at, dtype)
+            right = f"insertelement {self.typed(dtype, False)} {joined}, "
+            right += f"{type_of(dtype)} {value.operand}, i64 {lane}"
+            joined = self.made(right, dtype, False).operand
+        assert kind in ("i32", "i64")
+        return Value(joined, dtype, False)
 
     def table(self, values: np.ndarray) -> str:
         """A pointer to numbers that are known when the program is written."""

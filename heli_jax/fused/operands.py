@@ -11,7 +11,8 @@ MOST = 4096
 """Elements of an array that is taken apart; more would take
 minutes to compile."""
 LONG = 64
-"""elements above which an array that repeats one number is not taken apart"""
+"""elements above which an array that repeats one number is not taken apart, and up to which one
+may be looked for among all"""
 INDEX = np.dtype(np.int32)
 """of indices into arrays, and of passes of a loop"""
 
@@ -64,7 +65,23 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
         return code.load(code.table(operand), _flat(code, operand.shape, at), operand.dtype)
     if all(not i.operand.startswith("%") for i in at):
         return operand[tuple(int(i.operand) for i in at)]
-    raise UnsupportedError("an element of a computed array at a computed place")
+    if operand.size > LONG:
+        raise UnsupportedError(
+            f"an element at a computed place of a computed array {operand.shape}"
+        )
+    # Every element is at hand in a register: the one that is meant is chosen among all.
+    places = list(np.ndindex(operand.shape))
+    # Any: of an array's element NumPy's types make an array as well.
+    chosen: Any = operand[places[-1]]
+    for place in reversed(places[:-1]):
+        value: Any = operand[place]
+        here = None
+        for index, k in zip(at, place, strict=True):
+            same = code.compare("icmp eq", index, constant(k, index.dtype))
+            here = same if here is None else code.operation("and", here, same)
+        assert here is not None
+        chosen = code.choose(here, value, chosen)
+    return chosen
 
 
 def _flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:

@@ -1,7 +1,7 @@
 """A run that carries its derivatives along, and sums the products of its rows and columns."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +10,12 @@ import numpy as np
 # `Any` below: trees of arrays, of which JAX exports no type.
 
 
-class Steps(Protocol):
-    """A run in its steps, as `heli_jax.simulation.accumulate.Samples`."""
-
-    @property
-    def carry(self) -> Any: ...
-    def step(self, carry: Any, k: Any, /) -> Any: ...
-
-
 class Sensitive(NamedTuple):
     """What is differentiated."""
 
-    run: Callable[[Any], Steps]
-    """of the unknowns (q,)"""
+    run: Callable[[Any], Any]
+    """of the unknowns (q,): a run of one step a sample, as `simulation.accumulate.Steps`"""
+    steps: int
     throughout: Sequence[int]
     """unknowns that act at every sample"""
     at_first: Sequence[int]
@@ -58,6 +51,11 @@ class Products:
         )
         m = len(shapes[0])
         return first, tangents, jnp.zeros((m * (m + 1) // 2,), self._z.dtype)
+
+    @property
+    def steps(self) -> int:
+        """How many: one less than samples."""
+        return self._of.steps
 
     def step(self, carry: Any, k: Any, /) -> Any:
         """The carry a sample after the k-th."""

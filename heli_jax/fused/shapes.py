@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.lookups import gathered, padded, searched
 from heli_jax.fused.operands import (
     INDEX,
     LONG,
@@ -59,8 +60,6 @@ def _taken(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand
     indices = []
     for start, size, length in zip(starts, sizes, operand.shape, strict=True):
         start = converted(code, start, new_dtype=INDEX)
-        if not start.shared:
-            raise UnsupportedError("an index that is not the same for all vehicles")
         # Within the array whatever is asked for, as JAX has it.
         indices.append(
             OPERATIONS["clamp"](code, constant(0, INDEX), start, constant(length - size, INDEX))
@@ -211,39 +210,58 @@ def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]]
 
 
 def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
-    """scatter, of one window of length one along the axes that are indexed: `.at[i, j].set(v)`."""
+    """scatter, of windows of length one along the axes that are indexed: `.at[i, j].set(v)`."""
 
     def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-        old, where, new = (elements(code, v) for v in inputs)
+        result, where, new = (elements(code, v) for v in inputs)
         numbers = params["dimension_numbers"]
         axes = tuple(numbers.scatter_dims_to_operand_dims)
-        plain = where.shape == (len(axes),) and set(axes) == set(numbers.inserted_window_dims)
-        # Whatever is asked for, GatherScatterMode.CLIP moves it into the array; all others leave
-        # out what is beyond it.
-        if not plain or "CLIP" in str(params["mode"]):
-            raise UnsupportedError("several places of an array that are written at once")
-        result = np.empty(old.shape, object)
-        for at in np.ndindex(old.shape):
-            # Any: an element, of which NumPy's types make an array as well.
-            before: Any = old[at]
-            value: Any = new[tuple(i for d, i in enumerate(at) if d not in axes)]
-            if operation is not None:
-                value = OPERATIONS[operation](code, before, value)
-            for index, axis in zip(where, axes, strict=True):
-                here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
-                value = code.choose(here, value, before)
-            result[at] = value
+        if set(axes) != set(numbers.inserted_window_dims) or numbers.operand_batching_dims:
+            raise UnsupportedError("windows of an array that are written at computed places")
+        batch, windows = where.shape[:-1], set(numbers.update_window_dims)
+        of_batch = [d for d in range(new.ndim) if d not in windows]
+        # One place after the other: what stands twice is added twice.
+        new = np.moveaxis(new, of_batch, range(len(batch)))
+        for at in np.ndindex(batch):
+            places = list(zip(where[at], axes, strict=True))
+            if "CLIP" in str(params["mode"]):
+                places = [(_within(code, i, result.shape[axis] - 1), axis) for i, axis in places]
+            result = _put_one(code, operation, result, places, new[at])
         return result
 
     return made
 
 
+def _within(code: Code, index: Value, most: int) -> Value:
+    low, high = constant(0, index.dtype), constant(most, index.dtype)
+    return OPERATIONS["clamp"](code, low, index, high)
+
+
+def _put_one(
+    code: Code, operation: str | None, old: Elements, places: list[tuple[Value, int]], new: Any
+) -> Elements:
+    """With a window written; nowhere if it is beyond the array."""
+    result, axes = np.empty(old.shape, object), [axis for _, axis in places]
+    for at in np.ndindex(old.shape):
+        # Any: an element, of which NumPy's types make an array as well.
+        before: Any = old[at]
+        window = tuple(i for d, i in enumerate(at) if d not in axes)
+        value: Any = new[window] if isinstance(new, np.ndarray) else new
+        if operation is not None:
+            value = OPERATIONS[operation](code, before, value)
+        for index, axis in places:
+            here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
+            value = code.choose(here, value, before)
+        result[at] = value
+    return result
+
+
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     a, b = (elements(code, v) for v in inputs)
-    (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
-    if batch_a or batch_b:
-        raise UnsupportedError("a product of batches of matrices")
+    (of_a, of_b), (batch_a, _) = params["dimension_numbers"]
+    if batch_a:
+        return _products(code, a, b, params)
     free_a = [d for d in range(a.ndim) if d not in of_a]
     free_b = [d for d in range(b.ndim) if d not in of_b]
     shape = (*(a.shape[d] for d in free_a), *(b.shape[d] for d in free_b))
@@ -259,6 +277,28 @@ def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
             raise UnsupportedError("a product of nothing")
         result[i, j] = total
     return result.reshape(shape)
+
+
+def _products(code: Code, a: Elements, b: Elements, params: dict[str, Any]) -> Elements:
+    """Of batches, which come first in the result."""
+    (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
+    a = np.moveaxis(a, batch_a, range(len(batch_a)))
+    b = np.moveaxis(b, batch_b, range(len(batch_b)))
+
+    def within(axes: Any, batch: Any, ndim: int) -> tuple[int, ...]:
+        left = [d for d in range(ndim) if d not in batch]
+        return tuple(left.index(d) for d in axes)
+
+    numbers = (within(of_a, batch_a, a.ndim), within(of_b, batch_b, b.ndim)), ((), ())
+    batches = a.shape[: len(batch_a)]
+    each = [
+        _product(code, [a[at], b[at]], {"dimension_numbers": numbers}) for at in np.ndindex(batches)
+    ]
+    assert not any(isinstance(v, Stored) for v in each)
+    made = np.empty((len(each), *each[0].shape), object)
+    for k, value in enumerate(each):
+        made[k] = value
+    return made.reshape(*batches, *each[0].shape)
 
 
 SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
@@ -287,6 +327,9 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "cummin": _running("min"),
     "argmax": _where_extreme("ge"),
     "argmin": _where_extreme("le"),
+    "gather": gathered,
+    "SearchSorted": searched,
+    "pad": padded,
     "unvmap_any": _anywhere("or"),
     "unvmap_all": _anywhere("and"),
 }

@@ -16,8 +16,7 @@ from heli_jax.numerics.hoist import hoisted
 
 type Making = Callable[[Any, Any, Any], Any]
 """of (what all elements share, records (N, ...), what an element has of its own): a
-run in its steps, with `carry`, `step` and `last` as `heli_jax.simulation.accumulate.Samples` has
-them"""
+run as `heli_jax.simulation.accumulate.Steps` has it"""
 
 
 class Traced(NamedTuple):
@@ -87,7 +86,8 @@ def traced(
 
     def begin(shared: Any, given: Any, element: Any) -> Any:
         """What is carried before the first sample, and what stays."""
-        carry = making(shared, given, element).carry
+        run = making(shared, given, element)
+        carry, found["steps"] = run.carry, run.steps
         own = shared, element
         of_step, a_step = hoisted(step, own, given, carry, sample)
         of_last, the_last = hoisted(last, own, given, carry)
@@ -122,7 +122,7 @@ def traced(
         ),
         tuple(Argument(v.shape, v.dtype, not o) for v, o in zip(rows, own_records, strict=True)),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
-        rows[0].shape[0],
+        found["steps"],
     )
     return Traced(run, found["results"], closed)
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.lookups import in_order
 from heli_jax.fused.loops import loop
 from heli_jax.fused.operands import (
     INDEX,
@@ -81,6 +82,10 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
 
 def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]:
     name, params = equation.primitive.name, equation.params
+    if "_prim" in params:
+        # Such as jnp.searchsorted, of which the primitive is the same for all.
+        of = params["_prim"]
+        name, params = type(of).__name__, {**getattr(of, "params", {}), **params}
     if name in _NESTED:
         inner = params[_NESTED[name]]
         closed = hasattr(inner, "consts")
@@ -105,10 +110,16 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     if name in OPERATIONS:
         dtype = np.dtype(equation.outvars[0].aval.dtype)
         return [_elementwise(code, name, params, inputs, dtype)]
+    if name == "sort":
+        return in_order(code, inputs, params)
+    if name == "split":
+        cuts = np.cumsum(params["sizes"])[:-1]
+        return list(np.split(elements(code, inputs[0]), cuts, params["axis"]))
+    if name == "unstack":
+        rows = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
+        return [rows[k, ...] for k in range(len(rows))]
     if name in SHAPED:
         return [SHAPED[name](code, inputs, params)]
-    # Such as jnp.searchsorted, of which the primitive is the same for all.
-    name = type(params["_prim"]).__name__ if "_prim" in params else name
     raise UnsupportedError(f"the operation {name}")
 
 
@@ -244,31 +255,37 @@ def _written_out(
 
 
 def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Operand]:
-    """A loop that all vehicles leave at the same pass."""
+    """A loop that goes on while any vehicle does; one that is done keeps what it has."""
     n_test, n_body = params["cond_nconsts"], params["body_nconsts"]
     of_test, of_body = inputs[:n_test], inputs[n_test : n_test + n_body]
     carry, body, test = inputs[n_test + n_body :], params["body_jaxpr"], params["cond_jaxpr"]
 
     def holds(carried: list[Operand]) -> Value:
         (going,) = translate(code, test.jaxpr, test.consts, [*of_test, *carried])
-        going = scalar(code, going)
-        if not going.shared:
-            raise UnsupportedError("a loop that ends at another pass for each vehicle")
-        return going
+        return scalar(code, going)
+
+    def once(_: Value, carried: list[Operand]) -> list[Operand]:
+        going = holds(carried)
+        new = translate(code, body.jaxpr, body.consts, [*of_body, *carried])
+        return new if going.shared else _where(code, going, new, carried)
 
     # Entered at least once, as all loops here: what it then carries is not taken if it should not
     # have been.
-    entered = holds(carry)
+    entered = code.any(holds(carry))
     if code.taken is not None:
         entered = code.operation("and", entered, code.taken)
     results = loop(
         code,
         # Never again where it should not have been entered: such a loop may have no end.
-        lambda carried: code.operation("and", entered, holds(carried)),
+        lambda carried: code.operation("and", entered, code.any(holds(carried))),
         carry,
-        lambda _, carried: translate(code, body.jaxpr, body.consts, [*of_body, *carried]),
+        once,
     )
+    return _where(code, entered, results, carry)
+
+
+def _where(code: Code, which: Value, yes: list[Operand], no: list[Operand]) -> list[Operand]:
     return [
-        _elementwise(code, "select_n", {}, [_filled(entered, new), old, new], dtype_of(old))
-        for old, new in zip(carry, results, strict=True)
+        _elementwise(code, "select_n", {}, [_filled(which, new), old, new], dtype_of(old))
+        for old, new in zip(no, yes, strict=True)
     ]

@@ -1,6 +1,5 @@
 """Runs that are reduced to a value while they go on, and never kept: for large batches."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,19 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
-from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
-from heli_jax.numerics.matrix_exponential import product
-from heli_jax.simulation.blocks import without_next
 from heli_jax.simulation.delays import at
-from heli_jax.simulation.discretize import Discrete, scalars
 from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at, advance, dot
+from heli_jax.simulation.reduced_blocks import Reducing, blocks, of_whole_run
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at
 from heli_jax.simulation.stepping import (
     check_countable,
     field_term,
@@ -105,13 +100,8 @@ def accumulated(
     options = keywords.pop("options", DEFAULT).changed(keywords)
     reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
     _, args, _, _ = run
-    block = options.block
-    if block != 1 and (args.discrete is None or block < 1):
-        raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
-    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
-    # inputs, since a block's coefficients know no sample before its first.
-    if block > 1 and reducer.limits is None and args.delays is None:
-        value, state = _in_blocks(reducer, args, block, x0, start, data)
+    if (block := _block(reducer, args, options)) > 1:
+        value, state = of_whole_run(reducer.of, args, block, x0, start, data)
         return Accumulated(value, state, {}, dfx.RESULTS.successful)
     adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
     steps = _by_samples(reducer, run, x0, start, data)
@@ -135,7 +125,7 @@ def accumulated(
     return steps.last(carry)._replace(result=sol.result)
 
 
-def sample_by_sample(
+def in_steps(
     model: Model,
     params: Record,
     flight: FlightOrInputs,
@@ -145,17 +135,41 @@ def sample_by_sample(
     data: PyTree = (),
     limits: bool = False,
     options: SimulationOptions = DEFAULT,
-) -> "Samples":
-    """What `accumulated` does at each sample, for a loop that somebody else makes.
+) -> "Steps":
+    """What `accumulated` does at each step, for a loop that somebody else makes.
 
-    Args and exceptions are those of `accumulated`; `options.block` does not count.
+    Args and exceptions are those of `accumulated`.
     """
     reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
-    return _by_samples(reducer, run, x0, start, data)
+    _, args, _, _ = run
+    samples = jax.tree.leaves(args.inputs)[0].shape[0]
+    # Fewer samples than a block has make none.
+    if 1 < (block := _block(reducer, args, options)) < samples:
+        of = blocks(reducer.of, args, block, x0, start, data)
+
+        def last(carry: PyTree) -> Accumulated:
+            return Accumulated(*of.last(carry), {}, dfx.RESULTS.successful)
+
+        return Steps(of.carry, of.steps, of.step, last)
+    each = _by_samples(reducer, run, x0, start, data)
+    return Steps(each.carry, each.samples - 1, each.step, each.last)
 
 
-class Samples(NamedTuple):
+class Steps(NamedTuple):
     """A run in its steps."""
+
+    carry: PyTree
+    """before the first"""
+    steps: int
+    step: Callable[[PyTree, Any], PyTree]
+    """of (the carry, k): the carry after the k-th"""
+    last: Callable[[PyTree], Accumulated]
+    """what is left of the run, from the carry after the last step, which has not yet counted the
+    samples that no step begins with, one at least"""
+
+
+class _Samples(NamedTuple):
+    """A run of one step a sample."""
 
     solver: dfx.AbstractSolver
     term: dfx.ODETerm
@@ -164,7 +178,6 @@ class Samples(NamedTuple):
     """before the first sample: the State, the value and the limits left"""
     samples: int
     last: Callable[[PyTree], Accumulated]
-    """what is left of the run, from the carry at the last sample, which is not yet counted"""
 
     def step(self, carry: PyTree, k: Int[Array, ""]) -> PyTree:
         """The carry a sample after the k-th."""
@@ -192,33 +205,46 @@ def _prepared(
     inputs, dt = held_inputs(model, flight, options.dt)
     x0 = start_state(model, params, options.initial_state, inputs)
     run = per_sample(model, params, inputs, options._replace(dt=dt), linear)
-    reducer = _Reducer(model, params, update, model.limits if limits else None)
+    reducer = _Reducer(Reducing(model, params, update), model.limits if limits else None)
     return reducer, (*run, linear), x0
+
+
+def _block(reducer: "_Reducer", args: ZeroOrderHoldArgs, options: SimulationOptions) -> int:
+    """Samples a step.
+
+    Raises:
+        ValueError: what is asked for cannot be.
+    """
+    block = options.block
+    if block != 1 and (args.discrete is None or block < 1):
+        raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
+    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
+    # inputs, since a block's coefficients know no sample before its first.
+    return 1 if reducer.limits is not None or args.delays is not None else block
 
 
 class _Reducer(NamedTuple):
     """What is done at a sample."""
 
-    model: Model
-    params: Record
-    update: Callable[[Any, Any, Any], Any]
+    of: Reducing
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None
 
     def __call__(self, carried: PyTree, state: Record, inputs: Record, data: PyTree) -> Any:
         # Once left, the range stays left: a run that came back has been out of it.
         value, outside = carried
+        of = self.of
         if self.limits is not None:
-            left = self.limits(self.params, state, inputs)
+            left = self.limits(of.params, state, inputs)
             outside = {name: jnp.where(left[name], 1.0, was) for name, was in outside.items()}
-        return self.update(value, self.model.output(self.params, state, inputs), data), outside
+        return of.update(value, of.model.output(of.params, state, inputs), data), outside
 
 
 def _by_samples(
     reducer: _Reducer, run: _Stepping, x0: Record, start: PyTree, data: PyTree
-) -> Samples:
+) -> _Samples:
     """The run one step a sample."""
     method, args, term, linear = run
-    model, params, inputs = reducer.model, reducer.params, args.inputs
+    (model, params, _), inputs = reducer.of, args.inputs
     n = jax.tree.leaves(inputs)[0].shape[0]
     args = args.in_scalars()
     # What depends on the parameters alone is taken out of the loop over time.
@@ -244,143 +270,4 @@ def _by_samples(
 
     # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
     solver = Accumulating(method, lambda *now: reducer(*now), linear)
-    return Samples(solver, term, (args, data), (x0, (start, outside)), n, last)
-
-
-class _Block(NamedTuple):
-    """The exact recurrence over a block of m samples, in nested tuples of scalars.
-
-    Nothing depends on the result before it within a block, so XLA makes one loop over the vehicles
-    of it; written out sample by sample it would compute every sample from the block's first again.
-    """
-
-    free: Any
-    """C A^j, row by row, for j = 1 ... m - 1"""
-    forced: Any
-    """what an input of j samples before adds to the outputs, for j = 0 ... m - 1"""
-    onward: Any
-    """A^m"""
-    driven: Any
-    """what each sample's inputs add to the state after the block"""
-    of_next: Any
-    """Bn, for inputs that are linear between samples; else None"""
-
-
-def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Discrete]:
-    """The recurrence over m samples, and that over one."""
-    assert args.discrete is not None
-    A, B, _, Bn = discrete = args.discrete
-    space = jacobians(model, args.params)
-    C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
-    of_next = None if Bn is None else scalars(Bn)
-    if Bn is not None:
-        # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
-        # held ones.
-        discrete, D = without_next(discrete), D + product(C, Bn)
-        B = discrete.Bd
-    # C A^j and A^j B for all j in m - 1 products each, in place of powers of A.
-    rows, columns, power = [C], [B], A
-    for _ in range(m - 1):
-        rows.append(product(rows[-1], A))
-        columns.append(product(A, columns[-1]))
-        power = product(A, power)
-    free = [scalars(row) for row in rows[1:]]
-    forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
-    onward, driven = scalars(power), [scalars(column) for column in reversed(columns)]
-    # Behind a barrier the coefficients are computed once, not for every step that reads them.
-    once = jax.lax.optimization_barrier((free, forced, onward, driven, of_next))
-    return _Block(*once), discrete
-
-
-def _in_blocks(
-    reducer: _Reducer, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
-) -> tuple[Any, Any]:
-    """The exact recurrence m samples a step: x[k+m] = A^m x[k] + ..., and each output between
-    from x[k] directly, C A^j x[k] + ..., with coefficients of the vehicle's own."""
-    # Unrolled over the m samples, and a loop over the blocks: a block is a few hundred operations,
-    # all of them on vectors over the batch.
-    block, discrete = _block_of(reducer.model, args, m)
-    x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
-    structure, inputs = jax.tree.structure(x0), jax.tree.structure(args.inputs)
-    U = jax.tree.leaves(args.inputs)
-    n = U[0].shape[0]
-    # At least one sample is left over: the last one has outputs but no step after it.
-    steps = (n - 1) // m
-    outputs = functools.partial(_outputs_in_block, reducer, block, structure, inputs)
-
-    def samples(
-        x: list[Array], value: PyTree, u: list[list[Array]], now: PyTree, count: int
-    ) -> PyTree:
-        """The value after `count` samples of a block.
-
-        Args:
-            x: the states at its begin.
-            value: before.
-            u: by sample the inputs.
-            now: the data of these samples.
-            count: how many, m at most.
-        """
-        for j in range(count):
-            data_now = jax.tree.map(lambda v, j=j: v[j], now)
-            value = reducer.update(value, outputs(x, u, j), data_now)
-        return value
-
-    def step(carried: PyTree, slices: tuple[list[Array], PyTree]) -> tuple[PyTree, None]:
-        x, value = carried
-        rows, now = slices
-        u = [[v[j] for v in rows] for j in range(m)]
-        value = samples(x, value, u, now, m)
-        new = [dot(row, x) for row in block.onward]
-        for j in range(m):
-            new = [v + dot(row, u[j]) for v, row in zip(new, block.driven[j], strict=True)]
-        return (new, value), None
-
-    def cut(v: Array) -> Array:
-        return v[: steps * m].reshape(steps, m, *v.shape[1:])
-
-    slices = jax.tree.map(cut, (U, data))
-    (x, value), _ = jax.lax.scan(step, (jax.tree.leaves(x0), start), slices)
-    # The samples that are left, at least one, and the state at the last of them.
-    rest = n - steps * m
-    u = [[v[steps * m + j] for v in U] for j in range(rest)]
-    value = samples(x, value, u, jax.tree.map(lambda v: v[steps * m :], data), rest)
-    last, discrete = list(x), discrete.in_scalars()
-    for j in range(rest - 1):
-        last = advance(discrete, last, u[j])
-    end = jax.tree.unflatten(structure, last)
-    return value, _plus(end, block.of_next, jax.tree.unflatten(inputs, u[rest - 1]))
-
-
-def _outputs_in_block(
-    reducer: _Reducer,
-    block: _Block,
-    structure: Any,  # tree structures, of which JAX exports no type
-    inputs: Any,
-    x: list[Array],
-    u: list[list[Array]],
-    j: int,
-) -> Any:
-    """The outputs of the j-th sample of a block that begins at x with the inputs u[0..j]."""
-    model = reducer.model
-    # The first sample by the model itself: nothing is gained there by the recurrence.
-    if j == 0:
-        now = jax.tree.unflatten(inputs, u[0])
-        state = _plus(jax.tree.unflatten(structure, x), block.of_next, now)
-        return model.output(reducer.params, state, now)
-    # y[j] = C A^j x + the inputs of this sample and of those before it in the block.
-    outputs = {}
-    for i, name in enumerate(naming.names(model.Outputs)):
-        total = dot(block.free[j - 1][i], x)
-        for back in range(j + 1):
-            total = total + dot(block.forced[back][i], u[j - back])
-        outputs[name] = total
-    return model.Outputs(**outputs)
-
-
-def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record:
-    """A State plus (or minus) a matrix, row by row in scalars, times the inputs; None adds none."""
-    if rows is None:
-        return state
-    u = jax.tree.leaves(inputs)
-    new = [x + sign * dot(row, u) for x, row in zip(jax.tree.leaves(state), rows, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(state), new)
+    return _Samples(solver, term, (args, data), (x0, (start, outside)), n, last)

@@ -13,7 +13,8 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.accumulate import Samples, accumulated, sample_by_sample
+from heli_jax.simulation.accumulate import Steps, accumulated, in_steps
+from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
@@ -41,6 +42,10 @@ RUNAWAY = 1e12
 # Samples per step of the exact solver: fastest where many elements are side by side (see
 # `SimulationOptions.block`).
 _BLOCK = 4
+# The same for one program a run, where more coefficients a vehicle take longer to make than they
+# save: roll model, AVX2, busy machine, a whole sweep 7.5 and 8.0 us a vehicle with 2, 7.9 with 3,
+# 8.4 with 4 (one or two runs each).
+_FUSED_BLOCK = 2
 
 
 class ElementResults(NamedTuple):
@@ -80,15 +85,15 @@ def design_point(
     return _concluded(plan, numbers, values, trim, run)
 
 
-def samples_of(
+def steps_of(
     plan: Plan, numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None
-) -> Samples:
+) -> Steps:
     """The run of one element in its steps, for a plan that is streamed; arguments as
     `design_point` has them."""
     params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     update, start, data = _streaming(plan, numbers)
-    return sample_by_sample(
+    return in_steps(
         plan.model,
         params,
         inputs,
@@ -96,18 +101,18 @@ def samples_of(
         start,
         data=data,
         limits=True,
-        options=plan.simulation(dt=numbers.dt, initial_state=state),
+        options=_streamed_options(plan, numbers, state, _FUSED_BLOCK),
     )
 
 
-def of_samples(
+def of_steps(
     plan: Plan,
     numbers: FlightNumbers,
     values: Scalars,
     trim: InitialTrim | None,
     reduced: tuple[Any, Any, dict[str, Any]],
 ) -> ElementResults:
-    """The element of which `samples_of` gave the steps.
+    """The element of which `steps_of` gave the steps.
 
     Args:
         plan, numbers, values, trim: as `design_point` has them.
@@ -268,9 +273,7 @@ def _named(name: str, result: Any) -> dict[str, Any]:
 def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, inputs: Any) -> _Run:
     """The run reduced while it goes on."""
     update, start, data = _streaming(plan, numbers)
-    options = plan.simulation(
-        dt=numbers.dt, initial_state=state, block=_BLOCK if plan.solver == "exact" else 1
-    )
+    options = _streamed_options(plan, numbers, state, _BLOCK)
     reduced = accumulated(
         plan.model,
         params,
@@ -282,6 +285,13 @@ def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, input
         options=options,
     )
     return _of_reduced(plan, numbers, reduced.value, reduced.state, reduced.outside)
+
+
+def _streamed_options(
+    plan: Plan, numbers: FlightNumbers, state: Any, block: int
+) -> SimulationOptions:
+    block = block if plan.solver == "exact" else 1
+    return plan.simulation(dt=numbers.dt, initial_state=state, block=block)
 
 
 def _of_reduced(

@@ -15,8 +15,8 @@ from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.program import Run
 from heli_jax.fused.traced import Traced, traced
-from heli_jax.simulation.accumulate import Samples
-from heli_jax.sweeps.design_point import ElementResults, of_samples, samples_of
+from heli_jax.simulation.accumulate import Steps
+from heli_jax.sweeps.design_point import ElementResults, of_steps, steps_of
 from heli_jax.sweeps.flight_numbers import (
     FlightNumbers,
     Scalars,
@@ -191,25 +191,29 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
 
 
 class _Elements(NamedTuple):
-    """An element's run in steps whose results are what `of_samples` takes."""
+    """An element's run in steps whose results are what `of_steps` takes."""
 
-    samples: Samples
+    of: Steps
 
     @property
     def carry(self) -> Any:
-        return self.samples.carry
+        return self.of.carry
+
+    @property
+    def steps(self) -> int:
+        return self.of.steps
 
     def step(self, carry: Any, k: Any, /) -> Any:
-        return self.samples.step(carry, k)
+        return self.of.step(carry, k)
 
     def last(self, carry: Any, /) -> Any:
-        left = self.samples.last(carry)
+        left = self.of.last(carry)
         return left.value, left.state, left.outside
 
 
 def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> Traced:
     def making(bare: FlightNumbers, records: Any, element: Any) -> _Elements:
-        return _Elements(samples_of(plan, _with(bare, records), *element))
+        return _Elements(steps_of(plan, _with(bare, records), *element))
 
     return traced(making, _without(numbers), _records(numbers), (values, trim))
 
@@ -235,9 +239,9 @@ def _compiled(
         return run.common(_without(numbers), _records(numbers), element)
 
     before, split = spread(own, devices, lanes)
-    conclude, _ = spread(functools.partial(of_samples, plan), devices, lanes)
+    conclude, _ = spread(functools.partial(of_steps, plan), devices, lanes)
     if devices[0].platform == "cpu":
-        kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision)))
+        kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision), plan.solver == "exact"))
     else:
         kernel = GpuKernel(run.run, Gpu(devices[0].local_hardware_id), devices[0])
     return _Parts(kernel, run, before, common, conclude, split, trims_of(plan, lanes))

@@ -29,6 +29,13 @@ def field(stays, u, x, k, function):
     return jnp.stack([0.5 * x[0] + 0.1 * function(slope), jnp.maximum(x[1], both[0] * late)])
 
 
+def own(v):
+    """A table, an order and a loop that differ from vehicle to vehicle."""
+    looked_up = jnp.interp(v, jnp.asarray(np.sort(RECORD), v.dtype), jnp.asarray(TABLE, v.dtype))
+    halved = jax.lax.while_loop(lambda y: jnp.abs(y) > 0.1, lambda y: 0.5 * y, v)
+    return looked_up + jnp.median(jnp.stack([v, looked_up, halved]))
+
+
 def run_of(dtype=np.float64, function=jnp.tanh):
     own, shared = jnp.asarray(0.7, dtype), jnp.asarray([0.2, 0.3], dtype)
     stays, record, x = (own, shared), jnp.asarray(RECORD, dtype), jnp.zeros(2, dtype)
@@ -45,7 +52,7 @@ def run_of(dtype=np.float64, function=jnp.tanh):
         (Argument((), np.dtype(dtype), False), Argument((2,), np.dtype(dtype), True)),
         (Argument((N,), np.dtype(dtype), True),),
         (Argument((2,), np.dtype(dtype), False),),
-        N,
+        N - 1,
     )
 
 
@@ -62,9 +69,10 @@ def emulated(monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("vehicles", [1, 33, 160])
-def test_every_vehicle_is_a_thread(emulated, dtype, vehicles):
-    kernel = GpuKernel(run_of(dtype), emulated, jax.devices("cpu")[0])
+@pytest.mark.parametrize(("vehicles", "function"), [(1, jnp.tanh), (33, own), (160, jnp.tanh)])
+def test_every_vehicle_is_a_thread(emulated, dtype, vehicles, function):
+    run = run_of(dtype, function)
+    kernel = GpuKernel(run, emulated, jax.devices("cpu")[0])
     stays, stored, carry = given(vehicles, dtype)
     found = kernel(*([jnp.asarray(v) for v in part] for part in (stays, stored, carry)))
     # The processor's program takes whole blocks of vehicles.
@@ -72,7 +80,7 @@ def test_every_vehicle_is_a_thread(emulated, dtype, vehicles):
         np.concatenate([v, np.repeat(v[..., :1], -vehicles % 8, -1)], -1)
         for v in (stays[0], carry[0])
     ]
-    on_cpu = Kernel(run_of(dtype), 8)([filled[0], stays[1]], stored, [filled[1]], 1)
+    on_cpu = Kernel(run, 8)([filled[0], stays[1]], stored, [filled[1]], 1)
     rtol = 1e-12 if dtype == np.float64 else 1e-5
     np.testing.assert_allclose(found[0], on_cpu[0][:vehicles], rtol=rtol)
     np.testing.assert_array_equal(found[1], on_cpu[1][:vehicles])
@@ -94,7 +102,7 @@ def test_fewer_threads_than_vehicles_are_enough(emulated):
 def test_it_is_text_that_the_driver_reads(capability, tmp_path):
     # sqrt and tanh by exponentials need libdevice; without CUDA there is none.
     function = jnp.sin if libdevice() is not None else jnp.sqrt
-    text, _ = ptx(run_of(function=function), capability)
+    text, _ = ptx(run_of(function=lambda v: function(v) + own(v)), capability)
     assert ".visible .entry run(" in text
     assert f".target sm_{min(capability, 90)}" in text
     assert ".extern" not in text

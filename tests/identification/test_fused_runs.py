@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 from heli_jax import Free, Nuisance, Prior, Problem, fit, models
 from heli_jax.fused import gpu_kernel
@@ -23,7 +24,7 @@ from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from tests.fused.emulated_gpu import EmulatedGpu, as_text
-from tests.identification.bench import BENCH, record, vehicle
+from tests.identification.bench import BENCH, record, response, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
 RUNS = 18
@@ -181,6 +182,23 @@ def test_records_fitted_together_are_as_each_by_itself(fitted):
             # Noise levels and weak priors are those of the first record.
             assert abs(found.values[name][k] - e.value) < 0.1 * e.sd
             np.testing.assert_allclose(found.values[name][k::3], found.values[name][k], rtol=1e-6)
+
+
+def test_many_records_are_fitted_as_scipy_fits_them():
+    free = {"Ixx": Free(0.03), "If": Free(2e-4)}
+    flights = [record(BENCH, seed=k, n=150) for k in range(24)]
+    found = refit(fit(problem(flights[:1], free, nuisance=NONE)), flights)
+    assert found.converged.all()
+    assert found.note == ""  # as programs of machine code
+    for k, flight in enumerate(flights[:6]):
+        u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+        alone = scipy.optimize.least_squares(
+            lambda v, u=u, y=y: response(BENCH | {"Ixx": v[0], "If": v[1]}, u, 0.02, True) - y,
+            [0.024, 1.7e-4], x_scale=[1e-3, 1e-5], xtol=1e-14, ftol=1e-14, gtol=1e-14,
+        )  # fmt: skip
+        sd = np.sqrt(np.diag(np.linalg.inv(alone.jac.T @ alone.jac)) * 2.0 * alone.cost / 148)
+        for name, value, spread in zip(free, alone.x, sd, strict=True):
+            assert abs(found.values[name][k] - value) < 1e-2 * spread
 
 
 def test_a_records_cost_is_its_own(fitted):

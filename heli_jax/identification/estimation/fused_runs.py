@@ -24,7 +24,7 @@ from heli_jax.identification.estimation.residual import prior_rows, weak_rows
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, FlightData, Layout, Noise, unpack
 from heli_jax.numerics.cores import cores
-from heli_jax.simulation.accumulate import Samples, sample_by_sample
+from heli_jax.simulation.accumulate import Steps, in_steps
 from heli_jax.simulation.options import SimulationOptions
 
 _COMPARED = 32
@@ -206,7 +206,7 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
         data, sd = _with(shared[0], i, records, samples), shared[1][i]
         flight: FlightData = data.flights[i]
 
-        def run(z: Any) -> Samples:
+        def run(z: Any) -> Steps:
             u = unpack(layout, data, z)
             drive = driven(layout, data, u, i)
 
@@ -220,7 +220,7 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
                 )
 
             zero = jnp.zeros((), z.dtype)
-            return sample_by_sample(
+            return in_steps(
                 layout.model,
                 drive.params,
                 drive.inputs,
@@ -251,6 +251,7 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
         return Products(
             Sensitive(
                 run,
+                samples[i] - 1,
                 columns.throughout,
                 columns.at_first,
                 lambda carry: carry[1][0],
