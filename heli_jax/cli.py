@@ -240,7 +240,8 @@ def _fit_code(fitted: "Fit") -> int:
     # looks at the code alone must not take these numbers.
     if code == DONE and (fitted.adequacy.less_than_mean or fitted.held_out_worse):
         return NOT_CONVERGED
-    return code
+    # An optimum that gusts have made looks as determined as any other.
+    return NOT_DETERMINED if code == DONE and fitted.not_borne_out else code
 
 
 def _check(options: argparse.Namespace) -> int:

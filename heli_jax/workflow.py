@@ -17,13 +17,16 @@ from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
 from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
+from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import check, findings, first_guess, fit, rates
+from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
+from heli_jax.identification.likelier_hold import with_likelier_hold
 from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
+from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
 from heli_jax.identification.validation.finding import Finding
@@ -163,16 +166,14 @@ def _fit_run(
             guess = first_guess(problem) if with_findings else None
             enough = findings(problem, guess) if with_findings else ()
         with stage("fit"):
-            fitted = fit(
-                problem,
-                starts=options.starts,
-                seed=options.seed,
-                max_steps=options.max_steps,
-                progress=progress,
-                guess=guess,
+            fitted = _fitted(problem, options, progress, guess)
+            problem, fitted = with_likelier_hold(
+                problem, fitted, lambda held: _fitted(held, options, progress)
             )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
+    with stage("beside another method", name="second method"):
+        fitted = with_second_method(problem, fitted, max_steps=options.max_steps, progress=progress)
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     if out is not None and _long_intervals(config):
@@ -187,6 +188,19 @@ def _fit_run(
     with stage("whether the log was enough", name="findings"):
         further = further._replace(findings=_at_estimates(problem, fitted, enough))
     return FitRun(config, problem, fitted, rls, further, began=began)
+
+
+def _fitted(
+    problem: Problem, options: FitConfig, progress: Say, guess: FirstGuess | None = None
+) -> Fit:
+    return fit(
+        problem,
+        starts=options.starts,
+        seed=options.seed,
+        max_steps=options.max_steps,
+        progress=progress,
+        guess=guess,
+    )
 
 
 def _long_intervals(config: Experiment) -> bool:

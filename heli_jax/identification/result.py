@@ -47,6 +47,17 @@ class Estimate(NamedTuple):
     """the Cramer-Rao sd if all other unknowns were known: Tischler's insensitivity"""
 
 
+class SecondMethod(NamedTuple):
+    """Where a method that weighs by the noise's spectrum has other values than output error. The
+    names of the fields are keys of fit.json."""
+
+    label: str
+    """the method, as reports call it"""
+    estimates: Mapping[str, tuple[float, float, float] | None]
+    """by parameter that it does not bear out its estimate there and the ends of its 95 % interval;
+    None where the data do not determine it by that method"""
+
+
 class Signals(NamedTuple):
     """One flight as measured and as simulated; arrays (N,), SI."""
 
@@ -165,6 +176,9 @@ class Fit:
     disturbed_loop: bool = False
     """in time without process noise: whether inputs follow the response and the residuals are not
     white, so that a disturbance comes back through the inputs"""
+    second_method: SecondMethod | None = None
+    """output error with coloured residuals: where a method that weighs by the noise's spectrum
+    differs; None where that was not asked"""
     late_stick: LateStick | None = None
     """by how much inputs look later than they acted, where that is clear and matters"""
     seed: int = 0
@@ -179,14 +193,21 @@ class Fit:
 
     @property
     def untrusted(self) -> tuple[str, ...]:
-        """The parameters that feedback may have biased, or of which the instruments say too
-        little."""
-        if self.disturbed_loop:
-            # Nothing tells which of them: a disturbance in the inputs moves all.
+        """The parameters that feedback may have biased, of which the instruments say too little, or
+        that another method does not bear out."""
+        if self.disturbed_loop or self.not_borne_out:
+            # Nothing tells which of them: a disturbance in the inputs moves all, and one estimate
+            # of a wrong optimum is as wrong as another.
             return tuple(self.estimates)
         loop = Loop(self.feedback, self.instruments, self.held_upright)
         doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
         return tuple(n for n in self.estimates if n in doubted)
+
+    @property
+    def not_borne_out(self) -> tuple[str, ...]:
+        """Output error with coloured residuals: the parameters whose estimates a method that weighs
+        by the noise's spectrum excludes, or does not determine."""
+        return tuple(self.second_method.estimates) if self.second_method is not None else ()
 
     @property
     def distrust(self) -> str:
@@ -196,6 +217,9 @@ class Fit:
         why = "weak instrument" if self.weak_instrument else "closed loop without an instrument"
         if self.disturbed_loop:
             why = "the inputs follow the response, and the residuals are not white"
+        elif self.second_method is not None and self.second_method.estimates:
+            names = ", ".join(self.not_borne_out)
+            why = f"{self.second_method.label}, which allows for gusts, does not bear {names} out"
         return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
 
     @property

@@ -65,6 +65,7 @@ def residuals(fit: Fit) -> dict[str, Any]:
         "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
         "held_upright": fit.held_upright,
         "disturbed_loop": fit.disturbed_loop,
+        "second_method": fit.second_method._asdict() if fit.second_method else None,
         "untrusted": list(fit.untrusted),
     }
 

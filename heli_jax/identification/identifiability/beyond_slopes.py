@@ -107,13 +107,13 @@ def beyond_slopes(
         and (u.logarithmic or u.symmetric)
         and not (u.name in lacking or u.at_bound)
         and asked[i]
-        and sd[i] * reaches[i] > Z95 * least[i]
+        and (sd[i] * reaches[i] > Z95 * least[i] or _may_vanish(u, sd[i] * reaches[i]))
     ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES
     null = _open_at_rest(problem, at, e, lacking, reaches)
     opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
-    limits, one_sided = {}, []
+    limits, one_sided, along = {}, [], []
     R = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     # What is open already goes along with anything, and tells nothing of where the others go.
     R[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
@@ -136,10 +136,11 @@ def beyond_slopes(
         reach = together * float(reaches[i])
         others = np.abs(np.delete(verdict.correlation[i], i)).max(initial=0.0)
         far = (certain if others > _SINGULAR else together) * float(reaches[i])
-        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach, far)
+        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach, far, [])
         ends = profile.ends()
         if ends is None:
             one_sided.append(u.name)
+            along += profile.inside
         elif not all(end.as_expected for end in ends):
             low, high = sorted(end.value for end in ends)
             limits[u.name] = (low, high)
@@ -152,8 +153,74 @@ def beyond_slopes(
         and n not in {*one_sided, *opened, *lacking}
         and np.abs(verdict.correlation[i, at_side]).max(initial=0.0) > _TOGETHER
     ]
+    if along:
+        # Where what is open stays. What was asked itself went along with it already.
+        R[:, [i for i, n in enumerate(verdict.names) if n in one_sided]] = 0.0
+        still = np.linalg.pinv(R / norms, rcond=1e-10) / norms[:, None]
+        distances = np.linalg.norm(still, axis=1)[:n] * reaches[:n]
+        gone = {*one_sided, *opened, *lacking, *(u.name for _, u in wide)}
+        each = zip(verdict.names, distances.tolist(), strict=True)
+        known = {name: d for name, d in each if name not in gone}
+        limits |= _reaching(at, e, limits, along, known)
     limits = {n: ends for n, ends in limits.items() if n not in one_sided}
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
+
+
+def _may_vanish(u: Unknown, reach: float) -> bool:
+    """Whether an interval that reaches so far holds zero.
+
+    What acts through a parameter that may be zero may act not at all: slopes beside it bound what
+    the likelihood there does not.
+    """
+    return u.symmetric and reach >= u.distance
+
+
+class _Inside(NamedTuple):
+    """A point along an open parameter that is as likely as those within an interval."""
+
+    z: np.ndarray
+    """(q,)"""
+    left: float
+    """part of the interval of any other parameter that it leaves to that, 0 to 1"""
+
+
+def _reaching(
+    at: Solution,
+    e: Evaluation,
+    limits: Limits,
+    along: list[_Inside],
+    reach: Mapping[str, float],
+) -> dict[str, tuple[float, float]]:
+    """Intervals that hold where the others go along a parameter that is open, if they do not yet.
+
+    A slope tells how far a parameter goes where the open one stays; along with it, it may go as far
+    as that does.
+
+    Args:
+        at: the optimum.
+        e: what it tells.
+        limits: intervals by the likelihood, where these are known.
+        along: what is as likely as what is within an interval.
+        reach: by parameter, from the optimum to the ends of its interval by slopes, in the
+            optimiser's coordinate.
+    """
+    found = {}
+    for name, distance in reach.items():
+        i = at.layout.of_interest.index(name)
+
+        def value(z: float, i: int = i) -> float:
+            if i >= len(at.layout.kinds):
+                # No parameter of the model: its coordinate is itself in other units.
+                return float(e.named[i] + e.slopes[i] * (z - float(at.z[i])))
+            return float(value_of(at.layout, at.data, i, jnp.asarray(z)))
+
+        middle = float(at.z[i])
+        known = limits.get(name) or (value(middle - distance), value(middle + distance))
+        there = [value(float(p.z[i]) + side * p.left * distance) for p in along for side in (-1, 1)]
+        low, high = min(*known, *there), max(*known, *there)
+        if low < min(known) or high > max(known):
+            found[name] = (low, high)
+    return found
 
 
 class _Point(NamedTuple):
@@ -253,6 +320,8 @@ class _Profile(NamedTuple):
     """root of what may be lost within the interval"""
     certain: float
     """root of what has to be lost at a factor of ten"""
+    inside: list[_Inside]
+    """what was visited and is as likely as what is within the interval"""
 
     def ends(self) -> tuple[_End, _End] | None:
         """Both ends; None where one of them is not within the factor of ten."""
@@ -279,6 +348,7 @@ class _Profile(NamedTuple):
             if math.isfinite(root):
                 seen.append((t, root))
             if root < self.reach:
+                self.inside.append(_Inside(point.z, self._left(root)))
                 if t >= furthest:
                     return self._at_limit(side)
                 # The direction in which the others went last is where they go on.
@@ -298,8 +368,13 @@ class _Profile(NamedTuple):
         z = guess + tangent * (z0[self.i] + side * furthest - guess[self.i])
         point = _follow(self.at, z, np.arange(z0.size) == self.i)
         if _lost(self.at, first, point.squares) < self.certain**2:
+            self.inside.append(_Inside(point.z, 0.0))
             return self._at_limit(side)
         return _End(self._value(z0[self.i] + side * self._crossing(seen)), False)
+
+    def _left(self, root: float) -> float:
+        """What part of an interval is left where so much of the likelihood is lost already."""
+        return math.sqrt(max(0.0, 1.0 - (root / self.reach) ** 2))
 
     def _crossing(self, seen: list[tuple[float, float]]) -> float:
         """Where the root of what is lost passes the reach: nearly a straight line."""

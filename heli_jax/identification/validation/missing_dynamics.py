@@ -166,6 +166,8 @@ def explained_by(
     # A gap would have to be filled, and what fills it looks like a response.
     if not seen.all() or residual.size < _FEWEST * (lags + ORDER):
         return None
+    # Of a simulation that has left the record squares would overflow; a share knows no size.
+    residual = residual / max(float(np.max(np.abs(residual))), 1e-300)
     e, drive = residual - residual.mean(), u - u.mean()
     if not (np.std(e) > 0 and np.std(drive) > 0):
         return None

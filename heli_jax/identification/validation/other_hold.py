@@ -1,7 +1,9 @@
-"""What the estimates would be if the inputs moved otherwise between their samples."""
+"""What the estimates would be if the inputs moved otherwise between their samples, and which of the
+two the record bears out."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,11 +13,15 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 
 _NULL = 1e-8
 """Directions of the scaled Jacobian below this part of the largest stay where they are."""
+_BEYOND_DOUBT = 20.0
+"""of twice the log-likelihood, from which on the other hold is taken where the log leaves it
+open"""
 _MOST = 3
 """parameters that are named"""
 
@@ -53,7 +59,7 @@ def other_hold(
         other = evaluate(_flipped(at.layout, moving), at.data, at.noise, at.z)
     else:
         return []
-    if not (np.all(np.isfinite(other.J)) and np.all(np.isfinite(other.r))):
+    if not _is_finite(other):
         return []
     names = at.layout.of_interest
     change = _change(e, other, len(names))
@@ -65,6 +71,86 @@ def other_hold(
         if n not in skip and sd.get(n, 0.0) > 0
     }
     return _sentence(problem.training, moving, at.layout, e, changes)
+
+
+class LikelierHold(NamedTuple):
+    """That the record is better explained by inputs that stay where they were commanded."""
+
+    problem: Problem
+    """with these inputs held"""
+    inputs: tuple[str, ...]
+    gain: float
+    """of twice the log-likelihood, to first order"""
+
+    @property
+    def sentence(self) -> str:
+        """For the notes of a fit."""
+        names, several = ", ".join(self.inputs), len(self.inputs) > 1
+        return (
+            f"{names} {'move' if several else 'moves'} at nearly every sample, as a stick does "
+            "that is sampled on its way, and a command that is computed anew at each; "
+            f"{'they are' if several else 'it is'} taken as held between samples, since that "
+            f"explains the record better (twice the log-likelihood gains {self.gain:.3g}). State "
+            "hold: linear or zero-order where you know which."
+        )
+
+
+def likelier_hold(
+    problem: Problem, at: Solution, e: Evaluation, wider: float = 1.0
+) -> LikelierHold | None:
+    """The problem with the inputs held that their log let be taken as linear, where the record
+    bears that out beyond doubt; None where it does not, or where nothing was left to the log.
+
+    Args:
+        problem: what was fitted.
+        at: the optimum.
+        e: what it tells.
+        wider: by how much autocorrelated residuals widen intervals.
+    """
+    moving = [_moving_inputs(problem, f, in_doubt=True) for f in problem.training]
+    if not any(moving) or not _is_finite(e) or feeds_through(problem):
+        return None
+    other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
+    if not _is_finite(other):
+        return None
+    n = measured_count(at.data)
+    costs = [_least(one) / n for one in (e, other)]
+    gain = float(at.layout.estimator.deviance(at.layout, costs[0], costs[1], n))
+    # Of residuals that are autocorrelated fewer samples are news.
+    gain /= max(wider, 1.0) ** 2
+    if not gain > _BEYOND_DOUBT:
+        return None
+    names = {n for held in moving for n in held}
+    reason = f"explains the record better so: twice the log-likelihood gains {gain:.3g}"
+    flights = tuple(_held(f, names, reason) for f in problem.flights)
+    return LikelierHold(replace(problem, flights=flights), tuple(sorted(names)), gain)
+
+
+def _least(e: Evaluation) -> float:
+    """The smallest sum of squares to first order about a point."""
+    r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
+    norms = np.linalg.norm(J, axis=0)
+    Q, R = np.linalg.qr(J[:, norms > 0] / norms[norms > 0])
+    # Directions without effect take nothing off.
+    U, values, _ = np.linalg.svd(R)
+    taken = (Q @ U[:, values > _NULL * values[0]]).T @ r if values.size else np.zeros(0)
+    return float(r @ r - taken @ taken)
+
+
+def _held(flight: Flight, names: Collection[str], reason: str) -> Flight:
+    """A flight with the inputs held of which its log let a straight line be taken."""
+    doubted = {n for n in names if flight.hold[n] == "linear" and n in flight.hold_reason}
+    if not doubted:
+        return flight
+    return replace(
+        flight,
+        hold={**flight.hold, **dict.fromkeys(doubted, "zero-order")},
+        hold_reason={**flight.hold_reason, **dict.fromkeys(doubted, reason)},
+    )
+
+
+def _is_finite(e: Evaluation) -> bool:
+    return bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
 
 
 def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]:

@@ -1,0 +1,36 @@
+"""What an input does between samples, by the record where the log leaves it open."""
+
+import dataclasses
+from collections.abc import Callable
+
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Fit
+from heli_jax.identification.validation.other_hold import likelier_hold
+
+
+def with_likelier_hold(
+    problem: Problem, found: Fit, refit: Callable[[Problem], Fit]
+) -> tuple[Problem, Fit]:
+    """The fit, and what was fitted, with inputs held of which the log left that open, where the
+    record bears it out.
+
+    An input that moves at every sample may be a stick that was sampled on its way or a command that
+    is computed at each sample and held. The log looks the same; the answer is half a sample later.
+
+    Args:
+        problem: what was fitted.
+        found: the fit.
+        refit: fits a problem as that one was.
+    """
+    if found.status == "not-converged":
+        return problem, found
+    # By how much the colour of the residuals widens intervals: the record is worth so much less.
+    wider = [e.sd / e.sd_white for e in found.estimates.values() if e.sd and e.sd_white]
+    held = likelier_hold(problem, found.reached, evaluate(*found.reached), max(wider, default=1.0))
+    if held is None:
+        return problem, found
+    again = refit(held.problem)
+    if again.status == "not-converged" or not again.log_likelihood > found.log_likelihood:
+        return problem, found
+    return held.problem, dataclasses.replace(again, notes=(held.sentence, *again.notes))

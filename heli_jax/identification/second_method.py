@@ -1,0 +1,104 @@
+"""Output error whose residuals are coloured, beside a method that weighs by the noise's spectrum.
+
+In gusts output error is consistent and poorly weighed: it explains slow drift by slow modes, and
+intervals that allow for the residuals' colour do so for the optimum that was found, which such
+drift may have made. Frequency error, with the noise's spectrum estimated, has no such optimum. An
+efficient estimate and an inefficient one of the same parameter differ by less than the inefficient
+one's own interval where both are consistent: their difference has the variance of the one less that
+of the other (Hausman, 1978). So where they lie further apart the intervals do not hold.
+
+Source: J. A. Hausman, Specification tests in econometrics, Econometrica 46 (1978).
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+from heli_jax.identification.fit import fit
+from heli_jax.identification.methods import METHODS
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Fit, SecondMethod
+
+METHOD = "frequency-error"
+_WELL_EXPLAINED = 0.95
+"""VAF of every output from which on a disturbance is too small to make an optimum of its own"""
+_APART = 3.3
+"""output error's standard deviations that chance takes an estimate from the other in one of 1000"""
+
+
+def with_second_method(
+    problem: Problem,
+    found: Fit,
+    *,
+    max_steps: int = 200,
+    progress: Callable[[str], None] | None = None,
+) -> Fit:
+    """The fit, with the parameters on which frequency error does not bear it out.
+
+    Asked of output error alone, where disturbances colour its residuals and take a good part of an
+    output, of linear models whose inputs do not follow the response.
+
+    Args:
+        problem: what was fitted.
+        found: the fit.
+        max_steps: of the other method's optimiser.
+        progress: called with a line of text before the work.
+    """
+    if not _is_asked(problem, found):
+        return found
+    if progress is not None:
+        progress(f"the residuals are coloured: the same by {METHODS[METHOD].label}")
+    try:
+        other = fit(
+            dataclasses.replace(problem, method=METHOD, window=None, continuity=None),
+            max_steps=max_steps,
+        )
+    except ValueError:
+        # It takes fewer problems than output error does; nothing is said then.
+        return found
+    if other.status == "not-converged" or other.untrusted:
+        return found
+    estimates = {
+        n: None if b.sd is None else (b.value, float(b.lower95 or 0.0), float(b.upper95 or 0.0))
+        for n, a in found.estimates.items()
+        if _apart(a, b := other.estimates[n])
+    }
+    second = SecondMethod(METHODS[METHOD].label, estimates)
+    notes = (*found.notes, sentence(second)) if estimates else found.notes
+    return dataclasses.replace(found, second_method=second, notes=notes)
+
+
+def _is_asked(problem: Problem, found: Fit) -> bool:
+    if problem.method != "output-error" or found.status == "not-converged" or not found.coloured:
+        return False
+    # What is wrong with the record, or explains nothing of it, is said by itself.
+    if found.untrusted or found.adequacy.by_chance or not problem.model.linear:
+        return False
+    vafs = [m.vaf for m in found.metrics.values()]
+    return bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
+
+
+def _apart(a: Estimate, b: Estimate) -> bool:
+    """Whether output error's estimate of a parameter is one that the other method's excludes."""
+    if not a.sd:
+        return False
+    if b.sd is None or b.lower95 is None or b.upper95 is None:
+        # What the efficient one does not determine the other has by an optimum of chance.
+        return True
+    return abs(b.value - a.value) > _APART * a.sd and not b.lower95 <= a.value <= b.upper95
+
+
+def sentence(second: SecondMethod) -> str:
+    """For the notes of a fit.
+
+    Args:
+        second: with a parameter at least that it does not bear out.
+    """
+    each = ", ".join(
+        f"{n} not determined" if v is None else f"{n} {v[0]:.3g} (95 % {v[1]:.3g} to {v[2]:.3g})"
+        for n, v in second.estimates.items()
+    )
+    return (
+        f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. That is "
+        "not within what output error's intervals allow: in gusts it takes slow drift for slow "
+        "modes. Fit with method: frequency-error, or filter-error with a disturbance."
+    )
