@@ -197,11 +197,18 @@ def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     [
         ("converged", False, (), 0), ("converged", True, (), 4), ("converged", False, ("p",), 4),
         ("not-identifiable", True, ("p",), 3), ("not-converged", True, (), 4),
+        ("converged", False, "by another method", 3),
     ],
 )  # fmt: skip
 def test_exit_codes(status, less, held_out, code):
     adequacy = SimpleNamespace(reasons=("VAF of p is -586",) if less else (), less_than_mean=less)
-    fitted = SimpleNamespace(status=status, adequacy=adequacy, held_out_worse=held_out)
+    borne_out = held_out != "by another method"
+    fitted = SimpleNamespace(
+        status=status,
+        adequacy=adequacy,
+        held_out_worse=held_out if borne_out else (),
+        not_borne_out=() if borne_out else ("Kr",),
+    )
     assert cli._fit_code(fitted) == code
 
 

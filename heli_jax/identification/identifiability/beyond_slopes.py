@@ -107,7 +107,7 @@ def beyond_slopes(
         and (u.logarithmic or u.symmetric)
         and not (u.name in lacking or u.at_bound)
         and asked[i]
-        and (sd[i] * reaches[i] > Z95 * least[i] or _may_vanish(u, sd[i] * reaches[i]))
+        and (sd[i] * reaches[i] > Z95 * least[i] or _may_vanish(problem, u, sd[i] * reaches[i]))
     ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES
@@ -166,13 +166,14 @@ def beyond_slopes(
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
 
 
-def _may_vanish(u: Unknown, reach: float) -> bool:
-    """Whether an interval that reaches so far holds zero.
+def _may_vanish(problem: Problem, u: Unknown, reach: float) -> bool:
+    """Whether an interval that reaches so far holds zero, and its parameter may be there.
 
     What acts through a parameter that may be zero may act not at all: slopes beside it bound what
     the likelihood there does not.
     """
-    return u.symmetric and reach >= u.distance
+    low, high = transforms.limits(problem.free[u.name])
+    return u.symmetric and low < 0.0 < high and reach >= u.distance
 
 
 class _Inside(NamedTuple):

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.signal
 
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
@@ -183,7 +182,12 @@ def _largest(moved: Mapping[str, tuple[float, float]]) -> list[tuple[str, tuple[
 
 def _fast(u: np.ndarray) -> np.ndarray:
     """What of an input (N,) is faster than a parabola over a few samples follows."""
-    return u - scipy.signal.savgol_filter(u, _WINDOW, 2)
+    # As scipy.signal.savgol_filter has it, of which one function imports a second of others.
+    powers = np.vander(np.arange(_WINDOW) - _WINDOW // 2, 3).astype(float)
+    fitted, half = powers @ np.linalg.pinv(powers), _WINDOW // 2
+    smooth = np.convolve(u, fitted[half][::-1], mode="valid")
+    first, last = fitted[:half] @ u[:_WINDOW], fitted[half + 1 :] @ u[-_WINDOW:]
+    return u - np.concatenate([first, smooth, last])
 
 
 def _added(data: Data, name: str, more: list[np.ndarray]) -> Data:
