@@ -195,10 +195,12 @@ class Fit:
     def untrusted(self) -> tuple[str, ...]:
         """The parameters that feedback may have biased, of which the instruments say too little, or
         that another method does not bear out."""
-        if self.disturbed_loop or self.not_borne_out:
-            # Nothing tells which of them: a disturbance in the inputs moves all, and one estimate
-            # of a wrong optimum is as wrong as another.
+        if self.disturbed_loop:
+            # Nothing tells which of them: a disturbance in the inputs moves all.
             return tuple(self.estimates)
+        if self.not_borne_out:
+            # One estimate of a wrong optimum is as wrong as another.
+            return tuple(n for n, e in self.estimates.items() if e.sd is not None)
         loop = Loop(self.feedback, self.instruments, self.held_upright)
         doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
         return tuple(n for n in self.estimates if n in doubted)

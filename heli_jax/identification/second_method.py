@@ -99,6 +99,7 @@ def sentence(second: SecondMethod) -> str:
     )
     return (
         f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. That is "
-        "not within what output error's intervals allow: in gusts it takes slow drift for slow "
-        "modes. Fit with method: frequency-error, or filter-error with a disturbance."
+        "not within what output error's intervals allow: it takes slow drift for slow modes, and "
+        "what the model lacks for parameters. Fit with method: frequency-error, or filter-error "
+        "with a disturbance."
     )
