@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 
-from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.other_hold import likelier_hold
@@ -27,7 +26,7 @@ def with_likelier_hold(
         return problem, found
     # By how much the colour of the residuals widens intervals: the record is worth so much less.
     wider = [e.sd / e.sd_white for e in found.estimates.values() if e.sd and e.sd_white]
-    held = likelier_hold(problem, found.reached, evaluate(*found.reached), max(wider, default=1.0))
+    held = likelier_hold(problem, found.reached, max(wider, default=1.0))
     if held is None:
         return problem, found
     again = refit(held.problem)

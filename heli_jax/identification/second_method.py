@@ -18,7 +18,7 @@ from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, SecondMethod
 
-METHOD = "frequency-error"
+_METHOD = "frequency-error"
 _WELL_EXPLAINED = 0.95
 """VAF of every output from which on a disturbance is too small to make an optimum of its own"""
 _APART = 3.3
@@ -46,10 +46,10 @@ def with_second_method(
     if not _is_asked(problem, found):
         return found
     if progress is not None:
-        progress(f"the residuals are coloured: the same by {METHODS[METHOD].label}")
+        progress(f"the residuals are coloured: the same by {METHODS[_METHOD].label}")
     try:
         other = fit(
-            dataclasses.replace(problem, method=METHOD, window=None, continuity=None),
+            dataclasses.replace(problem, method=_METHOD, window=None, continuity=None),
             max_steps=max_steps,
         )
     except ValueError:
@@ -58,11 +58,11 @@ def with_second_method(
     if other.status == "not-converged" or other.untrusted:
         return found
     estimates = {
-        n: None if b.sd is None else (b.value, float(b.lower95 or 0.0), float(b.upper95 or 0.0))
+        n: _interval(other.estimates[n])
         for n, a in found.estimates.items()
-        if _apart(a, b := other.estimates[n])
+        if _apart(a, other.estimates[n])
     }
-    second = SecondMethod(METHODS[METHOD].label, estimates)
+    second = SecondMethod(METHODS[_METHOD].label, estimates)
     notes = (*found.notes, sentence(second)) if estimates else found.notes
     return dataclasses.replace(found, second_method=second, notes=notes)
 
@@ -77,14 +77,23 @@ def _is_asked(problem: Problem, found: Fit) -> bool:
     return bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
 
 
+def _interval(b: Estimate) -> tuple[float, float, float] | None:
+    """An estimate and the ends of its interval; None where it is not determined."""
+    if b.sd is None or b.lower95 is None or b.upper95 is None:
+        return None
+    return b.value, b.lower95, b.upper95
+
+
 def _apart(a: Estimate, b: Estimate) -> bool:
     """Whether output error's estimate of a parameter is one that the other method's excludes."""
     if not a.sd:
         return False
-    if b.sd is None or b.lower95 is None or b.upper95 is None:
+    interval = _interval(b)
+    if interval is None:
         # What the efficient one does not determine the other has by an optimum of chance.
         return True
-    return abs(b.value - a.value) > _APART * a.sd and not b.lower95 <= a.value <= b.upper95
+    value, low, high = interval
+    return abs(value - a.value) > _APART * a.sd and not low <= a.value <= high
 
 
 def sentence(second: SecondMethod) -> str:

@@ -161,7 +161,7 @@ def beyond_slopes(
         gone = {*one_sided, *opened, *lacking, *(u.name for _, u in wide)}
         each = zip(verdict.names, distances.tolist(), strict=True)
         known = {name: d for name, d in each if name not in gone}
-        limits |= _reaching(at, e, limits, along, known)
+        limits |= _reaching(at, e, along, known)
     limits = {n: ends for n, ends in limits.items() if n not in one_sided}
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
 
@@ -188,7 +188,6 @@ class _Inside(NamedTuple):
 def _reaching(
     at: Solution,
     e: Evaluation,
-    limits: Limits,
     along: list[_Inside],
     reach: Mapping[str, float],
 ) -> dict[str, tuple[float, float]]:
@@ -200,7 +199,6 @@ def _reaching(
     Args:
         at: the optimum.
         e: what it tells.
-        limits: intervals by the likelihood, where these are known.
         along: what is as likely as what is within an interval.
         reach: by parameter, from the optimum to the ends of its interval by slopes, in the
             optimiser's coordinate.
@@ -216,7 +214,7 @@ def _reaching(
             return float(value_of(at.layout, at.data, i, jnp.asarray(z)))
 
         middle = float(at.z[i])
-        known = limits.get(name) or (value(middle - distance), value(middle + distance))
+        known = (value(middle - distance), value(middle + distance))
         there = [value(float(p.z[i]) + side * p.left * distance) for p in along for side in (-1, 1)]
         low, high = min(*known, *there), max(*known, *there)
         if low < min(known) or high > max(known):

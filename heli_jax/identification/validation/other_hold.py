@@ -95,23 +95,22 @@ class LikelierHold(NamedTuple):
         )
 
 
-def likelier_hold(
-    problem: Problem, at: Solution, e: Evaluation, wider: float = 1.0
-) -> LikelierHold | None:
+def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> LikelierHold | None:
     """The problem with the inputs held that their log let be taken as linear, where the record
     bears that out beyond doubt; None where it does not, or where nothing was left to the log.
 
     Args:
         problem: what was fitted.
         at: the optimum.
-        e: what it tells.
         wider: by how much autocorrelated residuals widen intervals.
     """
     moving = [_moving_inputs(problem, f, in_doubt=True) for f in problem.training]
-    if not any(moving) or not _is_finite(e) or feeds_through(problem):
+    # Before anything is computed: most logs leave nothing open.
+    if not any(moving) or feeds_through(problem):
         return None
+    e = evaluate(*at)
     other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
-    if not _is_finite(other):
+    if not (_is_finite(e) and _is_finite(other)):
         return None
     n = measured_count(at.data)
     costs = [_least(one) / n for one in (e, other)]
