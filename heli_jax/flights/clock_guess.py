@@ -30,6 +30,9 @@ _COUNTERS = {
     ),
     *("row", "iteration", "id", "no", "nr", "number", "n", "packet", "tick", "axis", "line"),
 }
+_NO_TIMES = {"frame", "frames", "seq", "sequence", "index", "idx", "packet", "row", "iteration"}
+"""of which only each second or tenth may be of the samples at hand, as where packets of several
+sensors are counted together: a count all the same"""
 
 
 def guess_clock(
@@ -119,10 +122,10 @@ def _increases(values: np.ndarray) -> bool:
 
 def _counts(name: str, values: np.ndarray) -> bool:
     """Whether whole numbers count rows or frames, one by one, by name too: a log at a sample a
-    second has such times."""
-    return _by_name(name) and bool(
-        np.all(values[1:] == values[:-1] + 1.0) and values[0] == np.rint(values[0])
-    )
+    second has such times. Numbers of packets do so whatever their steps."""
+    if not _by_name(name) or not np.all(values == np.rint(values)):
+        return False
+    return bool(_NO_TIMES & set(words_in(name))) or bool(np.all(np.diff(values) == 1.0))
 
 
 def _by_name(name: str) -> bool:

@@ -19,6 +19,7 @@ from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_lines import Head
 from heli_jax.flights.csv_on_disk import plain_beginning
 from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
+from heli_jax.flights.csv_rate import rate_above
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
@@ -110,15 +111,16 @@ def open_csv(path: Path) -> "CsvTable":
     names = as_wide(qualified(names, groups), body)
     body, cut = body.whole(len(names))
     notes = (*notes, head.note) if head.note else notes
+    rate = rate_above(bytes(data[:after]).decode("utf-8", "replace"))
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        above = dict(zip(names[1:], head.units, strict=False))
-        return CsvTable(size, digest, names, body, head, notes, above)
+        stated = dict(zip(names[1:], head.units, strict=False))
+        return CsvTable(size, digest, names, body, head, notes, stated, rate)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
     stated = dict(zip(names, units, strict=True))
-    return CsvTable(size, digest, names, body, head, notes, stated)
+    return CsvTable(size, digest, names, body, head, notes, stated, rate)
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -161,7 +163,9 @@ class CsvTable:
         head: Head,
         notes: tuple[str, ...] = (),
         units: Mapping[str, str] | None = None,
+        rate_above: tuple[float, str] | None = None,
     ) -> None:
+        self.rate_above = rate_above
         self.path, self.size, self.names = body.path, size, names
         self.notes = notes
         self.units: Mapping[str, str] = dict(units or {})

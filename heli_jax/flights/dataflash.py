@@ -35,6 +35,8 @@ FIELDS: dict[str, tuple[str, float | None]] = {
     "L": ("<i4", 1e-7), "d": ("<f8", None), "M": ("<i1", None), "q": ("<i8", None),
     "Q": ("<u8", None),
 }  # fmt: skip
+_FEWEST_ROWS = 10
+"""of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}
 _PREFIXES = {1.0: "", 1e-2: "c", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
@@ -187,13 +189,15 @@ def make_log(
     Raises:
         InputError: no message holds a number.
     """
-    units = _units(rows, numbers)
+    units = _units(rows, formats, numbers)
     topics = []
     for name, table in rows.items():
         # These messages describe the log and are no samples: what they say is in units, parameters
         # and firmware.
         if name not in ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG"):
-            topics += _topics(formats[name], table, units.get(name, {}), scaled)
+            found, lost = _topics(formats[name], table, units.get(name, {}), scaled)
+            topics += found
+            damaged += lost
     require_samples(path, topics)
     return ChannelLog(
         path=path,
@@ -207,20 +211,60 @@ def make_log(
     )
 
 
-def _topics(form: Format, table: np.ndarray, units: dict[str, str], scaled: bool) -> list[Topic]:
-    """A message's topics: one for each instance where the log says which field counts them."""
+def _topics(
+    form: Format, table: np.ndarray, units: dict[str, str], scaled: bool
+) -> tuple[list[Topic], int]:
+    """A message's topics, one for each instance where the log says which field counts them, and
+    how many messages are damaged by their times."""
+    tables = _by_instance(form, table, units)
+    kept = {name: _in_order(form, rows) for name, rows in tables.items()}
+    lost = sum(tables[name].size - rows.size for name, rows in kept.items())
+    return [_topic(name, form, rows, units, scaled) for name, rows in kept.items()], lost
+
+
+def _by_instance(form: Format, table: np.ndarray, units: dict[str, str]) -> dict[str, np.ndarray]:
     instance = next((c for c, unit in units.items() if unit == "#"), None)
-    if instance is None or table[instance].dtype.kind not in "iu":
-        return [_topic(form.name, form, table, units, scaled)]
-    counts = np.unique(table[instance])
+    # In text a count is read as any number is.
+    if instance is None or not _are_counts(table[instance]):
+        return {form.name: table}
+    counts = np.unique(table[instance]).astype(np.int64)
     # A machine with one sensor has instance 0 alone; a name without an index is what its user
     # expects.
     if len(counts) == 1 and not counts[0]:
-        return [_topic(form.name, form, table, units, scaled)]
-    return [
-        _topic(f"{form.name}[{i}]", form, table[table[instance] == i], units, scaled)
-        for i in counts
+        return {form.name: table}
+    return {f"{form.name}[{i}]": table[table[instance] == i] for i in counts}
+
+
+def _in_order(form: Format, table: np.ndarray) -> np.ndarray:
+    """The rows without single ones whose time lies outside of those around them, as where a log was
+    cut off in a message: where the others are in order, and these are few."""
+    clock = _clock(form)
+    if not clock or table.size < _FEWEST_ROWS:
+        return table
+    times = table[clock].astype(np.float64)
+    back = np.flatnonzero(np.diff(times) < 0) + 1
+    if not 0 < back.size <= max(1, table.size // 1000):
+        return table
+    # A row before which the times go back is the wrong one, or the one before it is: whichever
+    # leaves the others in order.
+    wrong_rows = [
+        row if row + 1 == table.size or times[row + 1] >= times[row - 1] else row - 1
+        for row in back
     ]
+    kept = np.delete(table, wrong_rows)
+    return kept if np.all(np.diff(kept[clock].astype(np.float64)) >= 0) else table
+
+
+def _clock(form: Format) -> str:
+    """The field with the time; some firmware puts it behind the instance."""
+    return next((c for c in form.columns if c in _CLOCKS), "")
+
+
+def _are_counts(values: np.ndarray) -> bool:
+    if values.dtype.kind in "iu":
+        return True
+    whole = values.dtype.kind == "f" and np.isfinite(values) & (np.abs(values) < 256.0)
+    return bool(np.all(whole)) and bool(np.all(values == np.rint(values)))
 
 
 def _topic(
@@ -240,14 +284,15 @@ def _topic(
             columns[f"{name}.{column}{end}"] = part
             if units.get(column, "#") != "#":
                 named[f"{name}.{column}{end}"] = units[column]
-    # Some firmware puts the time behind the instance.
-    clock = next((c for c in form.columns if c in _CLOCKS), "")
+    clock = _clock(form)
     # Without a clock the rows have their order alone, which `clock` says by being empty.
     times = table[clock] * _CLOCKS[clock] if clock else np.arange(len(table), dtype=np.float64)
     return Topic(name, times, columns, named, clock)
 
 
-def _units(rows: dict[str, np.ndarray], numbers: dict[int, str]) -> dict[str, dict[str, str]]:
+def _units(
+    rows: dict[str, np.ndarray], formats: dict[str, Format], numbers: dict[int, str]
+) -> dict[str, dict[str, str]]:
     """The units of each message's fields, by its name; `#` is that of a count of instances."""
     if "FMTU" not in rows or not {"FmtType", "UnitIds"} <= set(rows["FMTU"].dtype.names or ()):
         return {}
@@ -263,15 +308,18 @@ def _units(rows: dict[str, np.ndarray], numbers: dict[int, str]) -> dict[str, di
         marks = _text(bytes(row["UnitIds"]))
         scales = _text(bytes(row["MultIds"])) if "MultIds" in row.dtype.names else ""
         units[name] = {}
-        for i, column in enumerate((rows[name].dtype.names or ())[: len(marks)]):
+        # By the letters of the format, since text has whole numbers as any other.
+        for i, (column, kind) in enumerate(
+            zip(formats[name].columns[: len(marks)], formats[name].kinds, strict=False)
+        ):
             scale = factors.get(scales[i : i + 1], 1.0)
-            unit = _unit(marks[i], labels, scale, rows[name].dtype[column])
+            unit = _unit(marks[i], labels, scale, kind)
             if unit:
                 units[name][column] = unit
     return units
 
 
-def _unit(mark: str, labels: dict[str, object], scale: object, kind: np.dtype) -> str:
+def _unit(mark: str, labels: dict[str, object], scale: object, kind: str) -> str:
     if mark == "#":
         return "#"
     label = labels.get(mark)
@@ -281,7 +329,9 @@ def _unit(mark: str, labels: dict[str, object], scale: object, kind: np.dtype) -
     # Whole numbers may count thousandths; floats, and fields that are multiplied when they are
     # read, hold the unit itself.
     prefix = _PREFIXES.get(float(scale) if isinstance(scale, int | float) else 1.0, "")
-    return prefix + label if kind.kind in "iu" and label in ("s", "m", "V", "A", "Hz") else label
+    stored, factor = FIELDS[kind]
+    is_count = np.dtype(stored).kind in "iu" and factor is None
+    return prefix + label if is_count and label in ("s", "m", "V", "A", "Hz") else label
 
 
 def _pairs(table: np.ndarray | None, key: str, value: str) -> dict[str, object]:
@@ -291,8 +341,14 @@ def _pairs(table: np.ndarray | None, key: str, value: str) -> dict[str, object]:
     pairs = {}
     for row in table:
         entry = row[value]
-        # Ids are letters that are stored as signed bytes, and a damaged one may be negative.
-        mark = chr(int(row[key]) & 0xFF) if table.dtype[key].kind in "iu" else _text(row[key])
+        # Ids are letters that are stored as signed bytes, and a damaged one may be negative. In
+        # text they stand as numbers.
+        if isinstance(row[key], bytes):
+            mark = _text(row[key])
+        elif np.isfinite(row[key]):
+            mark = chr(int(row[key]) & 0xFF)
+        else:
+            continue
         pairs[mark] = _text(entry) if isinstance(entry, bytes) else float(entry)
     return pairs
 

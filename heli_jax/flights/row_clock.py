@@ -15,7 +15,7 @@ _STEPS = {"ts", "dt", "tsample", "tsamp", "tsampling"}
 _RATES = {"fs", "hz"}
 _OF_SAMPLES = {"sample", "samples", "sampling", "time"}
 _STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
-_FASTEST, _SLOWEST = 1e5, 0.2
+FASTEST, SLOWEST = 1e5, 0.2
 """Hz: no record of a flight is outside of these"""
 
 
@@ -79,11 +79,12 @@ def counted(table: Table, time: Signal | None) -> Table:
     return table if time is None or time.name != ROWS else CountedTable(table)
 
 
-def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
+def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | None:
     """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
-    and this number in words; None where there is none, or are several.
+    or in words above them, and what says so; None where there is none, or are several.
 
     Args:
+        table: of rows.
         surveys: of all columns or arrays.
     """
     found: dict[float, str] = {}
@@ -97,8 +98,11 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
             continue
         number = float(values[0])
         rate = 1.0 / number if step else number
-        if _SLOWEST <= rate <= _FASTEST:
+        if SLOWEST <= rate <= FASTEST:
             found.setdefault(rate, f"{shown(each.name)} = {number:g}")
+    if not found:
+        # Of a text alone there may be anything above the rows.
+        return getattr(table, "rate_above", None)
     if len(found) != 1:
         return None
     rate, words = next(iter(found.items()))

@@ -31,6 +31,8 @@ _SERIAL_DAYS = ((30_000.0, 66_000.0), (710_000.0, 760_000.0), (2_440_000.0, 2_48
 """days of our time as they count: Excel and modified Julian, MATLAB's datenum, Julian"""
 _SLOWEST = 5.0
 """s: no flight is logged once in more"""
+_SHORTEST = 0.05
+"""s: no fit takes less"""
 _LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
 """s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
 slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
@@ -98,5 +100,16 @@ def likely_unit(stamps: np.ndarray | None) -> str:
         # Of parts of a second nothing is finer.
         whole = unit == "ms" or step >= slow
         if not step >= most and not (whole and length * SECONDS[unit] > longest):
-            return unit
-    return "ns"
+            return _of_a_flight(unit, step, length)
+    return _of_a_flight("ns", step, length)
+
+
+def _of_a_flight(unit: str, step: float, length: float) -> str:
+    """The next coarser unit in place of one in which the stamps are no flight's, but an instant's:
+    a sample a second counts a thousand ms and a million us."""
+    finer = {"ns": "us", "us": "ms", "ms": "s"}
+    while length * SECONDS[unit] < _SHORTEST and (coarser := finer.get(unit)):
+        if step * SECONDS[coarser] >= _SLOWEST:
+            break
+        unit = coarser
+    return unit

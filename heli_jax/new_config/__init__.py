@@ -306,8 +306,14 @@ def _own(name: str) -> str:
 
 def _outputs(log: Log, called: Sequence[str], si: str) -> list[str]:
     """Channels that may be an output, the likeliest first."""
-    names = [n for n, s in log.series.items() if guess.may_be(n, s, called, si)]
-    return guess.by_name(called, names)
+    # Among all names, since what stands beside a name may say what it means.
+    spelled = guess.spelled_out(tuple(log.series))
+    names = {
+        spelled.get(n, n): n
+        for n, s in log.series.items()
+        if guess.may_be(spelled.get(n, n), s, called, si)
+    }
+    return [names[n] for n in guess.by_name(called, list(names))]
 
 
 def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:

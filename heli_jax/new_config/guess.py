@@ -33,6 +33,8 @@ _PULSES = (700.0, 2300.0)
 """us: what receivers and servos are sent"""
 _FULL_PULSE = 500.0
 """us from the middle to the end"""
+_AXES = {"r": "roll", "p": "pitch", "y": "yaw"}
+_SETPOINTS = {letter + word for letter in _AXES for word in ("des", "out", "tar")}
 _ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
 _FULL_COMMAND = 500.0
 """at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
@@ -116,6 +118,31 @@ def by_name(
         elif any(core[-len(f) :] == f for f in forms):
             scored.append((2, 0, place, name))
     return [name for *_, name in sorted(scored)]
+
+
+def spelled_out(names: Sequence[str]) -> dict[str, str]:
+    """Names of rates that have a letter for their axis, with the axis in words: ArduPilot's RATE.R,
+    RATE.P and RATE.Y are of roll, pitch and yaw, where rate_p, rate_q and rate_r are p, q and r.
+
+    Args:
+        names: of the log's channels.
+    """
+    groups: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        *path, last = words_of(name) or ("",)
+        if path and path[-1] in ("rate", "rates"):
+            groups.setdefault(tuple(path), {})[last] = name
+    spelled = {}
+    for group in groups.values():
+        # Which of the two it is shows by the letter that the other has not, or by what
+        # stands beside: RDes.
+        if "q" not in group and ("y" in group or _SETPOINTS & set(group)):
+            spelled |= {
+                group[letter]: f"{group[letter]} {axis} rate"
+                for letter, axis in _AXES.items()
+                if letter in group
+            }
+    return spelled
 
 
 def by_number(called: Sequence[str], names: Sequence[str]) -> list[str]:

@@ -1,0 +1,117 @@
+"""Logs in the shapes in which others publish them, each made by its test."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heli_jax.flights.csv_rate import rate_above
+from heli_jax.flights.describe import describe_log
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.time_units import likely_unit
+from heli_jax.new_config import guess
+
+# As planners and mavlogdump write it: ids of units as numbers, counts of instances, hundredths as
+# what they mean, and the last line of a log that was cut off.
+FORMATS = """FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
+FMT, 203, 76, UNIT, QbZ, TimeUS,Id,Label
+FMT, 202, 44, FMTU, QBNN, TimeUS,FmtType,UnitIds,MultIds
+FMT, 204, 20, MULT, Qbd, TimeUS,Id,Mult
+FMT, 130, 50, GPS, QeH, TimeUS,Alt,AltErr
+FMT, 133, 53, IMU, QBf, TimeUS,I,GyrX
+UNIT, 100, 115, s
+UNIT, 100, 109, m
+UNIT, 100, 69, rad/s
+UNIT, 100, 35, instance
+MULT, 100, 66, 0.01
+MULT, 100, 70, 1E-06
+FMTU, 100, 130, smm, FBB
+FMTU, 100, 133, s#E, F--
+"""
+
+
+def test_a_text_of_dataflash_has_units_instances_and_a_torn_end(tmp_path: Path) -> None:
+    lines = [FORMATS]
+    for i in range(40):
+        lines += [f"GPS, {1000 + 200_000 * i}, {5 + 0.01 * i:.2f}, {100 + i}\n"]
+        lines += [f"IMU, {1000 + 20_000 * i}, {k}, {k + 0.1 * i:.3f}\n" for k in (0, 1)]
+    path = tmp_path / "flight.log"
+    path.write_text("".join([*lines, "IMU, 430, 0, 0\n"]))
+    log = open_log(path)
+    assert isinstance(log, ChannelLog)
+    topics = {t.name: t for t in log.topics}
+    # A height that is stored in hundredths is in metres, a count of them in centimetres.
+    assert topics["GPS"].units["GPS.Alt"] == "m"
+    assert topics["GPS"].units["GPS.AltErr"] == "cm"
+    for k in (0, 1):
+        own = topics[f"IMU[{k}]"]
+        assert own.units[f"IMU[{k}].GyrX"] == "rad/s"
+        np.testing.assert_allclose(own.columns[f"IMU[{k}].GyrX"], k + 0.1 * np.arange(40))
+        np.testing.assert_allclose(own.times, 1e-3 + 0.02 * np.arange(40))
+    assert log.notes == ("1 damaged place skipped",)
+
+
+@pytest.mark.parametrize(
+    ("above", "rate"),
+    [
+        ("// Sample rate: 50.0Hz", 50.0),
+        ("# Sampling period: 20 ms", 50.0),
+        ("% Ts = 0.08;", 12.5),
+        ("Sample Rate,1 kHz", 1000.0),
+        ("Sampling frequency (Hz): 100", 100.0),
+        ("Capture Frame Rate,120.000000,Export Frame Rate,120.000000", 120.0),
+        ("sampling time 0.05 s, sample rate 20 Hz", 20.0),
+        ("Sample rate 50 Hz, update rate 10 Hz", None),
+        ("Capture time: 1:30:00 PM", None),
+        ("# recorded 2020, 1000 samples", None),
+    ],
+)
+def test_the_rate_in_words_above_a_table(above: str, rate: float | None) -> None:
+    found = rate_above(above + "\nCounter,p\n")
+    assert (found[0] if found else None) == rate
+
+
+def test_a_rate_above_the_rows_is_taken_with_what_counts_them(tmp_path: Path) -> None:
+    rows = "".join(f"{2552 + i}\t{np.sin(i / 9):.6f}\t\n" for i in range(100) if i != 50)
+    path = tmp_path / "imu.txt"
+    path.write_text(f"// Sample rate: 50.0Hz\n// Firmware: 2.5.1\nCounter\tGyr_X\t\n{rows}")
+    time = describe_log(path).time
+    assert time is not None
+    assert (time.column, time.counted, time.said) == ("Counter", 50.0, "'Sample rate: 50.0Hz'")
+    assert time.duration == pytest.approx(99 / 50)
+    # A clock goes before words.
+    path.write_text(path.read_text().replace("Counter", "time_ms"))
+    time = describe_log(path).time
+    assert time is not None
+    assert (time.column, time.unit) == ("time_ms", "ms")
+
+
+def test_numbers_of_packets_are_no_times(tmp_path: Path) -> None:
+    # Packets of several sensors are counted together, so that those of one are not one by one.
+    numbers = np.cumsum(np.tile([2, 1, 2, 1, 1], 40))
+    path = tmp_path / "gyro.csv"
+    rows = "".join(f"{n},{np.sin(n / 9):.5f}\n" for n in numbers)
+    path.write_text("Packet number,Gyroscope X (deg/s)\n" + rows)
+    assert describe_log(path).time is None
+    path.write_text("Millis,Gyroscope X (deg/s)\n" + rows)
+    assert describe_log(path).time is not None
+
+
+def test_a_sample_a_second_in_microseconds_is_no_instant() -> None:
+    assert likely_unit(1e6 * np.arange(27) + 37.0) == "us"
+    assert likely_unit(1e6 * np.arange(5000)) == "ns"
+    assert likely_unit(2e3 * np.arange(5000)) == "us"
+
+
+def test_letters_of_axes_are_those_of_the_autopilot_or_of_the_body() -> None:
+    ardupilot = ["RATE.RDes", "RATE.R", "RATE.PDes", "RATE.P", "RATE.Y", "ATT.Roll"]
+    spelled = guess.spelled_out(ardupilot)
+    assert spelled == {
+        "RATE.R": "RATE.R roll rate",
+        "RATE.P": "RATE.P pitch rate",
+        "RATE.Y": "RATE.Y yaw rate",
+    }
+    assert set(guess.spelled_out(["RATE.RDes", "RATE.R", "RATE.P"])) == {"RATE.R", "RATE.P"}
+    assert guess.spelled_out(["rate_p", "rate_q", "rate_r"]) == {}
+    assert guess.spelled_out(["rate_p", "rate_r", "phi"]) == {}
