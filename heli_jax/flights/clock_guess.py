@@ -64,7 +64,13 @@ def guess_clock(
     # Without a name to go by, the first column that increases all along is taken, but for numbers
     # of rows. The result names it, so that a wrong guess is seen.
     increasing += [n for n in numeric if n not in increasing and restarts(values[n]).size]
-    others = [n for n in increasing if not by_name and not _counts(n, values[n])]
+    # Of arrays beside one another two limits are no clock of the hundreds of samples.
+    longest = max((x.size for x in values.values()), default=0)
+    others = [
+        n
+        for n in increasing
+        if not by_name and values[n].size == longest and not _counts(n, values[n])
+    ]
     for name in (*named, *others):
         return _with_unit(table, name, values[name])
     return None, False

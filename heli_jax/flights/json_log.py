@@ -22,6 +22,8 @@ _LARGEST = 500 * 10**6
 _MOST_COLUMNS = 10_000
 _MOST_TEXTS = 100
 _DEEPEST = 8
+_FEWEST = 8
+"""samples of a run"""
 
 
 def open_json(path: Path) -> ArrayTable:
@@ -72,8 +74,10 @@ def _parsed(where: str, data: bytes) -> Any:
 
 def _columns(where: str, content: Any) -> dict[str, Any]:
     """Columns of a file, each a list or an array, by path."""
-    if isinstance(content, list):
+    if isinstance(content, list) and not _are_runs(content):
         return _of_rows(where, content)
+    if isinstance(content, list):
+        content = {"data": content}
     if isinstance(content, dict):
         columns = dict(_within(content, "", 0))
         if len(columns) <= _MOST_COLUMNS:
@@ -91,12 +95,27 @@ def _within(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[
                 yield name, list(value.values())
             else:
                 yield from _within(value, name, depth + 1)
+        elif _are_runs(value) and depth < _DEEPEST:
+            for i, run in enumerate(value):
+                yield from _within(run, f"{name}[{i}]", depth + 1)
         elif isinstance(value, list) and value and isinstance(value[0], dict):
             yield from ((f"{name}.{n}", x) for n, x in _of_rows(name, value).items())
         elif isinstance(value, list):
             yield name, value
         elif isinstance(value, int | float):
             yield name, [value]
+
+
+def _are_runs(value: Any) -> bool:
+    """Whether a list holds runs, each with columns of its own, and no samples: the lists within are
+    longer than the list is, and as long as one another."""
+    if not isinstance(value, list) or not value or not all(isinstance(x, dict) for x in value):
+        return False
+    lengths = [[len(x) for x in run.values() if isinstance(x, list)] for run in value]
+    longest = [max(each, default=0) for each in lengths]
+    return min(longest) >= max(_FEWEST, len(value)) and all(
+        each.count(most) > 1 for each, most in zip(lengths, longest, strict=True)
+    )
 
 
 def _of_rows(where: str, rows: list[Any]) -> dict[str, Any]:

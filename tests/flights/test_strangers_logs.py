@@ -1,5 +1,6 @@
 """Logs in the shapes in which others publish them, each made by its test."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from heli_jax.flights.open_log import open_log
 from heli_jax.flights.time_units import likely_unit
 from heli_jax.new_config import guess
 
+RUNS = ((0, 1), (1, -1), (2, 2))
 # As planners and mavlogdump write it: ids of units as numbers, counts of instances, hundredths as
 # what they mean, and the last line of a log that was cut off.
 FORMATS = """FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
@@ -115,3 +117,22 @@ def test_letters_of_axes_are_those_of_the_autopilot_or_of_the_body() -> None:
     assert set(guess.spelled_out(["RATE.RDes", "RATE.R", "RATE.P"])) == {"RATE.R", "RATE.P"}
     assert guess.spelled_out(["rate_p", "rate_q", "rate_r"]) == {}
     assert guess.spelled_out(["rate_p", "rate_r", "phi"]) == {}
+
+
+def test_runs_in_a_list_of_json_are_arrays_each(tmp_path: Path) -> None:
+    runs = [
+        {"type": "noise", "u": [0.1 * i] * 20, "y": [k + j % 7 for j in range(20)]} for k, i in RUNS
+    ]
+    path = tmp_path / "runs.json"
+    path.write_text(json.dumps({"config": {"motors": 1, "limits": [-0.6, 0.6]}, "data": runs}))
+    info = describe_log(path)
+    # Limits of the joint increase, and are no clock.
+    assert info.time is None
+    columns = {c.name: c for c in info.columns}
+    assert {f"data[{k}].{n}" for k, _ in RUNS for n in "uy"} <= set(columns)
+    assert (columns["data[2].y"].rows, columns["data[2].y"].min) == (20, 2.0)
+    # Records of samples that hold a short list each stay a table.
+    samples = [{"t": 0.1 * i, "motor": [i, 2 * i], "gyro": [0, i]} for i in range(30)]
+    path.write_text(json.dumps(samples))
+    info = describe_log(path)
+    assert [c.name for c in info.columns] == ["t", "motor[0]", "motor[1]", "gyro[0]", "gyro[1]"]

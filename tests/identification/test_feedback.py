@@ -125,6 +125,19 @@ def test_steps_without_any_other_motion_are_no_feedback():
     assert feedback(short) == ()
 
 
+@pytest.mark.parametrize("tau", [0.08, 0.12])
+def test_programmed_doublets_that_a_filter_rounded_are_no_feedback(tau):
+    # A command as autopilots shape it: no corner of it is a single jump, and it comes to rest by
+    # and by. Nothing follows anything, and nothing is measured with noise.
+    pattern = np.repeat([0.0, 0.3, -0.3, 0.0], [100, 40, 40, 170])
+    keep = np.exp(-DT / tau)
+    u = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.tile(pattern, 12))
+    b, a, _ = scipy.signal.cont2discrete(([49.0], [1.0, 11.3, 49.0]), DT)
+    phi = scipy.signal.lfilter(b.ravel(), a, np.append(0.0, u[:-1]))
+    outputs = {"p": np.gradient(phi, DT), "phi": phi}
+    assert not any(f.present for f in feedback(Flight(dt=DT, inputs={"da": u}, outputs=outputs)))
+
+
 def test_missing_samples_and_a_fast_log():
     flight = record(0, 0.3, n=1500)
     p = flight.outputs["p"].copy()

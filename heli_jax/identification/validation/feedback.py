@@ -55,6 +55,11 @@ _JUMP, _ROUNDS = 5.0, 3
 is left is looked at again"""
 _MOVES = 0.05
 """part of the samples at which an input that may follow something moves, at least"""
+_LONG_REST, _AT_REST = 20, 0.5
+"""samples of one value in a row that are a rest between two motions, and the part of a record that
+such rests take in one whose input was programmed"""
+_STILL = 1e-4
+"""of the range of an input, below which a difference is no motion"""
 _SEEN = 0.8
 """part of the samples of an output that is used"""
 
@@ -331,8 +336,10 @@ def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
     """
-    # A commanded input that stays for twenty samples and jumps follows nothing in between.
-    if np.mean(np.diff(u) != 0.0) < _MOVES:
+    # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
+    # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
+    # of its corners rings on into the rest, as it does in the response.
+    if np.mean(np.diff(u) != 0.0) < _MOVES or _rests(u) > _AT_REST:
         return None
     past = _Past(u[:, None])
     left = _innovations(u[:, None], past)
@@ -348,6 +355,14 @@ def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
     if left is None or not np.nanstd(left) > 1e-9 * np.std(u):
         return None
     return left[:, 0]
+
+
+def _rests(u: Float[np.ndarray, " N"]) -> float:
+    """The part of the samples of an input that lie in long runs of one value, or as good as one: a
+    command that passed a filter comes to rest by and by."""
+    ends = np.flatnonzero(np.abs(np.diff(u)) > _STILL * np.ptp(u))
+    runs = np.diff(np.concatenate([[-1], ends, [u.size - 1]]))
+    return float(np.sum(runs[runs >= _LONG_REST])) / u.size
 
 
 def _decimated(
