@@ -30,6 +30,8 @@ _COUNTERS = {
     ),
     *("row", "iteration", "id", "no", "nr", "number", "n", "packet", "tick", "axis", "line"),
 }
+_OTHERS = {"freq", "freqs", "frequency", "frequencies", "hz", "distance", "dist", "address"}
+"""what may increase along a table all the same, as the frequencies of a response"""
 _NO_TIMES = {"frame", "frames", "seq", "sequence", "index", "idx", "packet", "row", "iteration"}
 """of which only each second or tenth may be of the samples at hand, as where packets of several
 sensors are counted together: a count all the same"""
@@ -69,7 +71,9 @@ def guess_clock(
     others = [
         n
         for n in increasing
-        if not by_name and values[n].size == longest and not _counts(n, values[n])
+        if not by_name
+        and values[n].size == longest
+        and not (_counts(n, values[n]) or _OTHERS & set(words_in(n)))
     ]
     for name in (*named, *others):
         return _with_unit(table, name, values[name])

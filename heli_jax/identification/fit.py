@@ -30,6 +30,8 @@ from heli_jax.identification.estimation.noise_covariance import (
 from heli_jax.identification.estimation.same_responses import better_of_same_responses
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
+from heli_jax.identification.further_starts import SAID as SAID_FURTHER
+from heli_jax.identification.further_starts import explains_little, further_starts
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
@@ -237,7 +239,9 @@ def fit(
         problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
             within the bounds, or about a factor of three around the start. None: one, or where a
-            delay is free five that differ in the delays.
+            delay is free five that differ in the delays; of a linear model by output error six
+            others are tried where the best of these explains less than half of the outputs: what
+            equation error makes of the record, and five that are drawn.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -264,7 +268,10 @@ def fit(
     # A model that is unstable where the search passes overflows, in time as in its powers; that is
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
-        search, optima, optimum = _search(problem, guess, points, max_steps, report)
+        further = None if starts is not None else seed
+        search, points, optima, optimum = _search(
+            problem, guess, points, further, max_steps, report
+        )
     doubts = record_doubts(problem)
     said = (*cautions(problem), *(f.sentence for f in doubts.findings))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
@@ -291,10 +298,14 @@ def _search(
     problem: Problem,
     guess: FirstGuess,
     points: Float[Array, "s q"],
+    further: int | None,
     max_steps: int,
     report: starting.Progress,
-) -> tuple[starting.Search, list[Optimum], RelaxedOptimum]:
-    """The search with its layout and data, an optimum for each start, and where it ended."""
+) -> tuple[starting.Search, Float[Array, "s q"], list[Optimum], RelaxedOptimum]:
+    """The search with its layout and data, its starts, an optimum for each, and where it ended.
+
+    Where those of `points` explain little others are gone to, drawn by the seed `further`.
+    """
     layout, data, noise = guess.layout, guess.data, guess.noise
     disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
@@ -308,6 +319,11 @@ def _search(
     known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
     first = starting.Search(problem, layout, begun, search.max_steps)
     optima = first.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
+    if further is not None and explains_little(first, noise, optima):
+        report(SAID_FURTHER)
+        more = further_starts(layout, problem, guess.z, further)
+        optima += first.run(noise, more, report, nearing=layout.estimator.nearing)
+        points = jnp.concatenate([points, more])
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
@@ -322,7 +338,7 @@ def _search(
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
         optimum = better_of_same_responses(search, which(search, optimum))
-    return search, optima, optimum
+    return search, points, optima, optimum
 
 
 def cautions(problem: Problem) -> tuple[str, ...]:

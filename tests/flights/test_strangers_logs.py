@@ -100,6 +100,13 @@ def test_numbers_of_packets_are_no_times(tmp_path: Path) -> None:
     assert describe_log(path).time is not None
 
 
+def test_frequencies_are_no_times(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * i:.3f},{1 / (1 + i):.5f},{-i}\n" for i in range(60))
+    path = tmp_path / "response.csv"
+    path.write_text("Freq (Hz),Gain,Phase\n" + rows)
+    assert describe_log(path).time is None
+
+
 def test_a_sample_a_second_in_microseconds_is_no_instant() -> None:
     assert likely_unit(1e6 * np.arange(27) + 37.0) == "us"
     assert likely_unit(1e6 * np.arange(5000)) == "ns"

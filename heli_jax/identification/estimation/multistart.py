@@ -267,6 +267,14 @@ class Search:
         ]
         return sum(power)
 
+    def variation(self, noise: Noise) -> float:
+        """Sum of squares that the outputs' means leave."""
+        return sum(
+            float(np.nansum(np.square((y - np.nanmean(y)) / np.asarray(s[n]))))
+            for flight, s in zip(self.data.flights, noise.sd, strict=True)
+            for n, y in ((n, np.asarray(y)) for n, y in flight.outputs.items())
+        )
+
     def _inside(self, z: Array) -> bool:
         values = named_values(self.layout, self.data, z)
         return all(

@@ -1,0 +1,68 @@
+"""Starts to go on from where a fit explains little: a mode far from where it is sought leaves no
+slope towards it."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.identification.equation_error.start import equation_error_start
+from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
+from heli_jax.identification.estimation.multistart import Search, rank
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.layout import Layout, Noise
+
+SAID = "little is explained: from further starts"
+_LITTLE = 0.5
+"""part of the outputs' variance below which an optimum explains little"""
+_DRAWN = 5
+
+
+def explains_little(search: Search, noise: Noise, optima: list[Optimum]) -> bool:
+    """Whether the best optimum of a linear model by output error explains less than half of the
+    outputs' variance; of others nothing is asked, which take long.
+
+    Args:
+        search: that ended there.
+        noise: of the measurements, by which its rows were divided.
+        optima: one for each start.
+    """
+    layout = search.layout
+    if not layout.model.linear or layout.disturbance or not layout.estimator.rows_are_samples:
+        return False
+    best = min(optima, key=rank)
+    left = float(best.cost) * measured_count(search.data) / search.variation(noise)
+    return not (bool(best.converged) and 1.0 - left > _LITTLE)
+
+
+def further_starts(
+    layout: Layout, problem: Problem, z0: Float[Array, " q"], seed: int
+) -> Float[Array, "s q"]:
+    """Starts (s, q) that differ from z0 in the free parameters: what a regression of the states'
+    derivatives makes of the record, where it can, and values drawn about the start.
+
+    Args:
+        layout: what the unknowns are.
+        problem: with the records, and the free parameters' bounds and priors.
+        z0: the first start.
+        seed: of the draw.
+    """
+    drawn = draw(layout, problem, z0, 1 + _DRAWN, seed)[1:]
+    try:
+        with np.errstate(all="ignore"):
+            guess = equation_error_start(
+                problem.model, problem.vehicle, problem.training, problem.free
+            )
+    # Nothing can be regressed: no state was measured, say.
+    except (ValueError, np.linalg.LinAlgError):
+        return drawn
+    row = np.array(z0, np.float64)
+    for i, (name, free) in enumerate(problem.free.items()):
+        value, (low, high) = guess.values[name].value, transforms.limits(free)
+        if np.isfinite(value) and transforms.inside(free, float(value)):
+            scale = transforms.sign_or_scale(free)
+            row[i] = float(transforms.to_coordinate(layout.kinds[i], value, scale, low, high))
+    if not np.isfinite(row).all():
+        return drawn
+    return jnp.concatenate([jnp.asarray(row[None, :], z0.dtype), drawn])
