@@ -132,9 +132,11 @@ def test_programmed_doublets_that_a_filter_rounded_are_no_feedback(tau):
     pattern = np.repeat([0.0, 0.3, -0.3, 0.0], [100, 40, 40, 170])
     keep = np.exp(-DT / tau)
     u = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.tile(pattern, 12))
-    b, a, _ = scipy.signal.cont2discrete(([49.0], [1.0, 11.3, 49.0]), DT)
-    phi = scipy.signal.lfilter(b.ravel(), a, np.append(0.0, u[:-1]))
-    outputs = {"p": np.gradient(phi, DT), "phi": phi}
+    phi, p, v = np.zeros(u.size), np.zeros(u.size), 0.0
+    for k in range(u.size - 1):
+        v += DT * (-11.3 * v + 49.0 * (u[k] - phi[k]))
+        phi[k + 1], p[k + 1] = phi[k] + DT * v, v
+    outputs = {"p": p, "phi": phi}
     assert not any(f.present for f in feedback(Flight(dt=DT, inputs={"da": u}, outputs=outputs)))
 
 

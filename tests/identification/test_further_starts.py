@@ -28,7 +28,7 @@ def problem(tmp_path) -> Problem:
     f = rng.standard_normal(1000)
     A = np.array([[0.0, 1.0], [-SPRING, -DAMPING]])
     system = (A, np.array([[0.0], [GAIN]]), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
-    _, x, _ = scipy.signal.dlsim(scipy.signal.cont2discrete(system, DT), f)
+    x = scipy.signal.dlsim(scipy.signal.cont2discrete(system, DT), f)[1]
     path = tmp_path / "oscillator.yaml"
     path.write_text(OSCILLATOR)
     oscillator = linear_model(str(path))
