@@ -90,7 +90,7 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({vaf_text(m.vaf, '.2g')})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    worse = [f"{n} ({vaf_text(m.vaf)})" for n, m in fit.validation.items() if not m.vaf >= 0]
     held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
@@ -136,7 +136,8 @@ def run_compatibility(
     tell(found.verdict)
     for line in found.doubts:
         tell(f"! {line}")
-    print_table(*compatibility.table(found))
+    head, rows = compatibility.table(found)
+    print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     tell(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
@@ -191,13 +192,13 @@ def _print_agreement(what: str, m: Metrics) -> None:
         tell(f"{what}: diverges")
         return
     fit = "worse than the mean" if m.vaf < WORST else f"{m.nrmse_fit_percent:.1f} %"
-    tell(f"{what}: VAF {vaf_text(m.vaf, '.5f')}, fit {fit}, TIC {m.tic:.4f}")
+    tell(f"{what}: VAF {vaf_text(m.vaf, 2)}, fit {fit}, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:
     ratios = ", ".join(f"{n} = {terse(v)}" for n, v in b.combinations.items())
     vaf = (
-        f"VAF {vaf_text(b.metrics.vaf, '.5f')}"
+        f"VAF {vaf_text(b.metrics.vaf, 2)}"
         if math.isfinite(b.metrics.vaf)
         else "its simulation diverges"
     )

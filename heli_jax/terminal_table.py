@@ -6,6 +6,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import TextIO
 
+from heli_jax.numbers import terminal_sentence
+
 type _Row = tuple[str, ...]
 _BETWEEN = 3
 """columns from one column's end to the next one's beginning"""
@@ -18,6 +20,7 @@ def tell(text: str, file: TextIO | None = None) -> None:
         text: what is told; a new line in it stays one.
         file: standard output unless given.
     """
+    text = terminal_sentence(text)
     stream = sys.stdout if file is None else file
     if stream.isatty():
         width = shutil.get_terminal_size().columns
