@@ -17,7 +17,7 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import WORST, plain_cell, plain_words, rounded, terse, vaf_text
+from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
@@ -210,14 +210,14 @@ def _print_baseline(b: Baseline) -> None:
 def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
     """A row of the table of estimates; `stopped`: the optimiser did not arrive."""
     if stopped:
-        return (name, report_tables.where_it_stopped(e), "", "", e.unit, f"{e.prior_share:.2f}")
+        return (name, report_tables.where_it_stopped(e), "", "", e.unit, percent(e.prior_share, 0))
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
     if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
-        return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
+        return (name, "not determined", "", "", e.unit, percent(e.prior_share, 0))
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)
-    return (name, value + at_bound, sd, _range(e), e.unit, f"{e.prior_share:.2f}")
+    return (name, value + at_bound, sd, _range(e), e.unit, percent(e.prior_share, 0))
 
 
 def print_check(check: Check) -> None:
@@ -232,7 +232,7 @@ def print_check(check: Check) -> None:
         relative = math.sqrt(verdict.covariance[i, i])
         lacking = name in verdict.undetermined or name in verdict.without_effect
         expected = "not determined" if lacking else f"{terse(100 * relative, 2)} %"
-        rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
+        rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
