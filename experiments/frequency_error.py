@@ -6,6 +6,8 @@ Records of 120 s made with SciPy alone, with gusts as large as the stick's respo
 Ixx, If and kappa start 1.3 times off. METHOD (frequency-error) may be output-error as well.
 """
 
+from pathlib import Path
+
 import jax
 import numpy as np
 from coverage_cases.disturbed import response
@@ -15,7 +17,10 @@ from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 jax.config.update("jax_enable_x64", True)
 DT, SAMPLES, NOISE, TAU = 0.02, 6000, 2e-3, 1.0
 NAMES = ("Ixx", "If", "kappa")
-VEHICLE = load_vehicle("configs/vehicles/bench-30.yaml", models.roll_on_stand.Params)
+VEHICLE = load_vehicle(
+    Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml",
+    models.roll_on_stand.Params,
+)
 
 
 def steps(rng: np.random.Generator) -> np.ndarray:

@@ -33,7 +33,9 @@ def asked(doc: str | None, takes: str, *sizes: Size, out: str | None = None) -> 
         parser.add_argument(
             size.name, nargs="?", type=type(size.default), help=f"{size.help} ({size.default})"
         )
-    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
+    # What has no size has no small one either.
+    if sizes:
+        parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
     if out is not None:
         parser.add_argument(
             "--out", type=Path, default=Path(out), metavar="FOLDER", help=f"({out})"

@@ -5,7 +5,6 @@ intervals and report, then a word on each error, and a file of corrections.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,8 @@ from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.numbers import with_sd
+from heli_jax.report.files import SensorAgreement
 from heli_jax.workflow import FitRun, Say
 from heli_jax.yaml_file import as_yaml
 
@@ -111,11 +112,20 @@ def run_compatibility(
     if out is None:
         return found
     progress("writing the report")
-    run = workflow.write_report(run, out)
+    further = run.supplementary._replace(sensors=_agreement(found))
+    run = workflow.write_report(dataclasses.replace(run, supplementary=further), out)
     place = Path(out) / FILE
     with run_directory.whole_file(place, f"--out {place}") as part:
         part.write_text(as_yaml(found.corrections), encoding="utf-8")
     return dataclasses.replace(found, run=run)
+
+
+def _agreement(found: Compatibility) -> SensorAgreement:
+    """What the page says before it shows the fit, whose own first line knows nothing of sensors."""
+    head, rows = table(found)
+    # The fit's notes stand on its page already.
+    doubts = tuple(d for d in found.doubts if d not in found.run.fit.notes)
+    return SensorAgreement(found.compatible, found.verdict, doubts, head, tuple(rows))
 
 
 _SMOOTH = (
@@ -219,7 +229,7 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
     ]
     if not scales:
         return notes
-    words = ", ".join(f"{e.name} {e.estimate.value:+.0%}" for e in scales)
+    words = ", ".join(f"{e.name} {100 * e.estimate.value:+.0f} %" for e in scales)
     return (
         f"{words}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
         "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
@@ -281,14 +291,6 @@ def table(found: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]
         interval, estimate = "", e.estimate
         if e.determined and estimate.lower95 is not None and estimate.upper95 is not None:
             reach = max(estimate.upper95 - estimate.value, estimate.value - estimate.lower95)
-            interval = _plus_minus(estimate.value, reach)
+            interval = with_sd(estimate.value, reach)
         rows.append((e.name, interval, estimate.unit, e.words, e.meaning))
     return head, rows
-
-
-def _plus_minus(value: float, reach: float) -> str:
-    """As many digits as the reach of the interval has sense for: two of its own."""
-    if not 0 < reach < math.inf:
-        return f"{value:.4g} +- {reach:.2g}"
-    digits = max(0, 1 - math.floor(math.log10(reach)))
-    return f"{value:.{digits}f} +- {reach:.{digits}f}"

@@ -12,7 +12,7 @@ from heli_jax.analysis.attitude_responses import (
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
 from heli_jax.analysis.response_curves import octave_mean
-from heli_jax.config.experiment import Experiment
+from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
@@ -20,6 +20,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.numbers import number, plain_words
 from heli_jax.terminal_table import print_table, tell
+from heli_jax.yaml_file import as_yaml
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
@@ -43,14 +44,7 @@ def responses_of_log(
     Raises:
         InputError: the log or something of the configuration is wrong, or no response is to be had.
     """
-    if log is not None:
-        whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
-        if not experiment.config.flights:
-            raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
-        first = experiment.config.flights[0].model_copy(update=whole)
-        experiment = experiment._replace(
-            config=experiment.config.model_copy(update={"flights": [first]})
-        )
+    experiment = _of_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
     wanted = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
     points = config.points or Settings().points
@@ -76,6 +70,17 @@ def responses_of_log(
             f"{longest:.3g} s"
         )
     return found
+
+
+def _of_log(experiment: Experiment, log: str | None) -> Experiment:
+    """The configuration with a log in place of its own."""
+    if log is None:
+        return experiment
+    if not experiment.config.flights:
+        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
+    whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
+    first = experiment.config.flights[0].model_copy(update=whole)
+    return experiment._replace(config=experiment.config.model_copy(update={"flights": [first]}))
 
 
 def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
@@ -116,7 +121,8 @@ def run_responses(
         title = Path(experiment.path).stem
         written = found._replace(notes=(*found.notes, *gaps))
         units, png = units_of(experiment), experiment.config.report.png
-        write_responses(temporary, written, units, title, handling, png=png)
+        config = as_yaml(resolved(_of_log(experiment, log)))
+        write_responses(temporary, written, units, title, handling, config=config, png=png)
     for note in found.notes:
         say(note)
     print_responses(found)

@@ -142,7 +142,7 @@ def print_ranking(ranking: Ranking) -> None:
     head += (*(f"sd {n}" for n in ranking.parameters), "why")
     if not several:
         rows = [(row[0], *row[2:]) for row in rows]
-    print_table(head, rows)
+    print_table(head, rows, keys=head.index("to [s]") + 1)
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
         words = "window that says less is" if unshown == 1 else "windows that say less are"

@@ -21,7 +21,8 @@ def number(value: float | None, digits: int = 4) -> str:
         return NOTHING
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    power = _power(value)
+    # Of the rounded value, since 0.0009999 to two digits is 0.0010 and not 10·10⁻⁴.
+    power = _power(float(f"{value:.{max(digits, 1) - 1}e}"))
     text = f"{value / 10.0**power:.{digits}g}"
     # `g` falls back to an exponent where the digits left of the point are more than asked for;
     # the power of ten has been taken out already, and a number has one.
@@ -48,9 +49,9 @@ def vaf_percent(value: float | None, digits: int = 2) -> str:
     return percent(value, digits)
 
 
-def vaf_text(value: float, form: str = ".3g") -> str:
-    """A VAF as a number in ASCII, bounded as `vaf_percent` does it."""
-    return f"below {WORST:g}" if value < WORST else f"{value:{form}}"
+def vaf_text(value: float, digits: int = 1) -> str:
+    """`vaf_percent` in ASCII, for sentences: one place tells 0.949 from 0.95 as the gates ask."""
+    return plain_words(vaf_percent(value, digits))
 
 
 def explained_text(share: float) -> str:
@@ -94,6 +95,11 @@ _WORDS = {"∞": "inf", "−∞": "-inf", NOTHING: "-", "−": "-"}
 _DOWN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
+def lowered(power: str) -> str:
+    """An exponent of a page in ASCII: `⁻⁴` as `-4`."""
+    return power.translate(_DOWN)
+
+
 def plain(text: str) -> str:
     """A number of a page in ASCII, with the same digits: `1.7000·10⁻⁴` as `1.7000e-04`."""
     if text in _WORDS:
@@ -102,19 +108,46 @@ def plain(text: str) -> str:
     if not power:
         return digits
     # A power of its own: 0.0012·10⁻⁴ beside a value of 1.7000·10⁻⁴ is 1.2e-07.
-    value = Decimal(digits).scaleb(int(power.translate(_DOWN)))
+    value = Decimal(digits).scaleb(int(lowered(power)))
     if not value:
         return digits
     mantissa, _, exponent = f"{value:e}".partition("e")
+    if _reads_well(int(exponent)):
+        return f"{value:f}"
     return f"{mantissa}e{int(exponent):+03d}"
 
 
-_NUMBER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+|[−-]?\d[\d.]*|−?∞|±|−|–")
+_NUMBER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+|[−-]?\d[\d.]*|−?∞|−|–")
 
 
 def plain_words(text: str) -> str:
     """A sentence of a page for the terminal: its numbers as `plain` has them."""
-    return _NUMBER.sub(lambda m: "+-" if m[0] == "±" else plain(m[0]), text)
+    return _NUMBER.sub(lambda m: plain(m[0]), text)
+
+
+# Not within words, paths, or what a user typed, which stands in quotes.
+_EXPONENT = re.compile(r"(?<![\w./'\"-])([-+]?\d+(?:\.\d+)?)e([-+]?\d+)(?![\w/'\"]|\.\w)")
+
+
+def terminal_sentence(text: str) -> str:
+    """A sentence that a format of Python's wrote, by the rule of `number`: 1.2e+03 as 1200."""
+    return _EXPONENT.sub(lambda m: _decimal(m) or m[0], text)
+
+
+def page_sentence(text: str) -> str:
+    """The same for a page: 7.5e-06 as 7.5·10⁻⁶."""
+
+    def written(m: re.Match[str]) -> str:
+        return _decimal(m) or _signed(m[1].removeprefix("+")) + _times(int(m[2]))
+
+    return _EXPONENT.sub(written, text)
+
+
+def _decimal(m: re.Match[str]) -> str | None:
+    """All digits of a number with an exponent; None where it reads better with a power of ten."""
+    value = Decimal(m[1]).scaleb(int(m[2]))
+    sign = "+" if m[1].startswith("+") else ""
+    return f"{sign}{value:f}" if _reads_well(value.adjusted()) or not value else None
 
 
 _POWER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
@@ -176,8 +209,12 @@ def _power(value: float) -> int:
     if value == 0 or not math.isfinite(value):
         return 0
     power = math.floor(math.log10(abs(value)))
-    # 0.01 and 12345 read better as they are than as 1·10⁻² and 1.2345·10⁴.
-    return 0 if -3 < power < 5 else power
+    return 0 if _reads_well(power) else power
+
+
+def _reads_well(power: int) -> bool:
+    """Whether a number of so many powers of ten does: 0.0032 and 12345 do, against 3.2·10⁻³."""
+    return -4 < power < 5
 
 
 def _times(power: int) -> str:

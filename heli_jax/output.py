@@ -17,7 +17,7 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import WORST, plain_cell, plain_words, rounded, terse, vaf_text
+from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
@@ -90,7 +90,7 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({vaf_text(m.vaf, '.2g')})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    worse = [f"{n} ({vaf_text(m.vaf)})" for n, m in fit.validation.items() if not m.vaf >= 0]
     held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
@@ -136,7 +136,8 @@ def run_compatibility(
     tell(found.verdict)
     for line in found.doubts:
         tell(f"! {line}")
-    print_table(*compatibility.table(found))
+    head, rows = compatibility.table(found)
+    print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     tell(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
@@ -191,13 +192,13 @@ def _print_agreement(what: str, m: Metrics) -> None:
         tell(f"{what}: diverges")
         return
     fit = "worse than the mean" if m.vaf < WORST else f"{m.nrmse_fit_percent:.1f} %"
-    tell(f"{what}: VAF {vaf_text(m.vaf, '.5f')}, fit {fit}, TIC {m.tic:.4f}")
+    tell(f"{what}: VAF {vaf_text(m.vaf, 2)}, fit {fit}, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:
     ratios = ", ".join(f"{n} = {terse(v)}" for n, v in b.combinations.items())
     vaf = (
-        f"VAF {vaf_text(b.metrics.vaf, '.5f')}"
+        f"VAF {vaf_text(b.metrics.vaf, 2)}"
         if math.isfinite(b.metrics.vaf)
         else "its simulation diverges"
     )
@@ -209,14 +210,14 @@ def _print_baseline(b: Baseline) -> None:
 def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
     """A row of the table of estimates; `stopped`: the optimiser did not arrive."""
     if stopped:
-        return (name, report_tables.where_it_stopped(e), "", "", e.unit, f"{e.prior_share:.2f}")
+        return (name, report_tables.where_it_stopped(e), "", "", e.unit, percent(e.prior_share, 0))
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
     if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
-        return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
+        return (name, "not determined", "", "", e.unit, percent(e.prior_share, 0))
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)
-    return (name, value + at_bound, sd, _range(e), e.unit, f"{e.prior_share:.2f}")
+    return (name, value + at_bound, sd, _range(e), e.unit, percent(e.prior_share, 0))
 
 
 def print_check(check: Check) -> None:
@@ -231,7 +232,7 @@ def print_check(check: Check) -> None:
         relative = math.sqrt(verdict.covariance[i, i])
         lacking = name in verdict.undetermined or name in verdict.without_effect
         expected = "not determined" if lacking else f"{terse(100 * relative, 2)} %"
-        rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
+        rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""

@@ -89,10 +89,14 @@ def sweep_progress(
         yield _Lines(what, of)
         return
     columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("compiling", total=1.0)
         yield lambda p: bar.update(
-            task, completed=p.done / p.total, description=_progress_words(p, of)
+            task,
+            completed=p.done / p.total,
+            # Beside the bar's name and the spaces between; rich would cut what is longer.
+            description=_fitting_words(p, of, console.width - len(what) - 3),
         )
 
 
@@ -111,15 +115,26 @@ class _Lines:
 
 
 def _progress_words(p: "Progress", of: str) -> str:
-    words = f"{p.done} of {p.total} {of}"
+    return ", ".join(_progress(p, of))
+
+
+def _progress(p: "Progress", of: str) -> list[str]:
+    words = [f"{p.done} of {p.total} {of}"]
     # The first chunk compiles: a rate that contained it would foretell hours.
-    if math.isnan(p.rate):
-        return words
-    words = f"{words}, {terse(p.rate, 3)} a second"
-    if p.done == p.total:
-        return words
-    left = max(0, round(p.remaining))
-    return f"{words}, {left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left"
+    if not math.isnan(p.rate):
+        words.append(f"{terse(p.rate, 3)} a second")
+        if p.done != p.total:
+            left = max(0, round(p.remaining))
+            words.append(f"{left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left")
+    return words
+
+
+def _fitting_words(p: "Progress", of: str, room: int) -> str:
+    """What of it there is room for: the time left before the rate."""
+    words = _progress(p, of)
+    while len(words) > 1 and len(", ".join(words)) > room:
+        words.pop(1)
+    return ", ".join(words)
 
 
 def _counted(elements: int) -> str:

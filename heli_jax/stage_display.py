@@ -9,12 +9,15 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from heli_jax import stages
+from heli_jax.numbers import terminal_sentence
 from heli_jax.stages import Stage
 
 _AFTER = 2.0
 """s: what is done sooner shows nothing"""
 _EVERY = 30.0
 """s between two lines where standard error is no terminal"""
+_SHORTEST = 12
+"""letters of a stage's name that stay, however narrow the terminal"""
 _COMPILES = "/jax/compilation_cache/compile_requests_use_cache"
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 
@@ -77,7 +80,7 @@ class _Display:
             stage = self.stack[-1]
         except IndexError:
             return ""
-        return in_words(stage, self.compiling, time.perf_counter())
+        return terminal_sentence(in_words(stage, self.compiling, time.perf_counter()))
 
     def _listen(self) -> None:
         # The first stage comes after JAX has been imported.
@@ -120,12 +123,14 @@ class _Display:
             from rich.live import Live
             from rich.text import Text
 
+            console = Console(stderr=True)
+
             def line() -> Any:
-                return Text(self.text(), no_wrap=True, overflow="ellipsis")
+                return Text(fitted(self.text(), console.width), no_wrap=True, overflow="ellipsis")
 
             # What else is printed meanwhile comes above the line.
             self.live = Live(
-                console=Console(stderr=True),
+                console=console,
                 get_renderable=line,
                 transient=True,
                 refresh_per_second=2,
@@ -137,6 +142,29 @@ class _Display:
             if self.live is not None:
                 self.live.stop()
             self.live = None
+
+
+def fitted(text: str, width: int) -> str:
+    """A line of `in_words` for a terminal: what is too long loses of its name, never a digit.
+
+    Args:
+        text: `fitting a, b and c: step 12, cost 1.2e+03, 14 s`.
+        width: of the terminal, in columns.
+    """
+    # The last column stays free, or some terminals begin a new line.
+    over = len(text) - (width - 1)
+    name, colon, rest = text.rpartition(": ")
+    if over <= 0 or not colon:
+        return text
+    kept = len(name) - over - 1
+    if kept >= _SHORTEST:
+        return f"{name[:kept]}…: {rest}"
+    name = f"{name[: _SHORTEST - 1]}…" if len(name) > _SHORTEST else name
+    parts = rest.split(", ")
+    while len(parts) > 1 and len(f"{name}: {', '.join(parts)}") >= width:
+        # How long it has gone on, the last of them, is said longest; the cost before the step.
+        parts.pop(1 if len(parts) > 2 else 0)
+    return f"{name}: {', '.join(parts)}"
 
 
 def in_words(stage: Stage, compiling: float | None, now: float) -> str:

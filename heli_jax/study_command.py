@@ -13,7 +13,7 @@ import numpy as np
 from heli_jax import cli_options, run_directory
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
-from heli_jax.numbers import rounded
+from heli_jax.numbers import rounded, terse
 from heli_jax.terminal_table import print_table, tell
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ def print_study(result: "xr.Dataset") -> None:
         agreement = [_percent(v) for v in one["nrmse_fit_percent"].to_numpy()]
         rows.append((*at, status[i], *estimates, *agreement))
     outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
-    print_table((*axes, "status", *parameters, *outputs), rows)
+    # One axis alone names no fit: rows of two would look alike in all tables but the first.
+    print_table((*axes, "status", *parameters, *outputs), rows, keys=len(axes))
     if len(status) > _MOST_ROWS:
         tell(f"... and {len(status) - _MOST_ROWS} more")
     _print_scatter(flat, parameters)
@@ -143,7 +144,8 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
             continue
         values, sds = values[there], sds[there]
         numbers = (values.min(), np.median(values), values.max(), values.std(ddof=1))
-        cells = [f"{v:.5g}" for v in numbers[:3]] + [f"{numbers[3]:.2g}", f"{np.median(sds):.2g}"]
+        cells = [terse(v, 5) for v in numbers[:3]]
+        cells += [terse(v, 2) for v in (numbers[3], float(np.median(sds)))]
         rows.append((parameter, str(values.size), *cells, str(flat["unit"].to_numpy()[i])))
     if rows:
         head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")

@@ -6,6 +6,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import TextIO
 
+from heli_jax.numbers import terminal_sentence
+
 type _Row = tuple[str, ...]
 _BETWEEN = 3
 """columns from one column's end to the next one's beginning"""
@@ -18,6 +20,7 @@ def tell(text: str, file: TextIO | None = None) -> None:
         text: what is told; a new line in it stays one.
         file: standard output unless given.
     """
+    text = terminal_sentence(text)
     stream = sys.stdout if file is None else file
     if stream.isatty():
         width = shutil.get_terminal_size().columns
@@ -38,52 +41,59 @@ def _folded(line: str, width: int) -> str:
     )
 
 
-def print_table(head: _Row, rows: list[_Row]) -> None:
+def print_table(head: _Row, rows: list[_Row], *, keys: int = 1) -> None:
     """A table on standard output, its columns as wide as they need.
 
-    What is wider than the terminal is printed as several tables, each with the first column, or
-    where not even two columns fit as a list. What is piped on has lines of any length.
+    What is wider than the terminal is printed as several tables, each with the columns that name
+    its rows, or where no further column fits as a list. What is piped on has lines of any length.
 
     Args:
         head: names of the columns.
         rows: as many cells each.
+        keys: columns that name a row together, the first ones.
     """
     # In a pipe nobody knows how wide a line may be, and a program reads it whole.
     most = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     columns = list(zip(head, *rows, strict=True))
-    groups = _groups(columns, most)
+    groups = _groups(columns, most, keys)
     if groups is None:
-        _print_list(head, rows)
+        _print_list(head, rows, keys)
         return
     for group in groups:
         kept_head, *kept_rows = zip(*(columns[i] for i in group), strict=True)
         _print(kept_head, kept_rows)
 
 
-def _groups(columns: Sequence[_Row], most: int | None) -> list[list[int]] | None:
-    """Columns by table, the first in each; None where it does not fit beside another."""
+def _groups(columns: Sequence[_Row], most: int | None, keys: int) -> list[list[int]] | None:
+    """Columns by table, the keys in each; None where one does not fit beside them."""
     from rich.cells import cell_len
 
-    widths = [max(map(cell_len, column)) for column in columns]
-    if most is None or sum(widths) + _BETWEEN * len(widths) <= most:
+    widths = [max(map(cell_len, column)) + _BETWEEN for column in columns]
+    if most is None or sum(widths) <= most:
         return [list(range(len(columns)))]
     groups: list[list[int]] = []
+    room = most - sum(widths[:keys])
     left = 0
-    for i, width in enumerate(widths[1:], 1):
-        if width + _BETWEEN > left or not groups:
-            groups.append([0])
-            left = most - widths[0] - _BETWEEN
-        if width + _BETWEEN > left:
+    for i, width in enumerate(widths[keys:], keys):
+        if width > left:
+            groups.append([*range(keys)])
+            left = room
+        if width > left:
             return None
         groups[-1].append(i)
-        left -= width + _BETWEEN
+        left -= width
     return groups or None
 
 
-def _print_list(head: _Row, rows: Sequence[_Row]) -> None:
+def _print_list(head: _Row, rows: Sequence[_Row], keys: int) -> None:
     for row in rows:
-        print(f"\n{row[0]}")
-        for name, cell in zip(head[1:], row[1:], strict=True):
+        if keys == 1:
+            print(f"\n{row[0]}")
+        else:
+            print()
+            for name, cell in zip(head[:keys], row[:keys], strict=True):
+                print(f"{name}: {cell}")
+        for name, cell in zip(head[keys:], row[keys:], strict=True):
             if cell:
                 print(f"  {name}: {cell}" if name else f"  {cell}")
     print()

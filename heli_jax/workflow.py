@@ -406,7 +406,8 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
         title = run.config.path.stem
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
         sampled = sample_files(extra.intervals)
-        made = origin(text, ("config.yaml", "fit.json", "signals.csv", *sampled))
+        corrections = ("compatibility.yaml",) if extra.sensors else ()
+        made = origin(text, ("config.yaml", "fit.json", "signals.csv", *corrections, *sampled))
         write_samples(folder, run.fit, extra.intervals, made, str(run.config.path))
         png = run.config.config.report.png
         write_page(folder, analysis, title, vehicle.constants, made, png=png)

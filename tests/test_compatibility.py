@@ -148,13 +148,16 @@ def test_a_fit_is_put_in_words(folder):
     assert judged.verdict == (
         "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more."
     )
-    assert judged.doubts[0].startswith("lambda_p +23%: more than a sensor's own error.")
+    assert judged.doubts[0].startswith("lambda_p +23 %: more than a sensor's own error.")
     assert judged.doubts[1:] == ("of the fit",)
     rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
     assert rows == [
-        ("lambda_p", "0.2300 +- 0.0040", "yes"), ("b_p", "0.0010 +- 0.0020", "no"),
-        ("b_r", "", "unknown"), ("delay_gyro", "0.040 +- 0.010", "yes"),
+        ("lambda_p", "0.2300 ± 0.0040", "yes"), ("b_p", "0.0010 ± 0.0020", "no"),
+        ("b_r", "", "unknown"), ("delay_gyro", "0.040 ± 0.010", "yes"),
     ]  # fmt: skip
+    agreement = compatibility._agreement(judged)
+    assert agreement.verdict == judged.verdict
+    assert agreement.doubts == judged.doubts[:1]  # the fit's notes stand on its page already
     assert judged.corrections["signals"]["roll"]["delay"] == 0.04
     assert judged.corrections["not_determined"] == ["b_r"]
     bad = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.2}))

@@ -115,9 +115,9 @@ def test_first_steps_show_what_the_commands_print_today(site):
     ):
         assert words in page
     # What the text between them says of these numbers.
-    vaf = re.search(r"roll, simulated: VAF (0\.\d+)", page)
+    vaf = re.search(r"roll, simulated: VAF (\d+\.\d+) %", page)
     assert vaf
-    assert f"VAF {float(vaf[1]):.2f}" in page
+    assert f"VAF {float(vaf[1]):.0f} %)" in page
 
 
 def test_the_gates_that_the_page_names_are_those_of_the_card():
@@ -133,7 +133,7 @@ def test_the_gates_that_the_page_names_are_those_of_the_card():
         "Cramér-Rao": f"at most {card.CRAMER_RAO:g} %",
         "insensitivity": f"at most {card.INSENSITIVITY:g} %",
         "largest correlation": f"at most {card.CORRELATION:g}",
-        "VAF, NRMSE fit": f"at least {card.VAF:g}, at least {card.NRMSE_FIT:g} %",
+        "VAF, NRMSE fit": f"at least {100 * card.VAF:g} %, at least {card.NRMSE_FIT:g} %",
         "Theil coefficient": f"at most {card.THEIL:g}",
         "Theil bias, variance part": f"at most {card.THEIL_PART:g}",
         "error power over expected": f"at most {card.EXPECTED:g}",

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -109,6 +110,10 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     page = (out / "responses.html").read_text()
     assert "lat to p" in page
     assert "Handling qualities" in page
+    links = set(re.findall(r'<a href="([^"#]+)"', page))
+    assert {"responses.csv", "responses.nc", "figures/"} <= links
+    assert all((out / link).exists() for link in links)
+    assert "Configuration, in full" in page
     assert (out / "figures/p-lat.svg").exists()
 
 

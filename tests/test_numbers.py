@@ -44,6 +44,8 @@ def test_terminal_and_page_round_to_the_same_digit_of_the_standard_deviation(val
         (7.5e-6, "7.5·10⁻⁶", "7.5e-06"),
         (-1.25e7, "−1.25·10⁷", "-1.25e+07"),
         (0.0123, "0.0123", "0.0123"),
+        (0.0032, "0.0032", "0.0032"),
+        (0.00032, "3.2·10⁻⁴", "3.2e-04"),
         (31400.0, "31400", "31400"),
         (float("inf"), "∞", "inf"),
         (-float("inf"), "−∞", "-inf"),
@@ -62,7 +64,7 @@ def test_each_number_on_the_terminal_has_a_power_of_its_own():
 
 def test_numbers_within_a_sentence_are_written_for_the_terminal():
     sentence = "a delay of 9.72·10⁻⁵ (−7.7·10⁻⁵ to ∞) s ± 3 %, from x_roll – none"
-    words = "a delay of 9.72e-05 (-7.7e-05 to inf) s +- 3 %, from x_roll - none"
+    words = "a delay of 9.72e-05 (-7.7e-05 to inf) s ± 3 %, from x_roll - none"
     assert numbers.plain_words(sentence) == words
     assert numbers.plain_words("coefficient of s^2 in 12.50") == "coefficient of s^2 in 12.50"
 
@@ -71,8 +73,9 @@ def test_a_vaf_far_below_zero_is_a_bound():
     assert numbers.vaf_percent(0.98761) == "98.76 %"
     assert numbers.vaf_percent(-3571.4) == "below −1000 %"
     assert numbers.vaf_percent(None) == numbers.NOTHING
-    assert numbers.vaf_text(-3571.4) == "below -10"
-    assert numbers.vaf_text(-0.41) == "-0.41"
+    assert numbers.vaf_text(-3571.4) == "below -1000 %"
+    assert numbers.vaf_text(-0.41) == "-41.0 %"
+    assert numbers.vaf_text(0.98761, 2) == "98.76 %"
 
 
 def test_what_is_worse_than_the_mean_explains_none():
@@ -84,7 +87,8 @@ def test_what_is_worse_than_the_mean_explains_none():
     ("page", "terminal"),
     [
         ("0.4·10⁻⁴ to 7.5·10⁻⁴", "4e-05 to 7.5e-04"),
-        ("−1.5·10⁻³ ± 0.2·10⁻³", "-1.5e-03 ± 2e-04"),
+        ("−1.5·10⁻⁴ ± 0.2·10⁻⁴", "-1.5e-04 ± 2e-05"),
+        ("0.4·10⁻⁴ to 75·10⁻⁴", "4e-05 to 0.0075"),
         ("kg m²", "kg m^2"),
         ("a-b 1.20", "a-b 1.20"),
         ("−∞ to 3", "-inf to 3"),
@@ -92,3 +96,25 @@ def test_what_is_worse_than_the_mean_explains_none():
 )
 def test_cells_of_tables_on_the_terminal(page, terminal):
     assert numbers.plain_cell(page) == terminal
+
+
+@pytest.mark.parametrize(
+    ("python", "page", "terminal"),
+    [
+        ("rms error 3.2e-03 rad", "rms error 0.0032 rad", "rms error 0.0032 rad"),
+        ("1.2e+02 % (-7.5e-06)", "120 % (−7.5·10⁻⁶)", "120 % (-7.5e-06)"),
+        ("factor 1.5e+04, +2e+00", "factor 15000, +2", "factor 15000, +2"),
+        ("at 2.50e+07.", "at 2.50·10⁷.", "at 2.50e+07."),
+        # What a user wrote, and what is no number.
+        ("got '1e3' in runs/1e-03/fit.json", "got '1e3' in runs/1e-03/fit.json", None),
+        ("1e-03.csv has a 0x1e3 and a-1e3", "1e-03.csv has a 0x1e3 and a-1e3", None),
+    ],
+)
+def test_exponents_within_a_sentence_are_written_by_the_same_rule(python, page, terminal):
+    assert numbers.page_sentence(python) == page
+    assert numbers.terminal_sentence(python) == (terminal or page)
+
+
+def test_what_is_rounded_up_to_a_power_has_that_power():
+    assert numbers.number(0.00099996, 3) == "0.001"
+    assert numbers.number(99999.7, 3) == "1·10⁵"

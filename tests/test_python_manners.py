@@ -3,7 +3,9 @@
 import pickle
 import subprocess
 import sys
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -17,6 +19,8 @@ FLIGHT = Flight(
     inputs=U, outputs={"p": np.zeros(200)}, dt=0.02, sd={"p": 0.1}, hold={"lat": "zero-order"}
 )
 FREE = {"Lb": Free(100.0)}
+WRONG: Any = Free
+"""for what its types forbid"""
 
 
 @pytest.mark.parametrize(
@@ -64,11 +68,49 @@ def test_the_version_is_that_of_the_distribution(capsys: pytest.CaptureFixture[s
         ((LINEAR.model, PARAMS, ["flight.csv"], FREE), "read_flight"),
         ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": 100.0}), r"expected Free\(100\)"),
         ((LINEAR.model, PARAMS, [FLIGHT], ["Lb"]), "Free by the parameter's name"),
+        ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": WRONG("100")}), "Lb.start: expected a number"),
+        ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": WRONG(True)}), "Lb.start: expected a number"),
+        ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": WRONG(9.0, "0")}), "Lb.lower: expected a number"),
+        ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": WRONG(9.0, prior=(9, 1))}), r"Prior\(mean, sd\)"),
     ],
 )
 def test_a_wrong_argument_is_told_what_to_pass(arguments: tuple, words: str) -> None:
     with pytest.raises(TypeError, match=words):
         Problem(*arguments)
+
+
+def test_numbers_of_numpy_and_jax_are_numbers() -> None:
+    free = {"Lb": Free(np.float32(100.0), lower=jnp.asarray(1.0), upper=np.asarray(1000.0))}  # pyright: ignore[reportArgumentType]
+    assert Problem(LINEAR.model, PARAMS, [FLIGHT], free).free["Lb"].start == 100.0
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "flight", "dt", "words"),
+    [
+        (LINEAR.model, PARAMS, U, 0.02, r"Inputs\(lat=...\) with dt, got dict"),
+        (LINEAR.model, PARAMS, U["lat"], 0.02, r"Inputs\(lat=...\) with dt, got ndarray"),
+        (LINEAR.model, "heli.yaml", FLIGHT, None, "load_vehicle"),
+        (LINEAR.model, PARAMS, FLIGHT, -0.02, "above zero .s., got -0.02"),
+        (LINEAR.model, PARAMS, FLIGHT, 0.0, "above zero"),
+        (LINEAR.model, PARAMS, FLIGHT, float("nan"), "above zero"),
+    ],
+)
+def test_simulate_says_what_to_pass(model, params, flight, dt, words) -> None:
+    with pytest.raises((TypeError, ValueError), match=words):
+        simulate(model, params, flight, dt=dt)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"inputs": U["lat"]}, "inputs: expected arrays by name"),
+        ({"dt": "0.02"}, "expected a number of seconds"),
+        ({"outputs": {"p": np.zeros(200, complex)}}, "complex"),
+    ],
+)
+def test_a_flight_says_what_to_pass(changes, words) -> None:
+    with pytest.raises((TypeError, ValueError), match=words):
+        Flight(**{"inputs": U, "outputs": {"p": np.zeros(200)}, "dt": 0.02} | changes)
 
 
 def test_an_empty_list_of_flights_is_said_to_be_empty() -> None:

@@ -55,3 +55,22 @@ def test_sentences_begin_new_lines_between_words(
         assert lines == list(sentences)
     else:
         assert all(len(line) <= width or " " not in line.strip() for line in lines)
+
+
+@pytest.mark.parametrize("width", [80, 50, 24])
+def test_each_part_of_a_wide_table_has_all_columns_that_name_a_row(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    head = ("a.start", "Ixx.start", *(f"estimate {i}" for i in range(8)))
+    rows = [(a, i, *(f"{a}{i}.{k}e-04" for k in range(8))) for a in ("4", "5") for i in ("1", "2")]
+    print_table(head, rows, keys=2)
+    text = re.sub(r"\x1b\[\d*m", "", capsys.readouterr().out)
+    for line in text.splitlines():
+        found = re.findall(r"([45])([12])\.\de-04", line)
+        if found and width > 24:
+            assert line.split()[:2] == list(found[0])
+    for row in rows:
+        assert all(cell in text for cell in row)
+    assert max(map(len, text.splitlines())) <= width

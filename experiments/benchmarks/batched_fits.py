@@ -7,6 +7,7 @@ this process, after one of each that compiles. Times are a record's, of all core
 may use; the estimates have to agree.
 """
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -72,4 +73,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import asked
+
+    asked(__doc__, "some minutes")
     main()

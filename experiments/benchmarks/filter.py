@@ -88,5 +88,8 @@ def compared(taus: bool) -> None:
 
 
 if __name__ == "__main__":
+    from script import asked
+
+    asked(__doc__, "some minutes")
     compared(taus=False)
     compared(taus=True)

@@ -4,6 +4,9 @@ Flapping, tail force and power, governor and inflow in any descent: from hover, 
 with 4 steps a sample, small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
 """
 
+import sys
+from pathlib import Path
+
 import helicopter as consistent
 import jax.numpy as jnp
 import numpy as np
@@ -34,4 +37,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import asked
+
+    asked(__doc__, "some minutes")
     main()

@@ -12,6 +12,7 @@ ratios. Compilation is from the trace to the machine code.
 import ctypes
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -392,4 +393,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import asked
+
+    asked(__doc__, "some minutes")
     main()

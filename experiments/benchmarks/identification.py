@@ -10,6 +10,7 @@ coefficients.
 
 import ctypes
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -219,4 +220,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import asked
+
+    asked(__doc__, "some minutes")
     main()

@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 if hasattr(os, "sched_setaffinity"):
@@ -105,4 +106,8 @@ def main(minutes: float) -> None:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import Size, asked
+
+    minutes = Size("minutes", 10.0, 1.0, "of the record")
+    main(asked(__doc__, "some minutes", minutes).minutes)

@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 os.environ["JAX_NUM_CPU_DEVICES"] = str(len(os.sched_getaffinity(0)))
@@ -49,9 +50,7 @@ def processor_time(run: Callable[[], Any]) -> float:
     return time.process_time() - begin
 
 
-def main() -> None:
-    asked = sys.argv[1:] or ["exact"]
-    solver, rounds = asked[0], int(asked[1]) if len(asked) > 1 else 5
+def main(solver: str, rounds: int) -> None:
     few, many = SIZES[solver]
     found = ways(solver)
     taken = np.array(
@@ -72,4 +71,12 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from script import Size, asked
+
+    sizes = (
+        Size("solver", "exact", "exact", "exact or rk4"),
+        Size("rounds", 5, 1, "of all programs in turn"),
+    )
+    options = asked(__doc__, "some minutes", *sizes)
+    main(options.solver, options.rounds)

@@ -24,6 +24,27 @@ _RECORDS = ("Params", "State", "Inputs", "Outputs")
 # what their functions have returned.
 
 
+def check_params(params: type, vehicle: Any) -> None:
+    """Refuse what has not the parameters of a model.
+
+    Args:
+        params: the model's class of parameters.
+        vehicle: should be one of these.
+
+    Raises:
+        TypeError: saying what to pass.
+    """
+    if isinstance(vehicle, str | bytes) or hasattr(vehicle, "__fspath__"):
+        raise TypeError(
+            f"vehicle: expected {params.__name__}, got a path; "
+            "heli_jax.load_vehicle(path, model.Params) reads the file"
+        )
+    if not all(hasattr(vehicle, name) for name in naming.names(params)):
+        raise TypeError(
+            f"vehicle: expected the model's {params.__name__}, got {type(vehicle).__name__}"
+        )
+
+
 def check_model(model: Any, *, traceable: bool = True) -> None:
     """Refuse what is no Model, and a Model whose functions cannot be traced or return something
     else than is expected. A model is looked at once; later calls cost a look-up.

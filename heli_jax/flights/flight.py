@@ -148,6 +148,12 @@ class Flight:
     instruments: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for kind in ("inputs", "outputs", "instruments"):
+            if not isinstance(getattr(self, kind), Mapping):
+                got = type(getattr(self, kind)).__name__
+                raise TypeError(f"{kind}: expected arrays by name, as {{'p': p}}, got {got}")
+        if isinstance(self.dt, str):
+            raise TypeError(f"dt is {self.dt!r}, expected a number of seconds")
         if not (math.isfinite(self.dt) and self.dt > 0):
             raise ValueError(f"dt is {self.dt}, expected a positive number of seconds")
         if not math.isfinite(self.t0):
@@ -230,6 +236,8 @@ class Flight:
 
 
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
+    if np.iscomplexobj(values):
+        raise ValueError(f"{name!r} is complex, expected real numbers")
     # A copy, made read-only: the caller's array may change after the flight has been checked.
     samples = np.array(values, dtype=np.float64)
     if samples.ndim != 1 or samples.size == 0:

@@ -76,13 +76,13 @@ def lines(
 
 
 def line_words(line: Line, rotor_hz: float | None) -> str:
-    """A line in words: `24.2 Hz has 12% of its variance (1/rev of the rotor)`.
+    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`.
 
     Args:
         line: of a signal.
         rotor_hz: turns per second of the rotor, where they are known.
     """
-    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g}% of its variance"
+    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
     if line.aliased:
         return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
     if line.harmonic:

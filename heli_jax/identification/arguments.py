@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import check_params
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.free import Free
+from heli_jax.identification.free import Free, Prior
 
 _HEADINGS = {"psi", "yaw"}
 """angles that may go on for more than a turn"""
@@ -29,15 +30,7 @@ def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None
     Raises:
         TypeError: naming the argument, what was expected and what was found.
     """
-    if isinstance(vehicle, str | bytes) or hasattr(vehicle, "__fspath__"):
-        raise TypeError(
-            f"vehicle: expected {params.__name__}, got a path; "
-            "heli_jax.load_vehicle(path, model.Params) reads the file"
-        )
-    if not all(hasattr(vehicle, name) for name in naming.names(params)):
-        raise TypeError(
-            f"vehicle: expected the model's {params.__name__}, got {type(vehicle).__name__}"
-        )
+    check_params(params, vehicle)
     if isinstance(flights, Flight):
         raise TypeError("flights: expected a list of Flights, got one; pass [flight]")
     if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
@@ -52,6 +45,22 @@ def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None
             got = f"the number {each:g}" if isinstance(each, int | float) else type(each).__name__
             example = f"Free({each:g})" if isinstance(each, int | float) else "Free(start)"
             raise TypeError(f"free: {name}: expected {example}, got {got}")
+        numbers = {"start": each.start, "lower": each.lower, "upper": each.upper}
+        if isinstance(each.prior, Prior):
+            numbers |= {"prior.mean": each.prior.mean, "prior.sd": each.prior.sd}
+        elif each.prior is not None:
+            raise TypeError(
+                f"free.{name}.prior: expected Prior(mean, sd), got {type(each.prior).__name__}"
+            )
+        for key, value in numbers.items():
+            if value is not None and not _is_number(value):
+                raise TypeError(f"free.{name}.{key}: expected a number, got {value!r:.60}")
+
+
+def _is_number(value: Any) -> bool:
+    """Of Python, NumPy or JAX; True is none, though Python counts with it."""
+    shape, kind = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value))).kind
+    return shape == () and kind in "iuf"
 
 
 def _kinds(flights: Any) -> str:

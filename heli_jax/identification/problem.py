@@ -105,6 +105,9 @@ class Problem:
         # The model first: all that follows asks it for names and units.
         check_model(self.model)
         check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
+        if not isinstance(self.nuisance, Nuisance):
+            got = type(self.nuisance).__name__
+            raise TypeError(f"nuisance: expected Nuisance(time_shift=True, ...), got {got}")
         warn_of_degrees(self.model.Outputs, self.flights)
         object.__setattr__(self, "flights", tuple(self.flights))
         if self.instrument is not None:

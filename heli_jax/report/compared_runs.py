@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import measured, number, rounded, vaf_percent
+from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
@@ -28,15 +29,17 @@ _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
 )
 _LATEX = str.maketrans(
     {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "^": r"\^{}", "–": "--", "±": r"$\pm$"}
+    | {"−": "$-$"}
     | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
 )
+_RAISED = re.compile(r"(·10)?([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
 _JOINT = (
     "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are from "
     "the first run, in the sd that the two have together if nothing is common to them."
 )
 _SAME = (
-    "{first} and {second} share a log: their estimates hang together, and differ by less than that "
-    "by chance."
+    "{first} and {second} share a log: their estimates are correlated, and differ by less than "
+    "that by chance."
 )
 
 
@@ -166,7 +169,7 @@ class ComparedRuns(NamedTuple):
 
     def to_latex(self) -> str:
         """The estimates as a table for a paper, with booktabs; its first line says what ± is."""
-        head, rows = self.estimates
+        head, rows = self.page_estimates
         lines = [
             "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
             r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
@@ -285,4 +288,9 @@ def _logs(run: SavedFit) -> set[str]:
 
 
 def _latex(text: str) -> str:
-    return text.translate(_LATEX)
+    """Text of a page for LaTeX, as the copy button of a page's tables writes it."""
+
+    def raised(m: re.Match[str]) -> str:
+        return f"${r'\cdot 10' if m[1] else ''}^{{{lowered(m[2])}}}$"
+
+    return _RAISED.sub(raised, text.translate(_LATEX)).replace("·", r"$\cdot$")

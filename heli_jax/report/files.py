@@ -26,6 +26,18 @@ from heli_jax.report.method_content import frequency_start_content, methods_cont
 from heli_jax.versions import versions
 
 
+class SensorAgreement(NamedTuple):
+    """Whether a log's sensors agree: what `heli-jax compatibility` asked of the fit."""
+
+    compatible: bool
+    verdict: str
+    doubts: tuple[str, ...]
+    """on the errors that were found, beside the fit's own notes"""
+    head: tuple[str, ...]
+    errors: tuple[tuple[str, ...], ...]
+    """a row of text for each"""
+
+
 class SupplementaryAnalyses(NamedTuple):
     """What belongs to a fit: model selection, intervals by other methods, what the log is worth."""
 
@@ -37,6 +49,8 @@ class SupplementaryAnalyses(NamedTuple):
     """further methods beside the fit's own"""
     responses: FittedResponses | None = None
     """of the model and of the flights, with their handling qualities"""
+    sensors: SensorAgreement | None = None
+    """of `heli-jax compatibility` alone"""
 
 
 def fit_json(
@@ -80,6 +94,7 @@ def fit_json(
             "methods": methods_content(supplementary.methods),
             "intervals": content.intervals(supplementary.intervals),
             "record": [f._asdict() for f in supplementary.findings],
+            "compatibility": _sensors(supplementary.sensors),
             **content.likelihood(fit),
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
@@ -97,6 +112,17 @@ def fit_json(
             **_provenance(fit, problem),
         }
     )
+
+
+def _sensors(found: SensorAgreement | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "compatible": found.compatible,
+        "verdict": found.verdict,
+        "doubts": list(found.doubts),
+        "shows": {row[0]: row[found.head.index("shows")] for row in found.errors},
+    }
 
 
 def _provenance(fit: Fit, problem: Problem) -> dict[str, Any]:

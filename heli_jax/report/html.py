@@ -139,6 +139,10 @@ def _more_results(analysis: Analysis) -> dict[str, Any]:
     handling = more.responses.handling if more.responses else ()
     return {
         "supplementary": more,
+        "sensors": more.sensors,
+        "sensor_errors": tables.Table(more.sensors.head, list(more.sensors.errors))
+        if more.sensors
+        else None,
         "choice": tables.choice(more.choice) if more.choice else None,
         "intervals": tables.intervals(more.intervals, fit) if more.intervals else None,
         "sampling": _sampling(analysis),

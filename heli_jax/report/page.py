@@ -9,6 +9,8 @@ from typing import Any
 import jinja2
 import markupsafe
 
+from heli_jax.numbers import page_sentence
+
 _FOLDER = Path(__file__).parent
 _SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "flight.js", "tables.js")
 _NOTHING: dict[str, Any] = {"arrays": [], "charts": [], "scenes": []}
@@ -32,6 +34,7 @@ def filled(template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["sentence"] = page_sentence
     environment.globals |= {"asset": _asset, "policy": _policy()}
     return environment.get_template(template).render(**{"numbers": _NOTHING, **values})
 

@@ -25,6 +25,12 @@ from heli_jax.report.tables.handling import handling as handling_table
 from heli_jax.report.tables.handling import handling_sentences
 from heli_jax.report.tables.table import Table
 
+_FILES = (
+    "responses.csv",
+    "responses.nc",
+    "transfer_functions.json",
+    "handling_qualities.json",
+)
 _DB = 20.0 / np.log(10.0)
 
 
@@ -35,6 +41,7 @@ def write_responses(
     title: str,
     handling: Sequence[Handling] = (),
     *,
+    config: str = "",
     png: bool = False,
 ) -> None:
     """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json,
@@ -46,6 +53,7 @@ def write_responses(
         units: SI, of inputs and outputs by name.
         title: of the page.
         handling: what the data say of handling qualities.
+        config: in full, as YAML.
         png: whether figures are PNG files too.
     """
     write_table(directory / "responses.csv", table(found))
@@ -70,7 +78,7 @@ def write_responses(
         title=title,
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
-        origin=origin(),
+        origin=origin(config, _FILES),
         notes=found.notes,
         fits=Table(
             ("input", "output", "averages", *FIT_HEAD),

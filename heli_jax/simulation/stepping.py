@@ -7,9 +7,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import check_params
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import columns
@@ -37,7 +39,9 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
         dt: [s]; that of the Flight unless given.
 
     Raises:
-        ValueError: a needed input is missing, the lengths differ, or dt is missing.
+        TypeError: what is flown is neither a Flight nor Inputs.
+        ValueError: a needed input is missing, the lengths differ, or dt is missing or not above
+            zero.
     """
     # By its dictionary, not by its class: anything with `inputs` and `dt` may be a flight, and a
     # model's Inputs may have a field of that name, which is an array.
@@ -49,7 +53,17 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
         inputs = model.Inputs(**{n: jnp.asarray(by_name[n]) for n in naming.names(model.Inputs)})
         dt = flight.dt if dt is None else dt
     else:
+        names = naming.names(model.Inputs)
+        if not all(hasattr(flight, n) for n in names):
+            example = ", ".join(f"{n}=..." for n in names)
+            raise TypeError(
+                f"flight: expected a Flight, or arrays as the model's Inputs({example}) with dt, "
+                f"got {type(flight).__name__}"
+            )
         inputs = jax.tree.map(jnp.asarray, flight)
+    # Backwards, or on the spot, a run would end like any other. Traced it has no value yet.
+    if dt is not None and not isinstance(dt, jax.core.Tracer) and not np.all(np.asarray(dt) > 0):
+        raise ValueError(f"dt: expected a sample time above zero [s], got {dt}")
     if dt is None:
         raise ValueError(
             "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
@@ -71,7 +85,11 @@ def start_state(
         params: the model's Params, SI.
         initial_state: the model's State, or None.
         inputs: the model's Inputs.
+
+    Raises:
+        TypeError: `params` are none of the model's.
     """
+    check_params(model.Params, params)
     # A loop needs one dtype for its state: float32 parameters in a float64 session stay float32,
     # and a state that is given in integers becomes numbers.
     state = model.initial_state(params) if initial_state is None else initial_state

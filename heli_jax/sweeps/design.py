@@ -256,7 +256,17 @@ def log_axes(design: Design) -> set[str]:
         return set().union(*map(log_axes, design.parts))
     if isinstance(design, _Sampled):
         return {n for n, axis in design.axes.items() if axis.scale == "log"}
+    if isinstance(design, _Grid):
+        return {n for n, values in design.axes.items() if _geometric(values)}
     return set()
+
+
+def _geometric(values: np.ndarray) -> bool:
+    """Whether each value is the one before times the same, as those of a range in the logarithm."""
+    if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
+        return False
+    steps = np.diff(np.log(np.abs(values)))
+    return bool(steps[0]) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
 
 
 def _check_parts(parts: tuple[Design, ...]) -> None:

@@ -90,7 +90,7 @@ def test_a_good_fit_with_coloured_residuals_is_adequate_in_size_only():
     assert found.adequate
     assert found.summary == "in size only (the residuals of p are not white)"
     worse = judged(P + 0.35 * P.std() * SLOW, P).summary
-    assert worse.startswith("in size only (the residuals of p are not white; VAF of p is 0.8")
+    assert worse.startswith("in size only (the residuals of p are not white; VAF of p is 8")
     filtered = judged(P + 0.14 * P.std() * SLOW, P, against=1.0)
     assert filtered.summary == "in size only (the innovations of p are not white)"
 

@@ -62,7 +62,7 @@ def test_intervals_that_part_are_told_with_which_to_believe(white):
     low, high = white.estimates["Ixx"].lower95, white.estimates["Ixx"].upper95
     by = {"gaussian": (low, high), "profile": (low, high + 0.3 * (high - low))}
     [said] = _sentences(white, {"Ixx": by}, None, None)
-    assert said.startswith("Ixx: profile differs from the Gaussian interval by more than 15%")
+    assert said.startswith("Ixx: profile differs from the Gaussian interval by more than 15 %")
     assert "believe the profile" in said
     [said] = _sentences(white, {"Ixx": by | {"profile": (low, np.inf)}}, None, None)
     assert "to one side at most" in said

@@ -88,7 +88,7 @@ def test_feedback_that_cannot_be_told_is_said(fits):
     flight = record(0, slow=True)
     (words,) = untested(problem(flight))
     assert words == (
-        "flight 1: whether the inputs follow roll was not tested, since more than 20% of the "
+        "flight 1: whether the inputs follow roll was not tested, since more than 20 % of the "
         "samples are missing."
     )
     alone = dataclasses.replace(flight, outputs={"roll": flight.outputs["roll"]})

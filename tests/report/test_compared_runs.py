@@ -179,3 +179,15 @@ def test_one_run_that_diverges_leaves_the_others_their_axes(tmp_path: Path) -> N
     assert max(map(abs, ax.get_ylim())) < 10.0
     assert ax.get_ylabel() == "p [rad/s]"
     assert any("diverges" in str(line.get_label()) for line in ax.get_lines())
+
+
+def test_latex_has_powers_of_ten_and_no_bare_special_characters(tmp_path: Path) -> None:
+    runs = [tmp_path / "a_1", tmp_path / "b%2"]
+    for k, run in enumerate(runs):
+        write_run(run, {"K_1": (1.7e-4 * (1 + k), 1.2e-5)})
+    table = compare_runs(runs).to_latex()
+    assert r"1.70$\cdot 10^{-4}$ $\pm$ 0.12$\cdot 10^{-4}$" in table
+    assert r"a\_1" in table
+    assert r"b\%2" in table
+    body = table.split("\n", 1)[1]
+    assert body.count("$") % 2 == 0

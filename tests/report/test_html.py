@@ -11,8 +11,9 @@ import pytest
 
 from heli_jax import numbers
 from heli_jax.identification.validation.metrics import Whiteness
-from heli_jax.report import tables
+from heli_jax.report import files, tables
 from heli_jax.report.drawings import Analysis
+from heli_jax.report.files import SensorAgreement, SupplementaryAnalyses
 from heli_jax.report.html import write_report
 from heli_jax.report.origin import origin
 from heli_jax.vehicle import Constant
@@ -204,3 +205,29 @@ def test_digits_follow_the_standard_deviation(value, sd, text):
 )
 def test_numbers(value, text):
     assert numbers.number(value, 4) == text
+
+
+def test_what_sensors_say_of_each_other_comes_before_the_fit(sound, tmp_path):
+    """The fit behind it converges and is adequate in size, whatever its sensors say."""
+    found = SensorAgreement(
+        False,
+        "Not compatible: no errors bring psi to 3.2e-07.",
+        ("lambda_p +23 %: much",),
+        ("error", "estimate, 95 %", "unit", "shows", "what it is"),
+        (("lambda_p", "0.226 ± 0.061", "1", "yes", "scale"),),
+    )
+    fit, problem, baseline = sound
+    analysis = Analysis(fit, problem, baseline, SupplementaryAnalyses(sensors=found))
+    write_report(tmp_path, analysis, "bench", CONSTANTS)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<title>bench: not compatible</title>" in text
+    shown = words(text)
+    places = [
+        shown.index(what)
+        for what in ("✗ Not compatible: no errors bring psi to 3.2·10⁻⁷.", "0.226 ± 0.061")
+    ]
+    assert places == sorted(places)
+    assert places[-1] < shown.index("converged:")
+    content = files.fit_json(fit, problem, baseline, analysis.supplementary)
+    assert content["compatibility"]["compatible"] is False
+    assert content["compatibility"]["shows"] == {"lambda_p": "yes"}

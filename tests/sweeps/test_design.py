@@ -12,6 +12,7 @@ from hypothesis import given
 from heli_jax import sweeps
 from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
 from heli_jax.sweeps.axes import whole_seeds
+from heli_jax.sweeps.design import log_axes
 from heli_jax.sweeps.sobol_points import scrambled_sobol
 
 AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
@@ -164,3 +165,13 @@ def test_messages_say_what_was_expected_and_what_was_got():
 def test_old_names_are_told_the_new_ones(old, new):
     with pytest.warns(DeprecationWarning, match=new):
         assert getattr(sweeps, old) is getattr(sweeps, new)
+
+
+def test_a_grid_that_is_even_in_the_logarithm_is_drawn_so():
+    log = Range(0.01, 0.1, "log", 7)
+    axes = {"Ixx": log, "If": Range(1.0, 2.0, n=5), "a": [1.0, 10.0, 100.0], "c": [4.0, 5.0]}
+    assert log_axes(grid(axes)) == {"Ixx", "a"}
+    assert log_axes(product(grid({"Ixx": log}), sobol({"a": Range(1.0, 9.0, "log")}, 4))) == {
+        "Ixx",
+        "a",
+    }

@@ -330,9 +330,9 @@ def _bias(
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
         sentences.append(
-            f"It predicts one sample ahead to {terse(one_step, 2)} but simulates to "
-            f"{terse(agreement.rmse, 2)} only: least squares on past measured outputs is biased "
-            "by their noise."
+            f"Its rms error is {terse(one_step, 2)} one sample ahead but "
+            f"{terse(agreement.rmse, 2)} in simulation: least squares on past measured outputs is "
+            "biased by their noise."
         )
     if not whiteness(errors).white:
         sentences.append(

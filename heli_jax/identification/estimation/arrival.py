@@ -11,6 +11,7 @@ from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.free import Free
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
+from heli_jax.numbers import percent
 
 _SHARE = 0.1
 """of the sum of squares that a modest step would take away, at most, at an optimum"""
@@ -86,8 +87,8 @@ def unless_stuck(
         return optimum
     note = (
         "The optimiser is stuck: by their slopes a modest step of the unknowns would take away "
-        f"{share:.0%} of the squares, and it went no further. So it is where a simulation grows by "
-        "orders of magnitude, or parameters have a wrong sign. Remedy: windows (multiple "
+        f"{percent(share, 0)} of the squares, and it went no further. So it is where a simulation "
+        "grows by orders of magnitude, or parameters have a wrong sign. Remedy: windows (multiple "
         "shooting), a shorter record, or other starts. What the data determine is not known there."
     )
     best = optimum.best._replace(converged=np.asarray(False))

@@ -9,6 +9,7 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
 from heli_jax.identification.uncertainty.profile_likelihood import Profile, profile
+from heli_jax.numbers import percent
 from heli_jax.stages import stage
 
 DIFFERENT = 0.15
@@ -164,7 +165,8 @@ def _which(
     """
     names = " and ".join(far)
     verb = "differ" if len(far) > 1 else "differs"
-    text = f"{names} {verb} from the Gaussian interval by more than {DIFFERENT:.0%} of its width. "
+    by = f"by more than {percent(DIFFERENT, 0)} of its width"
+    text = f"{names} {verb} from the Gaussian interval {by}. "
     profiled = others.get("profile")
     if profiled is not None and not np.isfinite(profiled).all():
         return text + (

@@ -32,7 +32,7 @@ from heli_jax.identification.validation.advice import (
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.moves_against import moves_against
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
-from heli_jax.numbers import explained_text, vaf_text
+from heli_jax.numbers import explained_text, percent, vaf_text
 from heli_jax.numerics.white_noise import white_part
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -99,7 +99,7 @@ class Adequacy(NamedTuple):
     @property
     def summary(self) -> str:
         """`yes`, `in size only (the residuals of p are not white)`, `not judged`, or
-        `no (VAF of p is -586, less than its mean)`."""
+        `no (VAF of p is -41.0 %, less than its mean)`."""
         if self.unjudged:
             return "not judged"
         if self.adequate:
@@ -309,12 +309,12 @@ def _unexplained(output: OutputAdequacy) -> str:
     if output.against_disturbance is not None:
         return (
             f"The model explains nothing of {output.output}: simulated VAF "
-            f"{vaf_text(output.vaf, '.2g')}, and one step ahead the filter predicts it hardly "
+            f"{vaf_text(output.vaf)}, and one step ahead the filter predicts it hardly "
             "better than its mean or the sample before. Either nothing moves it, or what "
             "the log has there is noise or vibration."
         )
     return (
-        f"The model explains nothing of {output.output} (VAF {vaf_text(output.vaf, '.2g')}), no "
+        f"The model explains nothing of {output.output} (VAF {vaf_text(output.vaf)}), no "
         "more than as many unknowns explain of noise alone; the other outputs carry the fit. Its "
         "residuals are white: either the inputs do not move it, or what the log has there is no "
         "measurement."
@@ -334,9 +334,7 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 
 def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
-    words = " and ".join(
-        f"{output.output} (VAF {vaf_text(output.vaf, '.2g')})" for output in outputs
-    )
+    words = " and ".join(f"{output.output} (VAF {vaf_text(output.vaf)})" for output in outputs)
     return Adequacy(
         False,
         False,
@@ -431,6 +429,6 @@ def _reason(output: OutputAdequacy, ahead: float | None) -> str:
         )
     return (
         f"The model explains {explained_text(output.explained)} of what in {name} is not white "
-        f"noise, expected at least {EXPLAINED:.0%} (VAF {vaf_text(vaf)}); the acceptance card asks "
-        "for a VAF of 0.9."
+        f"noise, expected at least {percent(EXPLAINED, 0)} (VAF {vaf_text(vaf)}); the acceptance "
+        "card asks for a VAF of 90 %."
     )

@@ -29,6 +29,7 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
+from heli_jax.numbers import percent
 
 STEPS = "inputs stay where they are between jumps"
 """the reason why nothing is tested where no input moves freely"""
@@ -144,7 +145,8 @@ def _tested(flight: Flight, earlier: Mapping[str, float]) -> _Tested | str:
     steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
     inputs, outputs, dt = _decimated(flight, steps)
     if not outputs:
-        return f"every output stays where it is or lacks more than {1 - _SEEN:.0%} of its samples"
+        most = percent(1 - _SEEN, 0)
+        return f"every output stays where it is or lacks more than {most} of its samples"
     n = next(iter(outputs.values())).size
     if n < _LEAST:
         return f"the record is too short ({n * dt:.3g} s, expected {_LEAST * dt:.3g} s at least)"
@@ -245,7 +247,7 @@ def untested(problem: Problem) -> list[str]:
             lacking.setdefault((tuple(gappy), not tested), []).append(label)
     return [
         f"{', '.join(those)}: whether the inputs follow {' or '.join(outputs)} was not tested, "
-        f"since more than {1 - _SEEN:.0%} of the samples are missing"
+        f"since more than {percent(1 - _SEEN, 0)} of the samples are missing"
         + (", and no other output was measured." if alone else ".")
         for (outputs, alone), those in lacking.items()
     ]

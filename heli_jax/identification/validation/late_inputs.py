@@ -14,6 +14,7 @@ from jaxtyping import Float
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.numbers import percent
 
 _RATE = 50.0
 """[Hz] to which logs are averaged, so that the verdict is the same at any rate of the log: samples
@@ -132,8 +133,9 @@ def _basis(X: np.ndarray, size: float | None = None) -> np.ndarray:
 def _finding(label: str, name: str, share: float, lead: float, output: str) -> Finding:
     words = (
         f"{label}: {output} moves {lead:.2g} s or more before {name} does (what {name} does later "
-        f"explains {share:.0%} of what the past leaves of {output}): {name} is logged late (free a "
-        "delay: nuisance.time_shift, or delays of the model) or follows the response (feedback)."
+        f"explains {percent(share, 0)} of what the past leaves of {output}): {name} is logged late "
+        "(free a delay: nuisance.time_shift, or delays of the model) or follows the response "
+        "(feedback)."
     )
     criterion = f"part of what the past leaves that the later input explains, {_CLEAR:g}"
     return Finding("late input", "doubt", words, share, criterion)

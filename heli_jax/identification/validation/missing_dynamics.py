@@ -15,6 +15,7 @@ import scipy.special
 from heli_jax.dynamics.kinematics import FORCES
 from heli_jax.identification.validation.metrics import cross_correlation
 from heli_jax.identification.validation.own_samples import own_samples
+from heli_jax.numbers import percent
 
 _SECONDS = 0.4
 """lags of an input that are looked at"""
@@ -120,9 +121,8 @@ def missing_dynamics(
 
 
 def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
-    begun = (
-        f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
-    )
+    share = percent(one.share, 0)
+    begun = f"{name} still explains {share} of the whitened residual of {output}, most of it "
     if one.lag < 0:
         return begun + (
             f"{-one.lag:.2g} s before it moved: the response precedes {name} as it is logged. "

@@ -17,6 +17,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.seen_parts import seen_parts
+from heli_jax.numbers import percent
 
 _SEGMENTS = 6
 """half-overlapping segments of the shortest flight, at least"""
@@ -64,7 +65,8 @@ class OddFlight(NamedTuple):
         )
         words = (
             f"{self.label}: {names} {does} not answer the inputs as in the other flights, whose "
-            f"response leaves {self.left:.0%} of the power: {why} Mend this flight or leave it out."
+            f"response leaves {percent(self.left, 0)} of the power: {why} Mend this flight or "
+            "leave it out."
         )
         criterion = f"part of the power that the response of the others leaves, {_LEFT:g}"
         return Finding("odd flight", "doubt", words, self.left, criterion)
