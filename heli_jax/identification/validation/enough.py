@@ -19,6 +19,7 @@ from heli_jax.identification.validation.feedback import (
     why_untested,
 )
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.input_units import wrong_units
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -74,6 +75,7 @@ def is_it_enough(
         *rate_against_angle(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated, sticks_of(problem.model)),
+        *wrong_units(flights, e.simulated, sticks_of(problem.model)),
         *late_inputs(flights, feedback),
     ]
     if compare:

@@ -46,6 +46,8 @@ _ROUNDING = 1e-5
 """part of an output's sd below which its residual is no noise"""
 _STEP = 1e-4
 """of an unknown's coordinate, for differences"""
+_PLAY = 0.1
+"""part of an input's range that a linkage's play is asked for with; other plays answer alike"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _ENOUGH = 1.0
@@ -100,7 +102,7 @@ class Unmodelled(NamedTuple):
         if self.by_amplitude:
             said = (
                 f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
-                "rate limit, a deadband or another nonlinearity is missing."
+                "rate limit, a deadband, play or another nonlinearity is missing."
             )
         elif self.over_time:
             said = (
@@ -362,13 +364,24 @@ def _moving(at: Solution) -> list[str]:
 
 
 def _drives(at: Solution, e: Evaluation, i: int, name: str, moving: list[str]) -> np.ndarray:
-    """The inputs that move, then what is not linear of these, of the output and of its rate."""
+    """The inputs that move, then what is not linear of these, of the output and of its rate, and
+    what a linkage with play keeps of the inputs."""
     inputs = naming.asdict(at.data.flights[i].inputs)
     u = [_normal(np.asarray(inputs[n])) for n in moving]
     y = np.asarray(e.simulated[i][name])
     shapes = [*u, _normal(y), _normal(np.gradient(y))]
     curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
-    return np.stack([*u, *curved], axis=1)
+    # What play takes off hangs on where the stick came from, not on where it is: no power does.
+    return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
+
+
+def _behind_play(v: np.ndarray) -> np.ndarray:
+    """Where a signal (N,) takes what follows it with play."""
+    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, np.empty(v.size)
+    for k, x in enumerate(v.tolist()):
+        at = min(max(at, x - half), x + half)
+        out[k] = at
+    return out
 
 
 def _normal(v: np.ndarray) -> np.ndarray:
