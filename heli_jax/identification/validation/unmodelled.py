@@ -6,16 +6,16 @@ what the sensitivities explain (`score_test`): the simulation and its residual a
 method. Then against cubes and signed squares of inputs, of the simulated output and of its rate,
 beyond what the input through the same filter explains: a saturation, a rate limit and a deadband
 answer large and small inputs differently, and no linear model does. Then against the sensitivities
-times the time: a rotor that slows down and a mass that changes leave what no constant takes up.
+times the time, and of single flights: a rotor that slows down, a mass that changes and a stick
+of another scale leave what no constant takes up.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
@@ -24,6 +24,12 @@ from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.own_samples import OwnSamples, own_samples
+from heli_jax.identification.validation.residual_drives import (
+    changing,
+    drives,
+    moving_inputs,
+    of_single_flights,
+)
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -46,8 +52,6 @@ _ROUNDING = 1e-5
 """part of an output's sd below which its residual is no noise"""
 _STEP = 1e-4
 """of an unknown's coordinate, for differences"""
-_PLAY = 0.1
-"""part of an input's range that a linkage's play is asked for with; other plays answer alike"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _ENOUGH = 1.0
@@ -72,13 +76,15 @@ class Unmodelled(NamedTuple):
     """by estimate how far it moves where that is in the model, in its standard deviations"""
     over_time: bool = False
     """whether it is an answer that changes over the record"""
+    between: str = ""
+    """the flights between which it differs"""
 
     @property
     def matters(self) -> bool:
         """Whether some estimate moves by a good part of its interval, or none has one."""
         # What depends on amplitude or time changes what an estimate means, whatever the fit makes
         # of it.
-        if self.by_amplitude or self.over_time or not self.moved:
+        if self.by_amplitude or self.over_time or self.between or not self.moved:
             return True
         return max(abs(v) for v in self.moved.values()) > _MATTERS
 
@@ -89,6 +95,8 @@ class Unmodelled(NamedTuple):
             return f"the response of {self.output} depends on amplitude"
         if self.over_time:
             return f"the response of {self.output} changes over the record"
+        if self.between:
+            return f"the response of {self.output} differs between {self.between}"
         return f"the residual of {self.output} still follows {self.input}{self._where}"
 
     @property
@@ -110,6 +118,13 @@ class Unmodelled(NamedTuple):
                 "mass or speed did, or the log's clock, and the estimates are means of what they "
                 "were. Fit shorter windows, and compare (heli-jax compare)."
             )
+        elif self.between:
+            said = (
+                f"The response of {self.output} differs between {self.between} ({chance}): mass, "
+                "rotor speed or speed does, or the scale, sign or clock of a column, and the "
+                "estimates are means. Fit the flights by themselves, and compare (heli-jax "
+                "compare)."
+            )
         else:
             what = "a mode or a lag" if self.damping < 1.0 else "dynamics"
             said = (
@@ -123,7 +138,12 @@ class Unmodelled(NamedTuple):
 
 
 def unmodelled(
-    at: Solution, e: Evaluation, sds: Mapping[str, float | None], *, coloured: bool = False
+    at: Solution,
+    e: Evaluation,
+    sds: Mapping[str, float | None],
+    *,
+    coloured: bool = False,
+    flights: Sequence[str] = (),
 ) -> tuple[Unmodelled, ...]:
     """What the residuals follow beyond chance, by output at most one.
 
@@ -137,12 +157,13 @@ def unmodelled(
         e: what that tells.
         sds: of the estimates of interest, as they are reported.
         coloured: whether the residuals in time are autocorrelated.
+        flights: what each is called.
     """
     layout = at.layout
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return ()
-    flights = _longest(at)
-    names = sorted({n for i in flights for n in layout.outputs[i] if _usable(at, e, i, n)})
+    looked_at = _longest(at)
+    names = sorted({n for i in looked_at for n in layout.outputs[i] if _usable(at, e, i, n)})
     if not names:
         return ()
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
@@ -151,7 +172,7 @@ def unmodelled(
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            found.append(_said(at, e, name, one, sds))
+            found.append(_said(at, e, name, one, sds, flights))
     return tuple(found)
 
 
@@ -163,6 +184,10 @@ class _Asked(NamedTuple):
     over_time: bool
     deviance: float
     """of the whitened residual: twice its negative log-likelihood but for a constant"""
+    odd: int | None
+    """the flight that it is of, where it is an answer that only one gives"""
+    flights: tuple[int, ...]
+    """that were looked at"""
 
 
 def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked:
@@ -306,88 +331,47 @@ def _blocks(at: Solution) -> list[np.ndarray]:
 def _of_output(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> _Asked | None:
-    """The strongest answer of an output: linear, by amplitude or over time; None where nothing can
-    be asked."""
-    moving = _moving(at)
+    """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
+    where nothing can be asked."""
+    moving = moving_inputs(at)
     flights = [i for i in _longest(at) if _usable(at, e, i, name)]
     # The bank's filters are of samples: those of one clock go together.
     flights = [i for i in flights if _every(at, i, name) == _every(at, flights[0], name)]
-    changing, each = _changing(at, J, name, flights), []
+    over_time, each = changing(at, J, name, flights), []
     for i in flights:
         own = _own(at, i, name)
         assert own is not None  # or the flight were not usable
-        drives = _drives(at, e, i, name, moving)
-        if own.every > 1:
-            drives = np.stack([own.of_input(v) for v in drives.T], axis=1)
-        else:
-            drives = drives[own.rows]
-        drives = np.concatenate([drives, changing[i][own.rows]], axis=1)
+        X = drives(at, e, i, name, moving)
+        X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
+        X = np.concatenate([X, over_time[i][own.rows]], axis=1)
         left = np.asarray(e.raw[i][name])[own.rows]
-        each.append(lines_of(left, J[i, name][own.rows], drives, own.holes))
-    lines = [one for one in each if one is not None]
-    if not lines or not moving:
+        each.append(lines_of(left, J[i, name][own.rows], X, own.holes))
+    those = [(i, one) for i, one in zip(flights, each, strict=True) if one is not None]
+    if not those or not moving:
         return None
+    lines, k = [one for _, one in those], len(at.layout.of_interest)
     m, columns = len(moving), lines[0].drives.shape[1]
-    constant = columns - changing[flights[0]].shape[1]
+    constant = columns - over_time[flights[0]].shape[1]
     linear = strongest(lines, range(m), NARROW)
     # Of three answers the best one, of equal ones the first: chance is asked of no other.
     curved = strongest(
         lines, range(m, constant), BROAD, beside=range(m), plain=True, least=linear.statistic
     )
     most = max(linear.statistic, curved.statistic)
-    changed = strongest(lines, range(constant, columns), (), plain=True, least=most)
+    changes = list(range(constant, columns))
+    if len(lines) > 1:
+        lines = of_single_flights(lines, k)
+        # First: what differs from flight to flight is a change halfway as well.
+        changes = [*range(columns, lines[0].drives.shape[1]), *changes]
+    changed = strongest(lines, changes, (), plain=True, least=most)
     # Two numbers a line, each of the variance size**2.
     deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
     # Each takes up a part of the others.
     best = max((linear, curved, changed), key=lambda s: s.statistic)
-    return _Asked(best, best is curved, best is changed, float(deviance))
-
-
-def _changing(
-    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: list[int]
-) -> dict[int, np.ndarray]:
-    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
-    one over the flights in their order, and one halfway."""
-    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
-    t = np.linspace(-1.0, 1.0, sum(sizes))
-    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
-    return {
-        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
-        for i, s in each
-    }
-
-
-def _moving(at: Solution) -> list[str]:
-    """The inputs that move in some flight."""
-    flights = [naming.asdict(f.inputs) for f in at.data.flights]
-    return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
-
-
-def _drives(at: Solution, e: Evaluation, i: int, name: str, moving: list[str]) -> np.ndarray:
-    """The inputs that move, then what is not linear of these, of the output and of its rate, and
-    what a linkage with play keeps of the inputs."""
-    inputs = naming.asdict(at.data.flights[i].inputs)
-    u = [_normal(np.asarray(inputs[n])) for n in moving]
-    y = np.asarray(e.simulated[i][name])
-    shapes = [*u, _normal(y), _normal(np.gradient(y))]
-    curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
-    # What play takes off hangs on where the stick came from, not on where it is: no power does.
-    return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
-
-
-def _behind_play(v: np.ndarray) -> np.ndarray:
-    """Where a signal (N,) takes what follows it with play."""
-    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, np.empty(v.size)
-    for k, x in enumerate(v.tolist()):
-        at = min(max(at, x - half), x + half)
-        out[k] = at
-    return out
-
-
-def _normal(v: np.ndarray) -> np.ndarray:
-    v = v - v.mean()
-    size = float(np.std(v))
-    return v / size if size > 0 else v
+    odd = those[(best.drive - columns) // k][0] if best.drive >= columns else None
+    by_amplitude, over = best is curved, best is changed and odd is None
+    asked = tuple(i for i, _ in those)
+    return _Asked(best, by_amplitude, over, float(deviance), odd, asked)
 
 
 def _said(
@@ -396,23 +380,32 @@ def _said(
     name: str,
     one: _Asked,
     sds: Mapping[str, float | None],
+    flights: Sequence[str],
 ) -> Unmodelled:
-    strong, by_amplitude, over_time, _ = one
-    moving, moved = _moving(at), {}
+    strong = one.strong
+    moving, moved = moving_inputs(at), {}
     for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
         sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
     first = next(i for i in _longest(at) if _usable(at, e, i, name))
     dt = float(at.data.flights[first].dt) * _every(at, first, name)
+    odd = ""
+    if one.odd is not None:
+        called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
+        # Of two nobody knows which one is odd.
+        two = len(called) == 2
+        odd = " and ".join(called) if two else called[one.flights.index(one.odd)]
+        odd += "" if two else " and the others"
     return Unmodelled(
         name,
         moving[strong.drive] if strong.drive < len(moving) else "",
-        by_amplitude,
+        one.by_amplitude,
         strong.frequency / dt,
         strong.damping,
         strong.p_value,
         strong.statistic,
         moved,
-        over_time,
+        one.over_time,
+        odd,
     )
