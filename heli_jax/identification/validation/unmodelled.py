@@ -18,17 +18,22 @@ import numpy as np
 
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
-from heli_jax.identification.estimation.measured_signals import signals
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.own_samples import OwnSamples, own_samples
+from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.residual_drives import (
     changing,
     drives,
     moving_inputs,
     of_single_flights,
+)
+from heli_jax.identification.validation.residual_slopes import (
+    every_of,
+    longest,
+    own_of,
+    sensitivities,
+    usable,
 )
 from heli_jax.identification.validation.score_test import (
     BROAD,
@@ -44,14 +49,6 @@ strong gusts: what whitens them is then too short to leave nothing"""
 _MATTERS = 0.5
 """standard deviations of an estimate by which a significant misfit has to move it to count: with
 less a 95 % interval still holds the truth in 92 of 100 cases"""
-_FLIGHTS = 6
-"""that are looked at, the longest"""
-_DIVERGED = -10.0
-"""VAF of a simulation below which its residual says nothing"""
-_ROUNDING = 1e-5
-"""part of an output's sd below which its residual is no noise"""
-_STEP = 1e-4
-"""of an unknown's coordinate, for differences"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _ENOUGH = 1.0
@@ -162,12 +159,12 @@ def unmodelled(
     layout = at.layout
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return ()
-    looked_at = _longest(at)
-    names = sorted({n for i in looked_at for n in layout.outputs[i] if _usable(at, e, i, n)})
+    looked_at = longest(at)
+    names = sorted({n for i in looked_at for n in layout.outputs[i] if usable(at, e, i, n)})
     if not names:
         return ()
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
-    found, J = [], _sensitivities(at, e)
+    found, J = [], sensitivities(at, e)
     for name in names:
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
@@ -203,8 +200,8 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
         there = at._replace(z=at.z + part * jnp.asarray(asked.strong.step, at.z.dtype))
         e = evaluate(*there)
         again = None
-        if any(_usable(there, e, i, name) for i in _longest(at)):
-            again = _of_output(there, e, name, _sensitivities(there, e))
+        if any(usable(there, e, i, name) for i in longest(at)):
+            again = _of_output(there, e, name, sensitivities(there, e))
         if again is None or not again.deviance < asked.deviance:
             part *= 0.25
             continue
@@ -252,94 +249,18 @@ def with_unmodelled(
     return adequacy._replace(limited="; ".join(words))
 
 
-def _longest(at: Solution) -> list[int]:
-    """The flights that are looked at, of one sample time: the bank's filters are of samples."""
-    flights = at.data.flights
-    sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
-    order = np.argsort(sizes, kind="stable")[::-1].tolist()
-    dt = float(flights[order[0]].dt)
-    return sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS])
-
-
-def _usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
-    if name not in at.layout.outputs[i]:
-        return False
-    own = _own(at, i, name)
-    if own is None:
-        return False
-    y = np.asarray(at.data.flights[i].outputs[name])[own.rows]
-    left = np.asarray(e.raw[i][name])[own.rows]
-    if not (np.isfinite(left).all() and np.std(y) > 0):
-        return False
-    with np.errstate(over="ignore"):
-        size = float(np.std(left) / np.std(y))
-    return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
-
-
-def _own(at: Solution, i: int, name: str) -> OwnSamples | None:
-    """Where a flight's output was sampled."""
-    return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
-
-
-def _every(at: Solution, i: int, name: str) -> int:
-    own = _own(at, i, name)
-    return own.every if own is not None else 0
-
-
-def _sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
-    """By flight and output (N, q) the derivative of the residual by all unknowns."""
-    layout, data, noise, z = at
-    if layout.estimator is OUTPUT_ERROR:
-        rows, J = {}, np.asarray(e.J)
-        first = 0
-        for i, n in signals(layout):
-            count = data.flights[i].outputs[n].shape[0]
-            rows[i, n] = J[first : first + count] * float(noise.sd[i][n])
-            first += count
-        return rows
-    # By differences of the simulation, whose program is there: a Jacobian would compile another.
-    z = np.asarray(z)
-    blocks = _blocks(at)
-    common = [np.array([k]) for k in range(layout.first_nuisance)]
-    longest = max((b.size for b in blocks), default=0)
-    # Each flight's own unknowns move at once: none is felt by another flight.
-    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(longest)]
-    before = simulated_outputs(layout, data, jnp.asarray(z))
-    slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
-    step = _STEP if z.dtype == np.float64 else np.sqrt(_STEP)
-    for columns in (*common, *own):
-        there = z.copy()
-        there[columns] += step
-        after = simulated_outputs(layout, data, jnp.asarray(there))
-        for i, n in signals(layout):
-            for k in columns:
-                if k < layout.first_nuisance or k in blocks[i]:
-                    slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
-    return slopes
-
-
-def _blocks(at: Solution) -> list[np.ndarray]:
-    """By flight where in z its own unknowns stand."""
-    layout, first, out = at.layout, at.layout.first_nuisance, []
-    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        size = count * len(layout.states) + layout.constants(outputs)
-        out.append(np.arange(first, first + size))
-        first += size
-    return out
-
-
 def _of_output(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> _Asked | None:
     """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
     where nothing can be asked."""
     moving = moving_inputs(at)
-    flights = [i for i in _longest(at) if _usable(at, e, i, name)]
+    flights = [i for i in longest(at) if usable(at, e, i, name)]
     # The bank's filters are of samples: those of one clock go together.
-    flights = [i for i in flights if _every(at, i, name) == _every(at, flights[0], name)]
+    flights = [i for i in flights if every_of(at, i, name) == every_of(at, flights[0], name)]
     over_time, each = changing(at, J, name, flights), []
     for i in flights:
-        own = _own(at, i, name)
+        own = own_of(at, i, name)
         assert own is not None  # or the flight were not usable
         X = drives(at, e, i, name, moving)
         X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
@@ -388,8 +309,8 @@ def _said(
         sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
-    first = next(i for i in _longest(at) if _usable(at, e, i, name))
-    dt = float(at.data.flights[first].dt) * _every(at, first, name)
+    first = next(i for i in longest(at) if usable(at, e, i, name))
+    dt = float(at.data.flights[first].dt) * every_of(at, first, name)
     odd = ""
     if one.odd is not None:
         called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
