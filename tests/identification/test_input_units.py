@@ -9,7 +9,11 @@ from heli_jax.flights.flight import Source
 from heli_jax.identification.validation.input_units import wrong_units
 
 N, DT, FULL = 500, 0.02, 0.5
-LAG = ([0.2], [1.0, -0.9])
+
+
+def lagged(u):
+    """A first-order answer to (N,) samples."""
+    return np.asarray(scipy.signal.lfilter([0.2], [1.0, -0.9], u))
 
 
 def doubts(unit, si, per_full, off=1.5, stick="lat"):
@@ -17,10 +21,10 @@ def doubts(unit, si, per_full, off=1.5, stick="lat"):
     an effect that is `off` times too large at the start values."""
     rng = np.random.default_rng(1)
     moved = np.repeat(rng.uniform(-1.0, 1.0, N // 25), 25)
-    p = scipy.signal.lfilter(*LAG, FULL * moved) + 0.002 * rng.standard_normal(N)
+    p = lagged(FULL * moved) + 0.002 * rng.standard_normal(N)
     signal = Signal("ail", unit, si)
     read = signal.to_si(per_full * moved)
-    start = off * scipy.signal.lfilter(*LAG, read)
+    start = off * lagged(read)
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": read}, outputs={"p": p}, source=source)
     return [f.sentence for f in wrong_units([("one", flight)], [{"p": start}], {"p": stick})]
@@ -56,7 +60,7 @@ def test_a_stick_in_its_own_unit_is_not_however_rough_the_start_values(unit, si,
 def test_counts_that_a_model_is_made_for_are_no_per_cent():
     signal = Signal("ail", "1", "1")
     u = np.repeat(np.random.default_rng(2).uniform(-50.0, 50.0, N // 25), 25)
-    p = scipy.signal.lfilter(*LAG, u)
+    p = lagged(u)
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p}, source=source)
     for off in (0.2, 1.0, 5.0):
