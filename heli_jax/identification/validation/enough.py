@@ -38,6 +38,7 @@ from heli_jax.identification.validation.signal_signs import (
     sticks_of,
 )
 from heli_jax.identification.validation.smoothed import smoothed
+from heli_jax.identification.validation.turned_sensors import turned_sensors
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -73,6 +74,7 @@ def is_it_enough(
         *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
         *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
+        *turned_sensors(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated, sticks_of(problem.model)),
         *wrong_units(flights, e.simulated, sticks_of(problem.model)),
