@@ -173,7 +173,13 @@ def _fit_run(
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
     with stage("beside another method", name="second method"):
-        fitted = with_second_method(problem, fitted, max_steps=options.max_steps, progress=progress)
+        fitted = with_second_method(
+            problem,
+            fitted,
+            undisturbed=lambda: configuration.by_method(config, problem, "frequency-error"),
+            max_steps=options.max_steps,
+            progress=progress,
+        )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     if out is not None and _long_intervals(config):

@@ -2,7 +2,13 @@
 
 from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import first_signals, read_flights, signals
-from heli_jax.config.problems import by_other_methods, candidate_models, disturbed, problem
+from heli_jax.config.problems import (
+    by_method,
+    by_other_methods,
+    candidate_models,
+    disturbed,
+    problem,
+)
 from heli_jax.config.schema import Config
 from heli_jax.config.simulate_section import SimulateConfig, StickConfig
 
@@ -11,6 +17,7 @@ __all__ = [
     "Experiment",
     "SimulateConfig",
     "StickConfig",
+    "by_method",
     "by_other_methods",
     "candidate_models",
     "disturbed",

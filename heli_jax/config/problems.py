@@ -111,13 +111,23 @@ def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Probl
     problems: dict[str, Problem | str] = {}
     for method in experiment.config.fit.also:
         try:
-            problems[method] = _by_method(experiment, fitted, method)
+            problems[method] = by_method(experiment, fitted, method)
         except ValueError as e:
             problems[method] = str(e)
     return problems
 
 
-def _by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
+def by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
+    """The same problem for another method.
+
+    Args:
+        experiment: the configuration.
+        fitted: the problem by its own method.
+        method: the other one.
+
+    Raises:
+        ValueError: the method refuses it.
+    """
     config = experiment.config
     assert config.fit is not None
     model, params, fixed = experiment.model, experiment.vehicle.params, ()

@@ -245,7 +245,8 @@ def assemble(
     elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
         sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
-        lacking = unmodelled(solution, e, sds, coloured=in_colour)
+        flights = labels(problem.training)
+        lacking = unmodelled(solution, e, sds, coloured=in_colour, flights=flights)
         adequacy = with_unmodelled(adequacy, lacking, unasked(solution))
         named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
         late = late_stick(problem, solution, e, named)

@@ -56,6 +56,7 @@ from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.expected_accuracy import guessed_gusts
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.input_units import wrong_units
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
@@ -278,20 +279,22 @@ def fit(
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
-        return _with_turned_sticks(problem, guess, assemble(problem, search, optimum, run))
+        return _with_doubtful_inputs(problem, guess, assemble(problem, search, optimum, run))
 
 
-def _with_turned_sticks(problem: Problem, guess: FirstGuess, found: Fit) -> Fit:
-    """With what moved the wrong way at the start values, first of all notes, where the model did
-    not follow from there."""
-    if found.adequacy.adequate:
+def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, found: Fit) -> Fit:
+    """With what moved too far or not far enough at the start values, and where the model did not
+    follow from there what moved the wrong way, first of all notes."""
+    # Of an angle that is in other units than its rate that is said already, and is surer.
+    if contradictions(problem):
         return found
     flights = list(zip(labels(problem.training), problem.training, strict=True))
-    turned = against_start(flights, guess.e.simulated, sticks_of(problem.model))
-    # Of an angle that runs against its rate that is said already, and is surer.
-    if not turned or contradictions(problem):
-        return found
-    return dataclasses.replace(found, notes=(*(f.sentence for f in turned), *found.notes))
+    at_start = (flights, guess.e.simulated, sticks_of(problem.model))
+    # A fit follows numbers in any unit, and does not tell.
+    doubts = wrong_units(*at_start)
+    if not found.adequacy.adequate:
+        doubts += against_start(*at_start)
+    return dataclasses.replace(found, notes=(*(f.sentence for f in doubts), *found.notes))
 
 
 def _search(

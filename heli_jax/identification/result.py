@@ -177,8 +177,9 @@ class Fit:
     """in time without process noise: whether inputs follow the response and the residuals are not
     white, so that a disturbance comes back through the inputs"""
     second_method: SecondMethod | None = None
-    """output error with coloured residuals: where a method that weighs by the noise's spectrum
-    differs; None where that was not asked"""
+    """where a method that weighs by the noise's spectrum differs from output error with coloured
+    residuals, or from filter error whose values the inputs do not ask for; None where that was not
+    asked"""
     late_stick: LateStick | None = None
     """by how much inputs look later than they acted, where that is clear and matters"""
     seed: int = 0
@@ -207,8 +208,8 @@ class Fit:
 
     @property
     def not_borne_out(self) -> tuple[str, ...]:
-        """Output error with coloured residuals: the parameters whose estimates a method that weighs
-        by the noise's spectrum excludes, or does not determine."""
+        """The parameters whose estimates a method that weighs by the noise's spectrum excludes, or,
+        of output error with coloured residuals, does not determine."""
         return tuple(self.second_method.estimates) if self.second_method is not None else ()
 
     @property
@@ -221,7 +222,8 @@ class Fit:
             why = "the inputs follow the response, and the residuals are not white"
         elif self.second_method is not None and self.second_method.estimates:
             names = ", ".join(self.not_borne_out)
-            why = f"{self.second_method.label}, which allows for gusts, does not bear {names} out"
+            knows = "any gusts" if self.method == "filter-error" else "gusts"
+            why = f"{self.second_method.label}, which allows for {knows}, does not bear {names} out"
         return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
 
     @property

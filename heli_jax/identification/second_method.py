@@ -1,4 +1,4 @@
-"""Output error whose residuals are coloured, beside a method that weighs by the noise's spectrum.
+"""A fit of a disturbed record, beside a method that weighs by the noise's spectrum.
 
 In gusts output error is consistent and poorly weighed: it explains slow drift by slow modes, and
 intervals that allow for the residuals' colour do so for the optimum that was found, which such
@@ -6,6 +6,9 @@ drift may have made. Frequency error, with the noise's spectrum estimated, has n
 efficient estimate and an inefficient one of the same parameter differ by less than the inefficient
 one's own interval where both are consistent: their difference has the variance of the one less that
 of the other (Hausman, 1978). So where they lie further apart the intervals do not hold.
+
+Filter error is the efficient one where the disturbance acts as its model says. Where it does not,
+frequency error, which takes its spectrum from the record, stays consistent.
 
 Source: J. A. Hausman, Specification tests in econometrics, Econometrica 46 (1978).
 """
@@ -17,53 +20,77 @@ from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, SecondMethod
+from heli_jax.identification.validation.borne_out import by_the_inputs
 
 _METHOD = "frequency-error"
 _WELL_EXPLAINED = 0.95
 """VAF of every output from which on a disturbance is too small to make an optimum of its own"""
 _APART = 3.3
-"""output error's standard deviations that chance takes an estimate from the other in one of 1000"""
+"""standard deviations that chance takes two estimates apart in one of 1000: of output error, and of
+the consistent estimate beside filter error"""
+_NORMAL = 1.96
+"""standard deviations to the end of a 95 % interval"""
+_OF_OUTPUT_ERROR = (
+    "That is not within what output error's intervals allow: it takes slow drift for slow modes, "
+    "and what the model lacks for parameters. Fit with method: frequency-error, or filter-error "
+    "with a disturbance."
+)
+_OF_FILTER = (
+    "That excludes filter error's values, which the answer to the inputs does not ask for either: "
+    "the disturbance acts elsewhere than is stated, or has another spectrum, and the parameters "
+    "make up for it. Fit with method: frequency-error, or another disturbance (on, poles; "
+    "fit.compare: true lays them side by side)."
+)
 
 
 def with_second_method(
     problem: Problem,
     found: Fit,
     *,
+    undisturbed: Callable[[], Problem] | None = None,
     max_steps: int = 200,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """The fit, with the parameters on which frequency error does not bear it out.
 
-    Asked of output error alone, where disturbances colour its residuals and take a good part of an
-    output, of linear models whose inputs do not follow the response.
+    Asked of linear models whose inputs do not follow the response: of output error where
+    disturbances colour its residuals and take a good part of an output, of filter error where the
+    answer to the inputs, by itself, asks for other values.
 
     Args:
         problem: what was fitted.
         found: the fit.
+        undisturbed: of filter error, makes the problem by the other method, without a disturbance.
         max_steps: of the other method's optimiser.
         progress: called with a line of text before the work.
     """
-    if not _is_asked(problem, found):
+    filtered = problem.method == "filter-error"
+    asked = undisturbed is not None and _of_filter(problem, found) if filtered else None
+    if not (_is_asked(problem, found) if asked is None else asked):
         return found
     if progress is not None:
-        progress(f"the residuals are coloured: the same by {METHODS[_METHOD].label}")
+        why = "the inputs ask for other values" if filtered else "the residuals are coloured"
+        progress(f"{why}: the same by {METHODS[_METHOD].label}")
     try:
-        other = fit(
-            dataclasses.replace(problem, method=_METHOD, window=None, continuity=None),
-            max_steps=max_steps,
-        )
+        if undisturbed is not None and filtered:
+            other = undisturbed()
+        else:
+            other = dataclasses.replace(problem, method=_METHOD, window=None, continuity=None)
+        other = fit(other, max_steps=max_steps)
     except ValueError:
         # It takes fewer problems than output error does; nothing is said then.
         return found
     if other.status == "not-converged" or other.untrusted:
         return found
+    apart = _excluded if filtered else _apart
     estimates = {
         n: _interval(other.estimates[n])
         for n, a in found.estimates.items()
-        if _apart(a, other.estimates[n])
+        if apart(a, other.estimates[n])
     }
     second = SecondMethod(METHODS[_METHOD].label, estimates)
-    notes = (*found.notes, sentence(second)) if estimates else found.notes
+    said = sentence(second, _OF_FILTER if filtered else _OF_OUTPUT_ERROR) if estimates else ""
+    notes = (*found.notes, said) if said else found.notes
     return dataclasses.replace(found, second_method=second, notes=notes)
 
 
@@ -75,6 +102,15 @@ def _is_asked(problem: Problem, found: Fit) -> bool:
         return False
     vafs = [m.vaf for m in found.metrics.values()]
     return bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
+
+
+def _of_filter(problem: Problem, found: Fit) -> bool:
+    """Whether filter error's estimates are others than the inputs ask for."""
+    if found.status == "not-converged" or found.untrusted or not problem.model.linear:
+        return False
+    if found.adequacy.by_chance or found.adequacy.ahead or any(f.present for f in found.feedback):
+        return False
+    return not by_the_inputs(found.reached)
 
 
 def _interval(b: Estimate) -> tuple[float, float, float] | None:
@@ -96,19 +132,27 @@ def _apart(a: Estimate, b: Estimate) -> bool:
     return abs(value - a.value) > _APART * a.sd and not low <= a.value <= high
 
 
-def sentence(second: SecondMethod) -> str:
+def _excluded(a: Estimate, b: Estimate) -> bool:
+    """Whether filter error's estimate is one that the other's own error excludes."""
+    interval = _interval(b)
+    # What it does not determine itself it has nothing against.
+    if not a.sd or interval is None:
+        return False
+    value, low, high = interval
+    return abs(a.value - value) > _APART / _NORMAL * (
+        value - low if a.value < value else high - value
+    )
+
+
+def sentence(second: SecondMethod, why: str = _OF_OUTPUT_ERROR) -> str:
     """For the notes of a fit.
 
     Args:
         second: with a parameter at least that it does not bear out.
+        why: what that tells, and the remedy.
     """
     each = ", ".join(
         f"{n} not determined" if v is None else f"{n} {v[0]:.3g} (95 % {v[1]:.3g} to {v[2]:.3g})"
         for n, v in second.estimates.items()
     )
-    return (
-        f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. That is "
-        "not within what output error's intervals allow: it takes slow drift for slow modes, and "
-        "what the model lacks for parameters. Fit with method: frequency-error, or filter-error "
-        "with a disturbance."
-    )
+    return f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. {why}"

@@ -1,13 +1,17 @@
-"""Output error in gusts beside a method that weighs by their spectrum; records by SciPy alone."""
+"""Fits in gusts beside a method that weighs by their spectrum; records by SciPy alone."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
+import scipy.stats
 
 from heli_jax import Flight, Free, Problem, fit, linear_model
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.second_method import with_second_method
+from heli_jax.identification.validation.score_test import lines_of, pulled_away
 
 TRUTH = {"Nr": -2.92, "Nped": 20.8, "Kr": 1.376, "Krfb": -5.625}
 YAW = """
@@ -79,6 +83,89 @@ def test_estimates_that_gusts_have_made_are_not_to_be_trusted(tmp_path):
     assert beside.untrusted == tuple(TRUTH)
     assert "does not bear" in beside.distrust
     assert any("frequency-error, or filter-error" in note for note in beside.notes)
+
+
+ROTOR = {"tau_f": 0.09, "Lb": 95.0, "Blat": 0.12}
+ROLL = """
+name: rotor-roll
+states: {p: rad/s, b: rad}
+inputs: {lat: "1"}
+outputs: {p: rad/s}
+parameters:
+  tau_f: {value: 0.09, unit: s, positive: true}
+  Lb: {value: 95, unit: 1/s^2}
+  Blat: {value: 0.12, unit: rad}
+A: {p: {b: Lb}, b: {p: -1, b: -1/tau_f}}
+B: {b: {lat: Blat/tau_f}}
+"""
+
+
+def _turned_by_gusts(seed: int) -> Flight:
+    """A minute of doublets; gusts as strong as the answer turn the machine."""
+    rng, n = np.random.default_rng(seed), 3000
+    lat, k = np.zeros(n), 25
+    while k < n:
+        half = int(rng.uniform(10, 50))
+        lat[k : k + half], lat[k + half : k + 2 * half] = 0.5, -0.5
+        k += 3 * half
+    A = np.array([[0.0, ROTOR["Lb"]], [-1.0, -1.0 / ROTOR["tau_f"]]])
+    B = np.array([[0.0], [ROTOR["Blat"] / ROTOR["tau_f"]]])
+    system = (A, B, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    answer = scipy.signal.lsim(system, lat, np.arange(n) * DT, interp=False)[1]
+    # In ten steps a sample, so that the gust is as good as continuous.
+    forget = np.exp(-0.1 * DT / 0.7)
+    drive = np.sqrt(1.0 - forget**2) * rng.standard_normal(10 * n)
+    gust = scipy.signal.lfilter([1.0], [1.0, -forget], drive)
+    pushed = (A, np.array([[1.0], [0.0]]), system[2], system[3])
+    by_gusts = scipy.signal.lsim(pushed, gust, np.arange(10 * n) * 0.1 * DT)[1][::10]
+    by_gusts *= 1.5 * np.std(answer) / np.std(by_gusts)
+    p = answer + by_gusts + 0.03 * np.std(answer) * rng.standard_normal(n)
+    return Flight(dt=DT, inputs={"lat": lat}, outputs={"p": p}, hold={"lat": "zero-order"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("pushed", "borne_out"), [("p", True), ("b", False)])
+def test_a_disturbance_in_the_wrong_place_is_told_by_the_inputs(tmp_path, pushed, borne_out):
+    # Taken for a push on the rotor they go through another lag, which the parameters make up for.
+    (tmp_path / "roll.yaml").write_text(ROLL)
+    roll = linear_model(tmp_path / "roll.yaml")
+    free = {n: Free(1.2 * v) for n, v in ROTOR.items()}
+    plain = Problem(
+        roll.model, roll.vehicle({}).params, [_turned_by_gusts(1)], free, method="frequency-error"
+    )
+    model = with_disturbance(plain.model, (pushed,))
+    params = model.Params(**plain.vehicle._asdict())
+    problem = Problem(model, params, plain.flights, free, method="filter-error")
+    found = fit(problem)
+    z = {n: (e.value - ROTOR[n]) / (e.sd or np.inf) for n, e in found.estimates.items()}
+    assert (max(abs(v) for v in z.values()) < 4.0) == borne_out
+    beside = with_second_method(problem, found, undisturbed=lambda: plain)
+    if borne_out:
+        assert beside is found
+    else:
+        assert "tau_f" in beside.not_borne_out
+        assert "allows for any gusts" in beside.distrust
+        assert any("the disturbance acts elsewhere" in note for note in beside.notes)
+
+
+def test_what_the_inputs_ask_for_is_told_in_any_colour():
+    rng, n = np.random.default_rng(7), 2000
+    answers = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal((n, 3)), axis=0)
+    chances = []
+    for _ in range(60):
+        noise = scipy.signal.lfilter([1.0], [1.0, -1.9, 0.95], rng.standard_normal(n))
+        lines = lines_of(noise, answers, np.zeros((n, 0)))
+        assert lines is not None
+        chances.append(pulled_away([lines], 2))
+    # Uniform where the values are those that the inputs ask for.
+    assert scipy.stats.kstest(chances, "uniform").pvalue > 0.01
+    off = lines_of(noise + 2.0 * answers[:, 0], answers, np.zeros((n, 0)))
+    aside = lines_of(noise + 2.0 * answers[:, 2], answers, np.zeros((n, 0)))
+    assert off is not None
+    assert aside is not None
+    assert pulled_away([off], 2) < 1e-4
+    # What the nuisances take up is no doubt of the parameters.
+    assert pulled_away([aside], 2) > 1e-3
 
 
 def test_what_goes_along_with_an_open_parameter_has_the_interval_of_both(tmp_path):

@@ -81,6 +81,15 @@ def saturated(u):
     return found.y[0]
 
 
+def through_play(u):
+    """p of a first-order machine behind a linkage whose play is an eighth of the stick's range."""
+    at, v = 0.0, np.zeros(N)
+    for k, x in enumerate(u):
+        at = min(max(at, x - 0.0125), x + 0.0125)
+        v[k] = at
+    return linear(np.array([[-4.0]]), np.array([[20.0]]), v)
+
+
 def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0, seen=slice(None)):
     rng = np.random.default_rng(seed)
     u = steps(rng)
@@ -125,6 +134,23 @@ def test_a_saturation_that_is_left_out_is_named(method):
     found = fitted(saturated, method, noise=0.02)
     assert "the response of p depends on amplitude" in found.adequacy.summary
     assert any("a saturation, a rate limit, a deadband" in note for note in found.notes)
+
+
+def test_play_of_a_linkage_is_no_plain_yes():
+    # Powers of stick and response do not see it: the residual is whatever the stick came from.
+    found = fitted(through_play, "output-error", noise=0.02)
+    assert "the response of p depends on amplitude" in found.adequacy.summary
+
+
+def test_a_flight_with_a_stick_of_another_scale_is_named():
+    rng, flights = np.random.default_rng(5), []
+    for name, scale in (("one", 1.0), ("two", 1.1), ("three", 1.0)):
+        u = steps(rng)
+        p = linear(np.array([[-4.0]]), np.array([[20.0]]), u) + 0.02 * rng.standard_normal(N)
+        flights.append(Flight(dt=DT, inputs={"lat": scale * u}, outputs={"p": p}, name=name))
+    free = {"Lp": Free(-3.0), "Ll": Free(15.0)}
+    found = fit(Problem(roll, Params(-3.0, 15.0), flights, free))
+    assert "the response of p differs between two and the others" in found.adequacy.summary
 
 
 @pytest.mark.parametrize("method", METHODS)

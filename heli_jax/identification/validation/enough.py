@@ -19,6 +19,7 @@ from heli_jax.identification.validation.feedback import (
     why_untested,
 )
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.input_units import wrong_units
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -37,6 +38,7 @@ from heli_jax.identification.validation.signal_signs import (
     sticks_of,
 )
 from heli_jax.identification.validation.smoothed import smoothed
+from heli_jax.identification.validation.turned_sensors import turned_sensors
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -72,8 +74,10 @@ def is_it_enough(
         *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
         *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
+        *turned_sensors(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated, sticks_of(problem.model)),
+        *wrong_units(flights, e.simulated, sticks_of(problem.model)),
         *late_inputs(flights, feedback),
     ]
     if compare:

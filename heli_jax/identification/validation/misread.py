@@ -27,6 +27,7 @@ from heli_jax.identification.validation.signal_quality import (
     facts_of,
 )
 from heli_jax.identification.validation.signal_signs import contradictions, rate_against_angle
+from heli_jax.identification.validation.turned_sensors import turned_sensors
 from heli_jax.vehicle import of_helicopter
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
@@ -91,6 +92,7 @@ def record_doubts(problem: Problem) -> RecordDoubts:
         [
             *(one.finding for one in found),
             *rate_against_angle(problem),
+            *turned_sensors(problem),
             *(one.finding for one in odd),
         ],
         [*words, *contradictions(problem), *(one.words for one in odd)],

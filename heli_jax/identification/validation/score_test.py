@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 from jaxtyping import Complex, Float
 
 from heli_jax.identification.validation.missing_dynamics import ORDER, across, whitening
@@ -170,6 +171,34 @@ def strongest(
     G = asked.filters[k // len(drives), :, None]
     columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
     return Strongest(gain, chance, drive, *one, *_steps(_real(J), columns, _real(e[:, None])))
+
+
+def pulled_away(records: Sequence[Lines], k: int) -> float:
+    """The probability that chance makes the residual follow the sensitivities of the parameters as
+    it does. At estimates that the answer to the inputs bears out it does so by chance alone.
+
+    Args:
+        records: those of one output; of their drives nothing is asked.
+        k: how many of the unknowns, the first, are parameters.
+    """
+    most = _LINES // len(records)
+    e = np.concatenate([record.e[:most] for record in records])
+    J = np.concatenate([record.J[:most] for record in records])
+    nuisances = _span(_real(J[:, k:])) if J.shape[1] > k else np.zeros((2 * e.size, 0))
+    whole = _real(J[:, :k])
+    own = _without(nuisances, whole)
+    told = np.linalg.norm(own, axis=0) > _SAME * np.linalg.norm(whole, axis=0)
+    if not told.any():
+        return 1.0
+    basis, white = _span(own[:, told]), _without(nuisances, _real(e[:, None]))
+    turns = 2.0 * np.pi * np.random.default_rng(0).random((e.size, _SURROGATES))
+    anew = _without(nuisances, _real(_complex(white) * np.exp(1j * turns)))
+    anew *= np.linalg.norm(white) / np.linalg.norm(anew, axis=0)
+    gain, by_chance = (float(np.mean(np.sum((basis.T @ v) ** 2, axis=0))) for v in (white, anew))
+    if not by_chance > 0:
+        return 1.0
+    rank = basis.shape[1]
+    return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
 
 
 class _Asked(NamedTuple):

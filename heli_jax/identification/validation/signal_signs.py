@@ -198,18 +198,23 @@ def angle_and_integral(
         rate: [rad/s], likewise.
         dt: [s].
     """
-    filled = [_filled(v, dt) for v in (angle, rate)]
+    whole = [filled(v, dt) for v in (angle, rate)]
     steps = max(1, round(WITHIN / dt))
-    if filled[0] is None or filled[1] is None or angle.size < (PARTS + 1) * steps:
+    if whole[0] is None or whole[1] is None or angle.size < (PARTS + 1) * steps:
         return None
     # Headings jump by a turn where they pass south.
-    turned = np.unwrap(filled[0])
-    halves = 0.5 * dt * (filled[1][1:] + filled[1][:-1])
+    turned = np.unwrap(whole[0])
+    halves = 0.5 * dt * (whole[1][1:] + whole[1][:-1])
     return turned, np.concatenate([np.zeros(1), np.cumsum(halves)])
 
 
-def _filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
-    """A signal (N,) with straight lines over its short gaps; None where one is long."""
+def filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
+    """A signal with straight lines over its short gaps; None where one is long.
+
+    Args:
+        signal: (N,), NaN where missing.
+        dt: [s].
+    """
     seen = np.flatnonzero(np.isfinite(signal))
     if seen.size < 2 or np.max(np.diff(np.r_[0, seen, signal.size - 1])) * dt > _GAP:
         return None

@@ -6,24 +6,35 @@ what the sensitivities explain (`score_test`): the simulation and its residual a
 method. Then against cubes and signed squares of inputs, of the simulated output and of its rate,
 beyond what the input through the same filter explains: a saturation, a rate limit and a deadband
 answer large and small inputs differently, and no linear model does. Then against the sensitivities
-times the time: a rotor that slows down and a mass that changes leave what no constant takes up.
+times the time, and of single flights: a rotor that slows down, a mass that changes and a stick
+of another scale leave what no constant takes up.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
-from heli_jax.identification.estimation.measured_signals import signals
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.own_samples import OwnSamples, own_samples
+from heli_jax.identification.validation.own_samples import own_samples
+from heli_jax.identification.validation.residual_drives import (
+    changing,
+    drives,
+    moving_inputs,
+    of_single_flights,
+)
+from heli_jax.identification.validation.residual_slopes import (
+    every_of,
+    longest,
+    own_of,
+    sensitivities,
+    usable,
+)
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -38,14 +49,6 @@ strong gusts: what whitens them is then too short to leave nothing"""
 _MATTERS = 0.5
 """standard deviations of an estimate by which a significant misfit has to move it to count: with
 less a 95 % interval still holds the truth in 92 of 100 cases"""
-_FLIGHTS = 6
-"""that are looked at, the longest"""
-_DIVERGED = -10.0
-"""VAF of a simulation below which its residual says nothing"""
-_ROUNDING = 1e-5
-"""part of an output's sd below which its residual is no noise"""
-_STEP = 1e-4
-"""of an unknown's coordinate, for differences"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _ENOUGH = 1.0
@@ -70,13 +73,15 @@ class Unmodelled(NamedTuple):
     """by estimate how far it moves where that is in the model, in its standard deviations"""
     over_time: bool = False
     """whether it is an answer that changes over the record"""
+    between: str = ""
+    """the flights between which it differs"""
 
     @property
     def matters(self) -> bool:
         """Whether some estimate moves by a good part of its interval, or none has one."""
         # What depends on amplitude or time changes what an estimate means, whatever the fit makes
         # of it.
-        if self.by_amplitude or self.over_time or not self.moved:
+        if self.by_amplitude or self.over_time or self.between or not self.moved:
             return True
         return max(abs(v) for v in self.moved.values()) > _MATTERS
 
@@ -87,6 +92,8 @@ class Unmodelled(NamedTuple):
             return f"the response of {self.output} depends on amplitude"
         if self.over_time:
             return f"the response of {self.output} changes over the record"
+        if self.between:
+            return f"the response of {self.output} differs between {self.between}"
         return f"the residual of {self.output} still follows {self.input}{self._where}"
 
     @property
@@ -100,13 +107,20 @@ class Unmodelled(NamedTuple):
         if self.by_amplitude:
             said = (
                 f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
-                "rate limit, a deadband or another nonlinearity is missing."
+                "rate limit, a deadband, play or another nonlinearity is missing."
             )
         elif self.over_time:
             said = (
                 f"The response of {self.output} changes over the record ({chance}): rotor speed, "
                 "mass or speed did, or the log's clock, and the estimates are means of what they "
                 "were. Fit shorter windows, and compare (heli-jax compare)."
+            )
+        elif self.between:
+            said = (
+                f"The response of {self.output} differs between {self.between} ({chance}): mass, "
+                "rotor speed or speed does, or the scale, sign or clock of a column, and the "
+                "estimates are means. Fit the flights by themselves, and compare (heli-jax "
+                "compare)."
             )
         else:
             what = "a mode or a lag" if self.damping < 1.0 else "dynamics"
@@ -121,7 +135,12 @@ class Unmodelled(NamedTuple):
 
 
 def unmodelled(
-    at: Solution, e: Evaluation, sds: Mapping[str, float | None], *, coloured: bool = False
+    at: Solution,
+    e: Evaluation,
+    sds: Mapping[str, float | None],
+    *,
+    coloured: bool = False,
+    flights: Sequence[str] = (),
 ) -> tuple[Unmodelled, ...]:
     """What the residuals follow beyond chance, by output at most one.
 
@@ -135,21 +154,22 @@ def unmodelled(
         e: what that tells.
         sds: of the estimates of interest, as they are reported.
         coloured: whether the residuals in time are autocorrelated.
+        flights: what each is called.
     """
     layout = at.layout
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return ()
-    flights = _longest(at)
-    names = sorted({n for i in flights for n in layout.outputs[i] if _usable(at, e, i, n)})
+    looked_at = longest(at)
+    names = sorted({n for i in looked_at for n in layout.outputs[i] if usable(at, e, i, n)})
     if not names:
         return ()
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
-    found, J = [], _sensitivities(at, e)
+    found, J = [], sensitivities(at, e)
     for name in names:
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            found.append(_said(at, e, name, one, sds))
+            found.append(_said(at, e, name, one, sds, flights))
     return tuple(found)
 
 
@@ -161,6 +181,10 @@ class _Asked(NamedTuple):
     over_time: bool
     deviance: float
     """of the whitened residual: twice its negative log-likelihood but for a constant"""
+    odd: int | None
+    """the flight that it is of, where it is an answer that only one gives"""
+    flights: tuple[int, ...]
+    """that were looked at"""
 
 
 def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked:
@@ -176,8 +200,8 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
         there = at._replace(z=at.z + part * jnp.asarray(asked.strong.step, at.z.dtype))
         e = evaluate(*there)
         again = None
-        if any(_usable(there, e, i, name) for i in _longest(at)):
-            again = _of_output(there, e, name, _sensitivities(there, e))
+        if any(usable(there, e, i, name) for i in longest(at)):
+            again = _of_output(there, e, name, sensitivities(there, e))
         if again is None or not again.deviance < asked.deviance:
             part *= 0.25
             continue
@@ -225,156 +249,50 @@ def with_unmodelled(
     return adequacy._replace(limited="; ".join(words))
 
 
-def _longest(at: Solution) -> list[int]:
-    """The flights that are looked at, of one sample time: the bank's filters are of samples."""
-    flights = at.data.flights
-    sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
-    order = np.argsort(sizes, kind="stable")[::-1].tolist()
-    dt = float(flights[order[0]].dt)
-    return sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS])
-
-
-def _usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
-    if name not in at.layout.outputs[i]:
-        return False
-    own = _own(at, i, name)
-    if own is None:
-        return False
-    y = np.asarray(at.data.flights[i].outputs[name])[own.rows]
-    left = np.asarray(e.raw[i][name])[own.rows]
-    if not (np.isfinite(left).all() and np.std(y) > 0):
-        return False
-    with np.errstate(over="ignore"):
-        size = float(np.std(left) / np.std(y))
-    return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
-
-
-def _own(at: Solution, i: int, name: str) -> OwnSamples | None:
-    """Where a flight's output was sampled."""
-    return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
-
-
-def _every(at: Solution, i: int, name: str) -> int:
-    own = _own(at, i, name)
-    return own.every if own is not None else 0
-
-
-def _sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
-    """By flight and output (N, q) the derivative of the residual by all unknowns."""
-    layout, data, noise, z = at
-    if layout.estimator is OUTPUT_ERROR:
-        rows, J = {}, np.asarray(e.J)
-        first = 0
-        for i, n in signals(layout):
-            count = data.flights[i].outputs[n].shape[0]
-            rows[i, n] = J[first : first + count] * float(noise.sd[i][n])
-            first += count
-        return rows
-    # By differences of the simulation, whose program is there: a Jacobian would compile another.
-    z = np.asarray(z)
-    blocks = _blocks(at)
-    common = [np.array([k]) for k in range(layout.first_nuisance)]
-    longest = max((b.size for b in blocks), default=0)
-    # Each flight's own unknowns move at once: none is felt by another flight.
-    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(longest)]
-    before = simulated_outputs(layout, data, jnp.asarray(z))
-    slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
-    step = _STEP if z.dtype == np.float64 else np.sqrt(_STEP)
-    for columns in (*common, *own):
-        there = z.copy()
-        there[columns] += step
-        after = simulated_outputs(layout, data, jnp.asarray(there))
-        for i, n in signals(layout):
-            for k in columns:
-                if k < layout.first_nuisance or k in blocks[i]:
-                    slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
-    return slopes
-
-
-def _blocks(at: Solution) -> list[np.ndarray]:
-    """By flight where in z its own unknowns stand."""
-    layout, first, out = at.layout, at.layout.first_nuisance, []
-    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        size = count * len(layout.states) + layout.constants(outputs)
-        out.append(np.arange(first, first + size))
-        first += size
-    return out
-
-
 def _of_output(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> _Asked | None:
-    """The strongest answer of an output: linear, by amplitude or over time; None where nothing can
-    be asked."""
-    moving = _moving(at)
-    flights = [i for i in _longest(at) if _usable(at, e, i, name)]
+    """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
+    where nothing can be asked."""
+    moving = moving_inputs(at)
+    flights = [i for i in longest(at) if usable(at, e, i, name)]
     # The bank's filters are of samples: those of one clock go together.
-    flights = [i for i in flights if _every(at, i, name) == _every(at, flights[0], name)]
-    changing, each = _changing(at, J, name, flights), []
+    flights = [i for i in flights if every_of(at, i, name) == every_of(at, flights[0], name)]
+    over_time, each = changing(at, J, name, flights), []
     for i in flights:
-        own = _own(at, i, name)
+        own = own_of(at, i, name)
         assert own is not None  # or the flight were not usable
-        drives = _drives(at, e, i, name, moving)
-        if own.every > 1:
-            drives = np.stack([own.of_input(v) for v in drives.T], axis=1)
-        else:
-            drives = drives[own.rows]
-        drives = np.concatenate([drives, changing[i][own.rows]], axis=1)
+        X = drives(at, e, i, name, moving)
+        X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
+        X = np.concatenate([X, over_time[i][own.rows]], axis=1)
         left = np.asarray(e.raw[i][name])[own.rows]
-        each.append(lines_of(left, J[i, name][own.rows], drives, own.holes))
-    lines = [one for one in each if one is not None]
-    if not lines or not moving:
+        each.append(lines_of(left, J[i, name][own.rows], X, own.holes))
+    those = [(i, one) for i, one in zip(flights, each, strict=True) if one is not None]
+    if not those or not moving:
         return None
+    lines, k = [one for _, one in those], len(at.layout.of_interest)
     m, columns = len(moving), lines[0].drives.shape[1]
-    constant = columns - changing[flights[0]].shape[1]
+    constant = columns - over_time[flights[0]].shape[1]
     linear = strongest(lines, range(m), NARROW)
     # Of three answers the best one, of equal ones the first: chance is asked of no other.
     curved = strongest(
         lines, range(m, constant), BROAD, beside=range(m), plain=True, least=linear.statistic
     )
     most = max(linear.statistic, curved.statistic)
-    changed = strongest(lines, range(constant, columns), (), plain=True, least=most)
+    changes = list(range(constant, columns))
+    if len(lines) > 1:
+        lines = of_single_flights(lines, k)
+        # First: what differs from flight to flight is a change halfway as well.
+        changes = [*range(columns, lines[0].drives.shape[1]), *changes]
+    changed = strongest(lines, changes, (), plain=True, least=most)
     # Two numbers a line, each of the variance size**2.
     deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
     # Each takes up a part of the others.
     best = max((linear, curved, changed), key=lambda s: s.statistic)
-    return _Asked(best, best is curved, best is changed, float(deviance))
-
-
-def _changing(
-    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: list[int]
-) -> dict[int, np.ndarray]:
-    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
-    one over the flights in their order, and one halfway."""
-    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
-    t = np.linspace(-1.0, 1.0, sum(sizes))
-    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
-    return {
-        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
-        for i, s in each
-    }
-
-
-def _moving(at: Solution) -> list[str]:
-    """The inputs that move in some flight."""
-    flights = [naming.asdict(f.inputs) for f in at.data.flights]
-    return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
-
-
-def _drives(at: Solution, e: Evaluation, i: int, name: str, moving: list[str]) -> np.ndarray:
-    """The inputs that move, then what is not linear of these, of the output and of its rate."""
-    inputs = naming.asdict(at.data.flights[i].inputs)
-    u = [_normal(np.asarray(inputs[n])) for n in moving]
-    y = np.asarray(e.simulated[i][name])
-    shapes = [*u, _normal(y), _normal(np.gradient(y))]
-    curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
-    return np.stack([*u, *curved], axis=1)
-
-
-def _normal(v: np.ndarray) -> np.ndarray:
-    v = v - v.mean()
-    size = float(np.std(v))
-    return v / size if size > 0 else v
+    odd = those[(best.drive - columns) // k][0] if best.drive >= columns else None
+    by_amplitude, over = best is curved, best is changed and odd is None
+    asked = tuple(i for i, _ in those)
+    return _Asked(best, by_amplitude, over, float(deviance), odd, asked)
 
 
 def _said(
@@ -383,23 +301,32 @@ def _said(
     name: str,
     one: _Asked,
     sds: Mapping[str, float | None],
+    flights: Sequence[str],
 ) -> Unmodelled:
-    strong, by_amplitude, over_time, _ = one
-    moving, moved = _moving(at), {}
+    strong = one.strong
+    moving, moved = moving_inputs(at), {}
     for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
         sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
-    first = next(i for i in _longest(at) if _usable(at, e, i, name))
-    dt = float(at.data.flights[first].dt) * _every(at, first, name)
+    first = next(i for i in longest(at) if usable(at, e, i, name))
+    dt = float(at.data.flights[first].dt) * every_of(at, first, name)
+    odd = ""
+    if one.odd is not None:
+        called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
+        # Of two nobody knows which one is odd.
+        two = len(called) == 2
+        odd = " and ".join(called) if two else called[one.flights.index(one.odd)]
+        odd += "" if two else " and the others"
     return Unmodelled(
         name,
         moving[strong.drive] if strong.drive < len(moving) else "",
-        by_amplitude,
+        one.by_amplitude,
         strong.frequency / dt,
         strong.damping,
         strong.p_value,
         strong.statistic,
         moved,
-        over_time,
+        one.over_time,
+        odd,
     )

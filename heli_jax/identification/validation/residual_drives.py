@@ -1,0 +1,100 @@
+"""What may drive what a model lacks.
+
+The inputs, what is not linear of them and of the response, and what parameters do that change.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.validation.score_test import Lines
+
+_PLAY = 0.1
+"""part of an input's range that a linkage's play is asked for with; other plays answer alike"""
+
+
+def moving_inputs(at: Solution) -> list[str]:
+    """The inputs that move in some flight.
+
+    Args:
+        at: where the fit ended.
+    """
+    flights = [naming.asdict(f.inputs) for f in at.data.flights]
+    return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
+
+
+def drives(
+    at: Solution, e: Evaluation, i: int, name: str, moving: Sequence[str]
+) -> Float[np.ndarray, "N d"]:
+    """The inputs that move, then what is not linear of these, of the output and of its rate, and
+    what a linkage with play keeps of the inputs.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+        i: the flight.
+        name: the output.
+        moving: of `moving_inputs`.
+    """
+    inputs = naming.asdict(at.data.flights[i].inputs)
+    u = [_normal(np.asarray(inputs[n])) for n in moving]
+    y = np.asarray(e.simulated[i][name])
+    shapes = [*u, _normal(y), _normal(np.gradient(y))]
+    curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
+    # What play takes off hangs on where the stick came from, not on where it is: no power does.
+    return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
+
+
+def _behind_play(v: np.ndarray) -> np.ndarray:
+    """Where a signal (N,) takes what follows it with play."""
+    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, np.empty(v.size)
+    for k, x in enumerate(v.tolist()):
+        at = min(max(at, x - half), x + half)
+        out[k] = at
+    return out
+
+
+def _normal(v: np.ndarray) -> np.ndarray:
+    v = v - v.mean()
+    size = float(np.std(v))
+    return v / size if size > 0 else v
+
+
+def changing(
+    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: Sequence[int]
+) -> dict[int, np.ndarray]:
+    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
+    one over the flights in their order, and one halfway.
+
+    Args:
+        at: where the fit ended.
+        J: by flight and output (N, q) the derivative of the residual by all unknowns.
+        name: the output.
+        flights: those that are looked at.
+    """
+    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
+    t = np.linspace(-1.0, 1.0, sum(sizes))
+    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
+    return {
+        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
+        for i, s in each
+    }
+
+
+def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
+    """With k further drives a record: what a change of each parameter in that record alone does.
+
+    Args:
+        lines: of each record.
+        k: how many of the unknowns, the first, are parameters.
+    """
+    out = []
+    for i, one in enumerate(lines):
+        more = np.zeros((one.e.size, k * len(lines)), complex)
+        more[:, k * i : k * (i + 1)] = one.J[:, :k]
+        out.append(one._replace(drives=np.concatenate([one.drives, more], axis=1)))
+    return out
