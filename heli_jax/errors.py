@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class InputError(ValueError):
@@ -29,3 +30,19 @@ def nearest(name: str, known: Iterable[str]) -> str:
     # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""
+
+
+def require_kind(argument: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Refuse an argument of another kind than it has to be.
+
+    Args:
+        argument: its name.
+        value: what was passed.
+        kinds: what it may be an instance of.
+        expected: these in words, with what makes one.
+
+    Raises:
+        TypeError: naming the argument, what was expected and what was found.
+    """
+    if not isinstance(value, kinds):
+        raise TypeError(f"{argument}: expected {expected}, got {type(value).__name__}")

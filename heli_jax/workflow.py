@@ -18,7 +18,7 @@ from heli_jax.config import Experiment
 from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, require_kind
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -393,7 +393,9 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
 
     Raises:
         InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
+        TypeError: `run` is no FitRun.
     """
+    require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
     from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
     from heli_jax.report.origin import origin

@@ -11,6 +11,7 @@ import pytest
 
 import heli_jax
 from heli_jax import Flight, Free, Problem, cli, linear_model, models, simulate
+from heli_jax.sweeps import grid
 
 LINEAR = linear_model("roll-flybarless")
 PARAMS = LINEAR.vehicle().params
@@ -138,3 +139,23 @@ def test_angles_of_more_than_a_turn_are_warned_of() -> None:
     )  # fmt: skip
     with pytest.warns(UserWarning, match="np.radians"):
         Problem(LINEAR.model, PARAMS, [turning], FREE)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: heli_jax.run_fit(WRONG), "config: expected the path of a configuration"),
+        (lambda: heli_jax.load_fit(WRONG), "directory: expected the path of a fit's run directory"),
+        (lambda: heli_jax.intervals(WRONG), r"fit: expected a Fit, as heli_jax.fit\(problem\)"),
+        (lambda: heli_jax.write_report(WRONG, "out"), "run: expected a FitRun"),
+        (lambda: _sweep({"Lb": [1, 2]}, {}), "design: expected a design.*got dict"),
+        (lambda: _sweep(grid({"Lb": [1, 2]}), {"rms": "rms"}), "reduce: rms: expected a Reduce"),
+    ],
+)
+def test_another_kind_is_refused_in_words(call, words) -> None:
+    with pytest.raises(TypeError, match=words):
+        call()
+
+
+def _sweep(design: Any, reduce: Any) -> None:
+    heli_jax.sweep(LINEAR.model, PARAMS, FLIGHT, design, reduce)

@@ -18,7 +18,7 @@ from heli_jax.config.quantities import in_si, initial_state
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, nearest, require_kind
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
@@ -57,7 +57,9 @@ def read_overridden(
 
     Raises:
         InputError: no such file, no YAML, or an override that cannot be put in.
+        TypeError: `path` is no path.
     """
+    require_kind("config", path, (str, Path), "the path of a configuration, 'fit.yaml'")
     content = read_mapping(path)
     # Before the validation, so that an override is checked as what the file says is, and may set a
     # key that the file leaves out.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, require_kind
 from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import adequacy_of
@@ -85,7 +85,9 @@ def load_fit(directory: str | Path) -> SavedFit:
 
     Raises:
         InputError: it holds no fit.json and signals.csv that a fit wrote.
+        TypeError: it is no path.
     """
+    require_kind("directory", directory, (str, Path), "the path of a fit's run directory")
     directory = Path(directory)
     if not directory.is_dir():
         got = "a file" if directory.exists() else "nothing of that name"

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from heli_jax.sweeps.axes import Columns, Range, axis_values, check_axes, check_
 from heli_jax.sweeps.sobol_points import MOST, scrambled_sobol
 
 
+@runtime_checkable
 class Design(Protocol):
     """What `sweep` needs of a design."""
 

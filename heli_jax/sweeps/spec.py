@@ -11,7 +11,7 @@ from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads, require_linear
-from heli_jax.errors import nearest
+from heli_jax.errors import nearest, require_kind
 from heli_jax.flights.flight import Flight
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
@@ -162,6 +162,14 @@ def special_axes(model: Model, design: Design) -> list[str]:
     return [n for n in design.names if n not in naming.names(model.Params)]
 
 
+def _check_kinds(design: Any, reduce: Any) -> None:
+    require_kind("design", design, Design, "a design, as heli_jax.sweeps.grid({'Ixx': [1, 2]})")
+    results = "results by name, as {'rms': Reduce('rms', 'roll')}"
+    require_kind("reduce", reduce, Mapping, results)
+    for name, each in reduce.items():
+        require_kind(f"reduce: {name}", each, Reduce, "a Reduce, as Reduce('rms', 'roll')")
+
+
 def job(
     model: Model,
     params: Any,
@@ -183,6 +191,7 @@ def job(
     Raises:
         ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
             lacks something, an unknown solver or precision, float64 while JAX has it switched off.
+        TypeError: a design or a result of another kind.
     """
     # The model first: the other checks ask for its names, and a wrong one would fail in them far
     # from its cause.
@@ -190,6 +199,7 @@ def job(
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
         raise ValueError("flights: expected at least one, got none")
+    _check_kinds(design, reduce)
     if not 1 <= design.size <= _MOST:
         raise ValueError(
             f"axes: expected a design of 1 to {_MOST:.0e} elements, got {design.size:.3g}"

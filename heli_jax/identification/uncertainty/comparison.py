@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from heli_jax.errors import require_kind
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
@@ -52,7 +53,9 @@ def intervals(
 
     Raises:
         ValueError: a parameter that is not free, or a missing extra.
+        TypeError: `fit` is no Fit.
     """
+    require_kind("fit", fit, Fit, "a Fit, as heli_jax.fit(problem) returns it")
     report = progress or (lambda _: None)
     profiled, booted, posterior = {}, None, None
     missing = [n for n in profiles or () if n not in fit.estimates]
