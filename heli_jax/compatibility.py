@@ -102,30 +102,32 @@ def run_compatibility(
             f"{experiment.model.name} (docs/compatibility.md)"
         )
     run = workflow.run_fit(experiment, progress=progress)
-    found = judged(run)
+    compatibility = judged(run)
     if _without_noise(run):
         reason = _SMOOTH if _smooth(run) else _BEYOND_NOISE
         progress("filter error has no end: once more by output error")
-        found = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
-        found = dataclasses.replace(found, doubts=(reason, *found.doubts))
-        run = found.run
+        compatibility = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
+        compatibility = dataclasses.replace(compatibility, doubts=(reason, *compatibility.doubts))
+        run = compatibility.run
     if out is None:
-        return found
+        return compatibility
     progress("writing the report")
-    further = run.supplementary._replace(sensors=_agreement(found))
+    further = run.supplementary._replace(sensors=_agreement(compatibility))
     run = workflow.write_report(dataclasses.replace(run, supplementary=further), out)
     place = Path(out) / FILE
     with run_directory.whole_file(place, f"--out {place}") as part:
-        part.write_text(as_yaml(found.corrections), encoding="utf-8")
-    return dataclasses.replace(found, run=run)
+        part.write_text(as_yaml(compatibility.corrections), encoding="utf-8")
+    return dataclasses.replace(compatibility, run=run)
 
 
-def _agreement(found: Compatibility) -> SensorAgreement:
+def _agreement(compatibility: Compatibility) -> SensorAgreement:
     """What the page says before it shows the fit, whose own first line knows nothing of sensors."""
-    head, rows = table(found)
+    head, rows = table(compatibility)
     # The fit's notes stand on its page already.
-    doubts = tuple(d for d in found.doubts if d not in found.run.fit.notes)
-    return SensorAgreement(found.compatible, found.verdict, doubts, head, tuple(rows))
+    doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.notes)
+    return SensorAgreement(
+        compatibility.compatible, compatibility.verdict, doubts, head, tuple(rows)
+    )
 
 
 _SMOOTH = (
@@ -212,10 +214,10 @@ def _verdict(
             "a wrong unit, sign or axis, a filter, a scale that changes in the flight."
         )
     lowest = min(r_squared.values())
-    found = [e.name for e in errors if e.shows]
-    if not found:
+    shown = [e.name for e in errors if e.shows]
+    if not shown:
         return f"Compatible as logged: R2 {lowest:.4f} or more, and no error shows."
-    return f"Compatible once {', '.join(found)} are corrected: R2 {lowest:.4f} or more."
+    return f"Compatible once {', '.join(shown)} are corrected: R2 {lowest:.4f} or more."
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
@@ -265,9 +267,9 @@ def _corrections(
             "delay": _short(late),
         }
         if any(correction.values()):
-            how = conversion_of(signal)
+            conversion = conversion_of(signal)
             # Left out where the numbers were read as they are.
-            read = {} if how == Conversion() else {"conversion": how.model_dump()}
+            read = {} if conversion == Conversion() else {"conversion": conversion.model_dump()}
             signals[signal.name] = {"of": n, "unit": signal.unit, **correction, **read}
     arm = {n: _short(values[n]) for n in ("x_imu", "y_imu", "z_imu") if n in values}
     return {
@@ -283,11 +285,11 @@ def _short(value: float) -> float:
     return float(f"{value:.5g}")
 
 
-def table(found: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def table(compatibility: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and rows of the table of errors."""
     head = ("error", "estimate, 95 %", "unit", "shows", "what it is")
     rows = []
-    for e in found.errors:
+    for e in compatibility.errors:
         interval, estimate = "", e.estimate
         if e.determined and estimate.lower95 is not None and estimate.upper95 is not None:
             reach = max(estimate.upper95 - estimate.value, estimate.value - estimate.lower95)

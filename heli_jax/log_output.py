@@ -171,26 +171,26 @@ def _gap_words(clock: TimeInfo) -> str:
     return f"{len(clock.gaps)} gaps, the longest {longest:.4g} s"
 
 
-def _vibration_lines(found: RotorLines | None) -> Iterator[str]:
-    if found is None:
+def _vibration_lines(rotor: RotorLines | None) -> Iterator[str]:
+    if rotor is None:
         return
-    if not found.signals:
-        yield f"rotor: {found.channel} is not steady for {LEAST:g} s, no lines are named"
+    if not rotor.signals:
+        yield f"rotor: {rotor.channel} is not steady for {LEAST:g} s, no lines are named"
         return
     yield (
-        f"rotor: {terse(found.hz)} Hz by {found.channel}, steady from {found.start:.4g} s to "
-        f"{found.end:.4g} s"
+        f"rotor: {terse(rotor.hz)} Hz by {rotor.channel}, steady from {rotor.start:.4g} s to "
+        f"{rotor.end:.4g} s"
     )
-    quiet = [each.channel for each in found.signals if not each.lines]
-    for each in found.signals:
+    quiet = [each.channel for each in rotor.signals if not each.lines]
+    for each in rotor.signals:
         for line in each.lines[:_MOST_VIBRATIONS]:
-            yield f"  {each.channel}: {line_words(line, found.hz)}"
+            yield f"  {each.channel}: {line_words(line, rotor.hz)}"
     if quiet:
         yield f"  no line above {100 * SMALLEST:g} % of the variance: {', '.join(quiet)}"
 
 
-def _vibration_content(found: RotorLines | None) -> dict[str, Any] | None:
-    if found is None:
+def _vibration_content(rotor: RotorLines | None) -> dict[str, Any] | None:
+    if rotor is None:
         return None
     signals = [
         {
@@ -198,9 +198,9 @@ def _vibration_content(found: RotorLines | None) -> dict[str, Any] | None:
             "channel": each.channel,
             "lines": [line._asdict() | {"aliased": line.aliased} for line in each.lines],
         }
-        for each in found.signals
+        for each in rotor.signals
     ]
-    return found._asdict() | {"signals": signals}
+    return rotor._asdict() | {"signals": signals}
 
 
 def _topic_lines(topics: Sequence[TopicInfo], width: int) -> Iterator[str]:

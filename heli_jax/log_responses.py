@@ -46,9 +46,9 @@ def responses_of_log(
     """
     experiment = _of_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
-    wanted = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
+    requests = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
     points = config.points or Settings().points
-    settings = Settings(config.band, config.window, points, wanted)
+    settings = Settings(config.band, config.window, points, requests)
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
     asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
@@ -57,19 +57,19 @@ def responses_of_log(
             progress(note)
     _require_samples(flights, experiment.path)
     try:
-        found = flight_responses(flights, settings)
+        estimate = flight_responses(flights, settings)
     except ValueError as e:
         raise InputError(f"{experiment.path}: frequency: {e}") from e
-    pairs = [pair for output in found.outputs.values() for pair in output.pairs.values()]
+    pairs = [pair for output in estimate.outputs.values() for pair in output.pairs.values()]
     if not any(np.isfinite(pair.coherence).any() for pair in pairs):
         longest = max(f.duration for f in flights)
         raise InputError(
             f"{experiment.path}: no response: at no frequency of the band has a signal ten times "
             "the power that the window's sidelobes bring, expected sticks that are excited there "
-            f"(a sweep, doublets) for longer than a few windows of {found.window:.3g} s, got "
+            f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return found
+    return estimate
 
 
 def _of_log(experiment: Experiment, log: str | None) -> Experiment:
@@ -106,26 +106,26 @@ def run_responses(
     from heli_jax.report.responses import write_responses
     from heli_jax.report.tables.handling import handling_lines, handling_sentences
 
-    found = responses_of_log(experiment, log, say)
+    responses = responses_of_log(experiment, log, say)
     # Of axes that did not move nobody asked by name, and nothing is to be said.
-    asked = asked_handling(experiment, found.outputs)
+    asked = asked_handling(experiment, responses.outputs)
     named = (experiment.config.frequency or FrequencyConfig()).handling is not None
     handling = [
-        Handling(pair, None, measured_handling(found, pair))
+        Handling(pair, None, measured_handling(responses, pair))
         for pair in asked
-        if named or pair.input in found.holds
+        if named or pair.input in responses.holds
     ]
-    gaps = missing_handling(experiment, found.outputs)
-    found = found._replace(notes=(*found.notes, *not_usable(found)))
+    gaps = missing_handling(experiment, responses.outputs)
+    responses = responses._replace(notes=(*responses.notes, *not_usable(responses)))
     with run_directory.whole(out) as temporary:
         title = Path(experiment.path).stem
-        written = found._replace(notes=(*found.notes, *gaps))
+        written = responses._replace(notes=(*responses.notes, *gaps))
         units, png = units_of(experiment), experiment.config.report.png
         config = as_yaml(resolved(_of_log(experiment, log)))
         write_responses(temporary, written, units, title, handling, config=config, png=png)
-    for note in found.notes:
+    for note in responses.notes:
         say(note)
-    print_responses(found)
+    print_responses(responses)
     for line in handling_lines(handling):
         tell(plain_words(line))
     for sentence in (*handling_sentences(handling), *gaps):
@@ -133,14 +133,14 @@ def run_responses(
     say(f"wrote {out / 'responses.html'}")
 
 
-def not_usable(found: FlightResponses) -> tuple[str, ...]:
+def not_usable(responses: FlightResponses) -> tuple[str, ...]:
     """That no response is coherent with its input, where none is.
 
     Args:
-        found: the responses.
+        responses: the responses.
     """
-    pairs = [pair for output in found.outputs.values() for pair in output.pairs.values()]
-    if any(np.max(octave_mean(found.omega, p.coherence)) >= COHERENT for p in pairs):
+    pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
+    if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()
     return (
         f"no response is usable: none has a coherence of {COHERENT:g} in the mean over an octave; "
@@ -148,21 +148,21 @@ def not_usable(found: FlightResponses) -> tuple[str, ...]:
     )
 
 
-def print_responses(found: FlightResponses) -> None:
+def print_responses(responses: FlightResponses) -> None:
     """What each response is good for, and the transfer functions, on standard output."""
     from heli_jax.report.responses import FIT_HEAD, fit_row, useful_band
 
     rows = []
-    for name, output in found.outputs.items():
+    for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            band = useful_band(found.omega, pair)
-            by = "by instrument" if input in found.instruments else "direct"
+            band = useful_band(responses.omega, pair)
+            by = "by instrument" if input in responses.instruments else "direct"
             rows.append((f"{input} to {name}", by, f"{output.averages:.1f}", *band))
     head = ("response", "taken", "averages", "coherence", "usable from [Hz]", "to [Hz]")
     print_table(head, rows)
-    for wanted, fit in found.fits:
-        orders = f"{wanted.zeros} zeros, {wanted.poles} poles"
-        tell(f"{wanted.input} to {wanted.output}, {orders}:")
+    for request, fit in responses.fits:
+        orders = f"{request.zeros} zeros, {request.poles} poles"
+        tell(f"{request.input} to {request.output}, {orders}:")
         for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
             tell(f"  {head}: {cell}")
         if not fit.determined:
@@ -173,5 +173,5 @@ def print_responses(found: FlightResponses) -> None:
             tell(
                 f"  squared errors are {number(fit.chi_squared, 2)} times what the random errors "
                 "let expect: the order is too low, the machine is not linear, or a window of "
-                f"{found.window:.3g} s does not resolve it"
+                f"{responses.window:.3g} s does not resolve it"
             )

@@ -132,19 +132,19 @@ def run_compatibility(
     from heli_jax import compatibility
 
     place = run_directory.default_directory(Path(config)) if out is None else Path(out)
-    found = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
-    tell(found.verdict)
-    for line in found.doubts:
+    result = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
+    tell(result.verdict)
+    for line in result.doubts:
         tell(f"! {line}")
-    head, rows = compatibility.table(found)
+    head, rows = compatibility.table(result)
     print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     tell(
         "R2 of what is reconstructed: "
-        + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
+        + ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
     )
     tell(f"corrections: {place / compatibility.FILE}")
     tell(f"report: {place / 'report.html'}")
-    return found.compatible
+    return result.compatible
 
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:

@@ -22,11 +22,11 @@ def print_keys(pattern: str | None) -> None:
     Raises:
         InputError: no key holds it.
     """
-    found = keys() if pattern is None else matching(pattern)
-    if not found:
+    matches = keys() if pattern is None else matching(pattern)
+    if not matches:
         raise InputError(f"keys: expected a text that some key or its meaning holds, got {pattern}")
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    for key in found:
+    for key in matches:
         print(*_lines(key, width), sep="\n")
 
 
@@ -36,8 +36,8 @@ def as_json(pattern: str | None) -> str:
     Args:
         pattern: as `print_keys`.
     """
-    found = keys() if pattern is None else matching(pattern)
-    return json.dumps([key._asdict() for key in found], indent=1)
+    matches = keys() if pattern is None else matching(pattern)
+    return json.dumps([key._asdict() for key in matches], indent=1)
 
 
 def write_schema(path: Path) -> None:

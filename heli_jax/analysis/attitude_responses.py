@@ -90,13 +90,15 @@ def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
         outputs: those of the model's that were logged.
     """
     with_stick = {a.name for a in axes_of(model) if _stick(model, a) is not None}
-    found = {n: [o for o in (_ANGLES[n], n, r) if o in outputs] for n, r in _ATTITUDES.items()}
+    logged_outputs = {
+        n: [o for o in (_ANGLES[n], n, r) if o in outputs] for n, r in _ATTITUDES.items()
+    }
     inputs = ", ".join(naming.names(model.Inputs))
     return tuple(
         f"no handling qualities of {name}: model {model.name} does not say which input is its "
         f"stick; write axes: {{{name}: {{stick: INPUT}}}} in its file, or in the configuration "
         f"frequency: {{handling: [{{input: INPUT, output: {logged[0]}}}]}}, with one of {inputs}"
-        for name, logged in found.items()
+        for name, logged in logged_outputs.items()
         if logged and name not in with_stick
     )
 
@@ -107,19 +109,23 @@ def prepared(pair: HandlingPair, curve: Curve) -> Curve:
     return times(curve, pair.gain) if pair.gain != 1.0 else curve
 
 
-def measured_handling(found: FlightResponses, pair: HandlingPair) -> HandlingQualities | str:
+def measured_handling(
+    flight_responses: FlightResponses, pair: HandlingPair
+) -> HandlingQualities | str:
     """Handling qualities of a measured response, or why there are none in words.
 
     Args:
-        found: the responses of some flights.
+        flight_responses: the responses of some flights.
         pair: which of them.
     """
-    output = found.outputs.get(pair.output)
+    output = flight_responses.outputs.get(pair.output)
     response = None if output is None else output.pairs.get(pair.input)
     if response is None:
         return "the flights have no such response"
     with np.errstate(all="ignore"):
-        H = without_hold(found.omega, response.H, found.holds[pair.input])
+        H = without_hold(flight_responses.omega, response.H, flight_responses.holds[pair.input])
         sd = response.sd * np.abs(H / response.H)
-    curve = measured_curve(found.omega, H, sd, response.coherence, found.window)
+    curve = measured_curve(
+        flight_responses.omega, H, sd, response.coherence, flight_responses.window
+    )
     return curve if isinstance(curve, str) else handling_qualities(prepared(pair, curve), pair.kind)

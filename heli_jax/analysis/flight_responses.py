@@ -303,7 +303,7 @@ def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> di
     u, y = list(range(m)), list(range(first, first + len(outputs)))
     by = None if windows.instruments is None else list(windows.instruments)
     spectra = cross_spectra(records, dt, omega, window)
-    found = responses(spectra, u, y, by)
+    estimate = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
     several = _several(records, dt, spectra, window, m)
@@ -311,14 +311,14 @@ def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> di
     for i, name in enumerate(outputs):
         seen = (driven & own[y[i]])[:, None]
         H, sd, coherence = (
-            np.where(seen, v[:, i], np.nan) for v in (found.H, found.sd, found.coherence)
+            np.where(seen, v[:, i], np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
         )
         picture = _picture(several, omega, (u, y[i], by))
         pairs = {
             n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j]) for j, n in enumerate(inputs)
         }
-        averages = float(found.averages[0])
-        result[name] = Output(pairs, found.multiple[:, i], found.noise[:, i], averages)
+        averages = float(estimate.averages[0])
+        result[name] = Output(pairs, estimate.multiple[:, i], estimate.noise[:, i], averages)
     return result
 
 
@@ -376,36 +376,36 @@ def _fits(
     holds: dict[str, Hold],
 ) -> tuple[tuple[Wanted, TransferFit], ...]:
     fits = []
-    for i, wanted in enumerate(settings.transfer_functions):
+    for i, request in enumerate(settings.transfer_functions):
         place = f"transfer_functions[{i}]"
-        output = outputs.get(wanted.output)
-        if output is None or wanted.input not in output.pairs:
+        output = outputs.get(request.output)
+        if output is None or request.input not in output.pairs:
             raise ValueError(
-                f"{place}: no response from {wanted.input} to {wanted.output} is to be had of "
+                f"{place}: no response from {request.input} to {request.output} is to be had of "
                 "these flights"
             )
         try:
-            fitted = _fitted(wanted, output.pairs[wanted.input], windows[wanted.output], holds)
+            fitted = _fitted(request, output.pairs[request.input], windows[request.output], holds)
         except ValueError as e:
             raise ValueError(f"{place}: {e}") from e
-        fits.append((wanted, fitted))
+        fits.append((request, fitted))
     return tuple(fits)
 
 
-def _fitted(wanted: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold]) -> TransferFit:
+def _fitted(request: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold]) -> TransferFit:
     omega = windows.omega
     hz = omega / (2.0 * np.pi)
-    low, high = wanted.band or (0.0, np.inf)
-    used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+    low, high = request.band or (0.0, np.inf)
+    used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
     # With its hold, which is half a sample late, so that the delay is the machine's own.
-    hold = holds[wanted.input]
+    hold = holds[request.input]
     measured = Measured(omega, H, pair.sd, windows.seconds, pair.coherence, hold)
-    orders = wanted.zeros, wanted.poles, wanted.delay
+    orders = request.zeros, request.poles, request.delay
     fitted = fit_transfer(measured, *orders)
     for _ in range(_ROUNDS):
         # What the windows do to the record they do to the transfer function.
-        added = window_error(fitted, windows, list(holds).index(wanted.input), hold)
+        added = window_error(fitted, windows, list(holds).index(request.input), hold)
         if added is None:
             break
         fitted = fit_transfer(measured._replace(H=H - added), *orders)

@@ -259,9 +259,9 @@ def _attitude(
         sentences.append(_missing("w180, gain bandwidth and phase delay", words))
     else:
         places["w180"] = at = response.place(neutral, "phase")
-        found = _gain_bandwidth(response, at)
-        if found is not None:
-            places["gain_bandwidth"] = found
+        bandwidth = _gain_bandwidth(response, at)
+        if bandwidth is not None:
+            places["gain_bandwidth"] = bandwidth
         else:
             words = "the gain is nowhere in the band 6 dB above that at w180"
             sentences.append(_missing("gain bandwidth", words))

@@ -313,9 +313,9 @@ def composite(
 
 def _weights(s: CrossSpectra, inputs: Sequence[int], outputs: Sequence[int]) -> np.ndarray:
     """(k,) one over the random error, to the fourth power."""
-    found = responses(s, inputs, outputs)
+    estimate = responses(s, inputs, outputs)
     with np.errstate(all="ignore"):
-        each = np.abs(found.H / found.sd) ** 2
+        each = np.abs(estimate.H / estimate.sd) ** 2
     seen = np.isfinite(each)
     information = np.sum(np.where(seen, each, 0.0), axis=(1, 2)) / np.maximum(
         np.sum(seen, axis=(1, 2)), 1

@@ -288,23 +288,23 @@ def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
         )
 
 
-def _result(measured: Measured, scaled: _Scaled, found, zeros: int, delay: bool) -> TransferFit:
-    poles = found.x.size - zeros - 1 - delay
+def _result(measured: Measured, scaled: _Scaled, optimum, zeros: int, delay: bool) -> TransferFit:
+    poles = optimum.x.size - zeros - 1 - delay
     # Back to seconds: a power of s less in a coefficient is a power of the scale more.
     powers = np.concatenate(
         [poles - np.arange(zeros, -1, -1), poles - np.arange(poles - 1, -1, -1), [-1] * delay]
     )
     units = scaled.speed ** powers.astype(float)
-    freedom = max(2.0 * float(np.sum(_shares(measured))) - found.x.size, 1.0)
-    chi_squared = 2.0 * float(found.cost) / freedom
+    freedom = max(2.0 * float(np.sum(_shares(measured))) - optimum.x.size, 1.0)
+    chi_squared = 2.0 * float(optimum.cost) / freedom
     # What the order leaves unexplained is no smaller than what it was measured to.
-    sd = _deviations(found.jac) * max(chi_squared, 1.0) ** 0.5
-    size = np.ones(found.x.size)
+    sd = _deviations(optimum.jac) * max(chi_squared, 1.0) ** 0.5
+    size = np.ones(optimum.x.size)
     size[: zeros + 1] = np.max(np.abs(scaled.H))
-    sd = np.where(sd > _FAR * np.maximum(np.abs(found.x), size), np.inf, sd)
+    sd = np.where(sd > _FAR * np.maximum(np.abs(optimum.x), size), np.inf, sd)
     values = [
         Coefficient(v, d, v - Z95 * d, v + Z95 * d)
-        for v, d in zip((found.x * units).tolist(), (sd * units).tolist(), strict=True)
+        for v, d in zip((optimum.x * units).tolist(), (sd * units).tolist(), strict=True)
     ]
     whole = TransferFit(
         tuple(values[: zeros + 1]),
@@ -312,7 +312,7 @@ def _result(measured: Measured, scaled: _Scaled, found, zeros: int, delay: bool)
         values[-1] if delay else None,
         chi_squared,
         0.0,
-        bool(found.status > 0),
+        bool(optimum.status > 0),
     )
     return whole._replace(J=mismatch(measured, whole.sampled(measured.omega, measured.hold)))
 

@@ -275,9 +275,9 @@ def steady_flight(model: Model) -> SteadyFlight | None:
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
     if not {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"} <= {*states, *inputs}:
         return None
-    found = ["phi", "theta", "vi", "a1", "b1", "governor"]
-    found += [] if "x_collective" in inputs else ["Omega"]
-    unknowns = [n for n in states if n in found]
+    solved_for = ["phi", "theta", "vi", "a1", "b1", "governor"]
+    solved_for += [] if "x_collective" in inputs else ["Omega"]
+    unknowns = [n for n in states if n in solved_for]
     unknowns += [n for n in states if n.startswith("beta")]
     # Wind and a measured rotor speed are given, not flown.
     unknowns += [n for n in inputs if not n.startswith("wind") and n != "Omega"]

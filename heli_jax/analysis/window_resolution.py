@@ -59,8 +59,8 @@ def window_error(
     ]
     spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds)
     by = None if windows.instruments is None else [place[i] for i in windows.instruments]
-    found = responses(spectra, [place[i] for i in windows.inputs], [len(kept)], by)
-    return found.H[:, 0, input] - fitted.sampled(windows.omega, hold)
+    estimate = responses(spectra, [place[i] for i in windows.inputs], [len(kept)], by)
+    return estimate.H[:, 0, input] - fitted.sampled(windows.omega, hold)
 
 
 def _answer(fitted: TransferFit, u: Float[np.ndarray, " N"], hold: Hold) -> Float[np.ndarray, " N"]:

@@ -133,16 +133,16 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
     samples = {"inputs": dict(flight.inputs), "outputs": dict(flight.outputs)}
     notes = []
     for each in logged_signals(flight):
-        found = corrections.signals.get(each.signal.name)
-        if found is None:
+        correction = corrections.signals.get(each.signal.name)
+        if correction is None:
             continue
-        factor = _factor(each, found, where)
+        factor = _factor(each, correction, where)
         x = samples[each.role][each.name]
-        x = (x - found.bias * factor) / (1.0 + found.scale)
-        samples[each.role][each.name] = _earlier(x, found.delay / flight.dt, each.role)
+        x = (x - correction.bias * factor) / (1.0 + correction.scale)
+        samples[each.role][each.name] = _earlier(x, correction.delay / flight.dt, each.role)
         notes.append(
-            f"{each.name}: corrected by scale {found.scale:+.3g}, bias {found.bias:.3g} "
-            f"{found.unit}, delay {found.delay:.3g} s"
+            f"{each.name}: corrected by scale {correction.scale:+.3g}, bias {correction.bias:.3g} "
+            f"{correction.unit}, delay {correction.delay:.3g} s"
         )
     if not notes:
         raise InputError(
@@ -160,21 +160,22 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
     return dataclasses.replace(flight, source=source)
 
 
-def _factor(each: Logged, found: SignalCorrection, where: str) -> float:
+def _factor(each: Logged, correction: SignalCorrection, where: str) -> float:
     """From the stated unit to SI."""
     signal = each.signal
     place = f"{where}.corrections: {signal.name}"
     try:
-        stated, of_correction = (units.factor(u, signal.si) for u in (signal.unit, found.unit))
+        stated, of_correction = (units.factor(u, signal.si) for u in (signal.unit, correction.unit))
     except ValueError as e:
         raise InputError(f"{place}: {e}") from e
     # Read as degrees there and as radians here, one of the two fits was of other numbers.
     if not np.isclose(stated, of_correction, rtol=1e-9):
         raise InputError(
-            f"{place}: expected the unit that it was corrected in, {found.unit}, got {signal.unit}"
+            f"{place}: expected the unit that it was corrected in, {correction.unit}, "
+            f"got {signal.unit}"
         )
     # With another sign or zero the errors would be added and not taken off.
-    here, there = conversion_of(signal), found.conversion
+    here, there = conversion_of(signal), correction.conversion
     if here != there:
         raise InputError(
             f"{place}: expected the conversion that it was corrected with, {there.words}, got "

@@ -85,9 +85,10 @@ class DisturbanceConfig(BaseModel):
     @property
     def has_units(self) -> bool:
         """Whether some number has a unit of its own, and is not in SI yet."""
-        given = (self.sigma_w, self.tau_w)
+        values = (self.sigma_w, self.tau_w)
         return any(
-            _has_unit(v) or (isinstance(v, dict) and any(map(_has_unit, v.values()))) for v in given
+            _has_unit(v) or (isinstance(v, dict) and any(map(_has_unit, v.values())))
+            for v in values
         )
 
     @property
@@ -97,11 +98,11 @@ class DisturbanceConfig(BaseModel):
         several, values = len(self.names) > 1, {}
         for name in self.names:
             for key in ("sigma_w", "tau_w"):
-                given = getattr(self, key)
+                value = getattr(self, key)
                 # One number stands for all, which only a time constant may: it is in seconds
                 # whatever is pushed.
-                by_name = isinstance(given, dict) and not _has_unit(given)
-                of_it = given.get(name) if by_name else given
+                by_name = isinstance(value, dict) and not _has_unit(value)
+                of_it = value.get(name) if by_name else value
                 values[f"{key}_{name}" if several else key] = of_it
         return values
 
@@ -111,9 +112,9 @@ class DisturbanceConfig(BaseModel):
             got = "neither" if self.on is None else "both"
             raise ValueError(f"expected axis (one) or on (a list of states), got {got}")
         for key in ("sigma_w", "tau_w"):
-            given = getattr(self, key)
-            by_name = isinstance(given, dict) and not _has_unit(given)
-            for name in given if by_name else ():
+            value = getattr(self, key)
+            by_name = isinstance(value, dict) and not _has_unit(value)
+            for name in value if by_name else ():
                 if name not in self.names:
                     raise ValueError(f"{key}: {name!r} is not disturbed{nearest(name, self.names)}")
         if len(self.names) > 1 and (isinstance(self.sigma_w, float) or _has_unit(self.sigma_w)):

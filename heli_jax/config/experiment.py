@@ -329,12 +329,12 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
 def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
     """The vehicle of a model in Python, whose Params say which constants there can be, and in
     which units."""
-    found = _found_by_fit(config)
-    if config.vehicle is None and not found:
+    fitted = _found_by_fit(config)
+    if config.vehicle is None and not fitted:
         raise InputError(f"{path}: vehicle: missing")
     if isinstance(config.vehicle, str):
-        return read_vehicle(path.parent / config.vehicle, model.Params, found)
-    return vehicle_from_mapping(config.vehicle or {}, f"{path}: vehicle", model.Params, found)
+        return read_vehicle(path.parent / config.vehicle, model.Params, fitted)
+    return vehicle_from_mapping(config.vehicle or {}, f"{path}: vehicle", model.Params, fitted)
 
 
 def _found_by_fit(config: Config) -> tuple[str, ...]:
@@ -349,26 +349,26 @@ def _found_by_fit(config: Config) -> tuple[str, ...]:
 def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) -> Vehicle:
     """The values of a linear model's file, with those of the configuration in their place."""
     read = _linear(model, path)
-    given, where = config.vehicle, f"{path}: vehicle"
-    if isinstance(given, str):
-        where = str(path.parent / given)
-        given = read_mapping(path.parent / given)
-    if given is None:
+    vehicle, where = config.vehicle, f"{path}: vehicle"
+    if isinstance(vehicle, str):
+        where = str(path.parent / vehicle)
+        vehicle = read_mapping(path.parent / vehicle)
+    if vehicle is None:
         own = read.vehicle()
-        given, where = {}, own.path
+        vehicle, where = {}, own.path
     else:
         known = naming.names(built.Params)
-        for name in given:
+        for name in vehicle:
             if name not in known:
                 raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
         own = read.vehicle(
-            {n: v for n, v in given.items() if n in naming.names(read.model.Params)}, where
+            {n: v for n, v in vehicle.items() if n in naming.names(read.model.Params)}, where
         )
     if built.Params is read.model.Params:
         return own
     # Devices around the model have parameters of their own, which the file does not know.
     entries = {n: c._asdict() for n, c in own.constants.items()}
-    return vehicle_from_mapping({**given, **entries}, where, built.Params)
+    return vehicle_from_mapping({**vehicle, **entries}, where, built.Params)
 
 
 def resolved(experiment: Experiment) -> dict[str, Any]:

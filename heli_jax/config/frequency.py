@@ -79,12 +79,12 @@ def check_pairs(
     Raises:
         InputError: one of them.
     """
-    for i, wanted in enumerate(pairs):
+    for i, pair in enumerate(pairs):
         for role, record in (
             ("input", experiment.model.Inputs),
             ("output", experiment.model.Outputs),
         ):
-            name, known = getattr(wanted, role), naming.names(record)
+            name, known = getattr(pair, role), naming.names(record)
             if name not in known:
                 raise InputError(
                     f"{experiment.path}: frequency.{section}[{i}].{role}: model "

@@ -56,10 +56,10 @@ def matching(pattern: str) -> list[Key]:
     Args:
         pattern: the text, blanks at its ends left out.
     """
-    wanted, every = pattern.strip().lower(), keys()
-    found = [k for k in every if wanted in k.path.lower()]
+    text, every = pattern.strip().lower(), keys()
+    by_path = [k for k in every if text in k.path.lower()]
     # A word of the meaning finds a key whose name the reader does not know.
-    return found or [k for k in every if wanted in k.meaning.lower()]
+    return by_path or [k for k in every if text in k.meaning.lower()]
 
 
 def _walk(
@@ -174,16 +174,16 @@ def _is_nan(value: Any) -> bool:
 
 def _sections(of: type[BaseModel]) -> dict[str, type[BaseModel]]:
     """The classes of all sections by their names."""
-    found: dict[str, type[BaseModel]] = {}
+    sections: dict[str, type[BaseModel]] = {}
     todo = [of]
     while todo:
         section = todo.pop()
-        if section.__name__ not in found:
-            found[section.__name__] = section
+        if section.__name__ not in sections:
+            sections[section.__name__] = section
             fields = section.model_fields.values()
             todo += itertools.chain.from_iterable(_classes(f.annotation) for f in fields)
             todo += itertools.chain.from_iterable(_classes(m) for f in fields for m in f.metadata)
-    return found
+    return sections
 
 
 def _classes(kind: Any) -> Iterator[type[BaseModel]]:
@@ -198,12 +198,12 @@ def _classes(kind: Any) -> Iterator[type[BaseModel]]:
 def _meanings(section: type[BaseModel]) -> dict[str, str]:
     """What stands below each field in the source, by field; own fields over inherited ones."""
     # Read from the source when it is asked for: pydantic would do so at every import.
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for each in reversed(section.__mro__):
         if issubclass(each, BaseModel) and each is not BaseModel:
-            found |= _stated(each)
+            meanings |= _stated(each)
     aliases = {n: f.alias for n, f in section.model_fields.items() if f.alias}
-    return {aliases.get(name, name): words for name, words in found.items()}
+    return {aliases.get(name, name): words for name, words in meanings.items()}
 
 
 def _stated(section: type[BaseModel]) -> dict[str, str]:

@@ -118,24 +118,24 @@ def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Sig
 def _names(content: dict[str, Any], role: str) -> set[str]:
     """The inputs or outputs that any flight names; none where the configuration is malformed, which
     its validation says."""
-    found: set[str] = set()
+    names: set[str] = set()
     flights = content.get("flights")
     for flight in flights if isinstance(flights, list) else []:
         also = flight.get("also") if isinstance(flight, dict) else None
         for log in (flight, *(also if isinstance(also, list) else ())):
             signals = log.get("signals") if isinstance(log, dict) else None
-            found |= _named(signals, role) if isinstance(signals, dict) else set()
-    return found
+            names |= _named(signals, role) if isinstance(signals, dict) else set()
+    return names
 
 
 def _named(signals: dict[str, Any], role: str) -> set[str]:
     """Of one log; a preset supplies all inputs that are needed for the outputs asked of it."""
     named, asked = signals.get(role), signals.get("preset_outputs")
-    found = {str(n) for n in named} if isinstance(named, dict) else set()
+    names = {str(n) for n in named} if isinstance(named, dict) else set()
     asked = {str(n) for n in asked} if isinstance(asked, list) else set()
     if role == "outputs":
-        return found | asked
-    return found | ({*FORCES} if asked & {*GROUND, *BODY, *POSITION, "V"} else set())
+        return names | asked
+    return names | ({*FORCES} if asked & {*GROUND, *BODY, *POSITION, "V"} else set())
 
 
 def _given(content: dict[str, Any]) -> set[str]:
@@ -220,7 +220,7 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
         model: of `heli_jax.dynamics.kinematics`.
         flights: read.
     """
-    known, found = naming.names(model.Params), {}
+    known, noise = naming.names(model.Params), {}
     for parameter, names in NOISES.items():
         if parameter in known:
             # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
@@ -229,8 +229,8 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
 
             walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
             # One intensity for three axes, as the model has it: their rms.
-            found[parameter] = float(np.sqrt(np.mean(np.square(walks))))
-    return found
+            noise[parameter] = float(np.sqrt(np.mean(np.square(walks))))
+    return noise
 
 
 _FAINTEST = 1e-6

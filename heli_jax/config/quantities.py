@@ -70,15 +70,15 @@ def _si(name: str, record: type) -> str | None:
 
 
 # Any: None, a number, {value, unit}, or one of these for each of several disturbances by name.
-def _converted(given: Any, key: str, si: Mapping[str, str | None], where: str) -> Any:
+def _converted(value: Any, key: str, si: Mapping[str, str | None], where: str) -> Any:
     """A disturbance's sizes or time constants, in the shape in which they stand in the file."""
-    if isinstance(given, Mapping) and "value" not in given:
+    if isinstance(value, Mapping) and "value" not in value:
         return {
             n: _one(v, f"{key}.{n}", si.get(f"{key}_{n}", si.get(key)), where)
-            for n, v in given.items()
+            for n, v in value.items()
         }
     # One number for several may only be a time constant, whose unit is that of all.
-    return None if given is None else _one(given, key, next(iter(si.values())), where)
+    return None if value is None else _one(value, key, next(iter(si.values())), where)
 
 
 def _one(entry: Any, place: str, si: str | None, where: str) -> float:

@@ -131,10 +131,10 @@ def vibration_notes(
     stated = config.vibration
     notes = [] if stated is None or rotor is None else [*rotor_doubt(stated, 2 * math.pi * rotor)]
     for name, y in flight.outputs.items():
-        found = lines(y, flight.dt, rotor, rates.get(name))
-        if found:
-            told = "; ".join(line_words(line, rotor) for line in found[:_NAMED])
-            notes.append(f"{name} vibrates: {told}")
+        vibration = lines(y, flight.dt, rotor, rates.get(name))
+        if vibration:
+            words = "; ".join(line_words(line, rotor) for line in vibration[:_NAMED])
+            notes.append(f"{name} vibrates: {words}")
     return tuple(notes)
 
 

@@ -152,8 +152,8 @@ def _steady_flight(corrections: Corrections, Inputs: type) -> SteadyFlight:
     further += ["vi"] if corrections.dynamic_inflow else []
     sticks = [n for n in naming.names(Inputs) if n.startswith("x_")]
     # A stick more, for the throttle alone, or a speed that is no state.
-    given = corrections.collective or corrections.measured_speed
-    speed = () if given else ("Omega",)
+    speed_given = corrections.collective or corrections.measured_speed
+    speed = () if speed_given else ("Omega",)
     rotor = () if corrections.measured_speed else ("Omega",)
     return SteadyFlight(
         ("phi", "theta", *speed, *further, *bar, *sticks),

@@ -113,7 +113,7 @@ def _as_logged(
             notes.append(f"{name} {note}")
         # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
         odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
-        notes += [f"{name} has {stray_words(found)}: kept as measured" for found in odd[key]]
+        notes += [f"{name} has {stray_words(stray)}: kept as measured" for stray in odd[key]]
         made[key] = Timed(timed.seconds, values)
     return AsLogged(made, _facts(made, marks, odd), tuple(notes))
 

@@ -123,8 +123,8 @@ def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
         return ""
     if len(words) == 1 and words[0] in _AXIS and not sure:
         return "an angular rate"
-    found = [w for w in words if w in _WORDS and not (sure and w in _UNSURE)]
-    return _WORDS[found[0]] if found else ""
+    matches = [w for w in words if w in _WORDS and not (sure and w in _UNSURE)]
+    return _WORDS[matches[0]] if matches else ""
 
 
 def names_a_stick(name: str) -> bool:

@@ -80,17 +80,17 @@ def likely_numbers(body: Body, width: int, signs: Sequence[str]) -> list[int]:
     if body.size > len(first):
         first = first[: first.rfind(b"\n") + 1]
     sample = dataclasses.replace(body, rows=memoryview(first))
-    found: dict[int, Any] = {}
+    columns: dict[int, Any] = {}
     for sign in signs:
         table = _table(sample, width, dict.fromkeys(range(width)), sign)
         if table is not None:
-            found |= {
+            columns |= {
                 i: None
                 for i in range(width)
                 if pa.types.is_integer(kind := table.schema.field(i).type)
                 or pa.types.is_floating(kind)
             }
-    return sorted(found)
+    return sorted(columns)
 
 
 def _table(body: Body, width: int, kinds: dict[int, Any], sign: str) -> "pa.Table | None":

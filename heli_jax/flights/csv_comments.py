@@ -24,14 +24,14 @@ def without_comments(body: Body) -> tuple[Body, str] | None:
     if body.has_quotes or _COMMENT.match(first):
         return None
     data = bytes(body.data)
-    found = _COMMENT.search(data)
-    if found is None:
+    match = _COMMENT.search(data)
+    if match is None:
         return None
     count = sum(1 for _ in _COMMENT.finditer(data))
     if count > max(_FEW, _MOST * data.count(b"\n")):
         return None
-    line = body.first_line + data.count(b"\n", 0, found.start())
-    words = shown(found[1].decode("utf-8", "replace").replace("\t", " "))
+    line = body.first_line + data.count(b"\n", 0, match.start())
+    words = shown(match[1].decode("utf-8", "replace").replace("\t", " "))
     what = f"line {line}" if count == 1 else f"{count} lines, the first line {line},"
     verb = "is a comment" if count == 1 else "are comments"
     rows = memoryview(_COMMENT.sub(b"", data))

@@ -82,12 +82,12 @@ def seconds_of_dates(
         read = _of_minutes
     else:
         read = _of_counts
-    found = read([cells[i] or "" for i in filled])
-    if isinstance(found, int):
-        return filled[found]
+    dates = read([cells[i] or "" for i in filled])
+    if isinstance(dates, int):
+        return filled[dates]
     values = np.full(len(cells), np.nan)
-    values[filled] = found.seconds
-    return found._replace(seconds=values)
+    values[filled] = dates.seconds
+    return dates._replace(seconds=values)
 
 
 def _of_dates(form: re.Pattern[str], cells: Sequence[str]) -> Dates | int:
@@ -133,12 +133,12 @@ def _of_clocks(cells: Sequence[str], days: Sequence[str] | None) -> Dates | int:
         if time is None:
             return i
         seconds[i] = time
-    found = _ordinals(days) if days is not None and all(map(is_day, days)) else 0
-    if isinstance(found, int) or np.ptp(found.seconds) == 0:
+    dates = _ordinals(days) if days is not None and all(map(is_day, days)) else 0
+    if isinstance(dates, int) or np.ptp(dates.seconds) == 0:
         return Dates(_going_on(seconds, _DAY))
     note = "times of day are counted on by the dates beside them"
-    said = "; ".join(filter(None, (note, found.note)))
-    return Dates(seconds + _DAY * (found.seconds - found.seconds[0]), said)
+    said = "; ".join(filter(None, (note, dates.note)))
+    return Dates(seconds + _DAY * (dates.seconds - dates.seconds[0]), said)
 
 
 def _of_minutes(cells: Sequence[str]) -> Dates | int:
@@ -201,12 +201,12 @@ def _ordinals(dates: Sequence[str]) -> Dates | int:
             by_order.append((order, np.array([days[date] for date in dates], float)))
         elif order == orders[-1] and not by_order:
             return list(dates).index(bad)
-    order, found = min(by_order, key=lambda one: np.ptp(one[1]))
-    if len(by_order) == 1 or np.ptp(found) == 0:
+    order, ordinals = min(by_order, key=lambda one: np.ptp(one[1]))
+    if len(by_order) == 1 or np.ptp(ordinals) == 0:
         # Within one day it does not matter which of the two numbers is the month.
-        return Dates(found)
+        return Dates(ordinals)
     what = "day and month" if order == "dm" else "month and day"
-    return Dates(found, f"dates such as {dates[0]} are taken as {what}: the log is shorter so")
+    return Dates(ordinals, f"dates such as {dates[0]} are taken as {what}: the log is shorter so")
 
 
 def _orders(numbered: Sequence[re.Match[str]]) -> tuple[str, ...]:

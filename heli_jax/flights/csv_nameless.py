@@ -31,9 +31,9 @@ def nameless_head(data: bytes, lines: Sequence[Line], blanks: bool, fewest: int 
         at = _first_row(cells, delimiter, fewest)
         if at is None or (fewest == 2 and at):
             continue
-        found = _head(data, lines, cells, at, delimiter)
-        if found is not None:
-            return found
+        head = _head(data, lines, cells, at, delimiter)
+        if head is not None:
+            return head
     return None
 
 

@@ -143,13 +143,13 @@ def _head_above(
     top = header
     while top and _is_group(lines, cells, top - 1, width) and delimiter != " ":
         top -= 1
-    found, note = lines[header], ""
+    head_line, note = lines[header], ""
     if top:
         first, last = lines[0].number, lines[top - 1].number
         above = f"line {first}" if first == last else f"lines {first} to {last}"
-        note = f"the names of the columns were found in line {found.number}, below {above}"
+        note = f"the names of the columns were found in line {head_line.number}, below {above}"
     return Head(
-        Line(found.text, found.number, lines[begin - 1].after),
+        Line(head_line.text, head_line.number, lines[begin - 1].after),
         "\t" if delimiter == " " else delimiter,
         tuple(line.text for line in reversed(lines[top:header])),
         lines[begin - 1].number + 1,
@@ -166,8 +166,8 @@ def _units_above(above: Sequence[Sequence[str]], names: Sequence[str]) -> tuple[
         return ()
     for cells in reversed(above):
         if len(cells) > 1 and _UNIT_LABEL.fullmatch(cells[0].strip()):
-            found = row_of_units(cells[1 : len(names)])
-            return found or ()
+            units = row_of_units(cells[1 : len(names)])
+            return units or ()
     return ()
 
 

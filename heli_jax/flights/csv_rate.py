@@ -37,22 +37,22 @@ def rate_above(text: str) -> tuple[float, str] | None:
     """
     text = text[:_LONGEST]
     rates: dict[float, str] = {}
-    for found in _RATE.finditer(text):
-        factor = _HERTZ.get((found["unit"] or "").casefold())
-        _take(rates, float(found["number"]) * (factor or 1.0), found, factor is not None)
-    for found in _STEP.finditer(text):
-        unit = time_unit(found["unit"] or "")
-        step = float(found["number"]) * SECONDS[unit or "s"]
-        _take(rates, 1.0 / step if step > 0 else 0.0, found, unit is not None)
+    for match in _RATE.finditer(text):
+        factor = _HERTZ.get((match["unit"] or "").casefold())
+        _take(rates, float(match["number"]) * (factor or 1.0), match, factor is not None)
+    for match in _STEP.finditer(text):
+        unit = time_unit(match["unit"] or "")
+        step = float(match["number"]) * SECONDS[unit or "s"]
+        _take(rates, 1.0 / step if step > 0 else 0.0, match, unit is not None)
     return next(iter(rates.items())) if len(rates) == 1 else None
 
 
-def _take(rates: dict[float, str], rate: float, found: re.Match[str], has_unit: bool) -> None:
+def _take(rates: dict[float, str], rate: float, match: re.Match[str], has_unit: bool) -> None:
     if not SLOWEST <= rate <= FASTEST:
         return
     # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
     near = round(rate, 6)
     rate = near if math.isclose(rate, near, rel_tol=1e-9) else rate
-    end = found.end("unit" if has_unit and found["unit"] else "number")
-    words = found.string[found.start() : end]
+    end = match.end("unit" if has_unit and match["unit"] else "number")
+    words = match.string[match.start() : end]
     rates.setdefault(rate, shown(" ".join(words.split())))

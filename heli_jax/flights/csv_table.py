@@ -225,12 +225,12 @@ class CsvTable:
         rest = [i for i in range(width) if i not in plain]
         if rest and self._passed_over():
             return self._survey()
-        found = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
+        by_column = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
         if rest:
             texts = zip(rest, self._texts(rest), strict=True)
-            found |= {i: self._surveyed(self.names[i], text) for i, text in texts}
+            by_column |= {i: self._surveyed(self.names[i], text) for i, text in texts}
         # What stands behind a delimiter at the end of every row is no column.
-        surveys = [found[i] for i in range(width)]
+        surveys = [by_column[i] for i in range(width)]
         return [s for s in surveys if s.name or s.n_filled]
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
@@ -298,20 +298,20 @@ class CsvTable:
     def _days(self, name: str) -> list[str | None] | None:
         """The cells of the one column of dates beside a time of day."""
         _, first = self._record(0)
-        found = [i for i, cell in enumerate(first) if is_day(cell.strip())]
-        if len(found) != 1 or self.names[found[0]] == name:
+        columns = [i for i, cell in enumerate(first) if is_day(cell.strip())]
+        if len(columns) != 1 or self.names[columns[0]] == name:
             return None
-        return filled_cells(self._texts(found)[0]).to_pylist()
+        return filled_cells(self._texts(columns)[0]).to_pylist()
 
     def _passed_over(self) -> bool:
         """Whether comments stood among the rows, which are without them from now on."""
         if self._is_searched or self._body.size > _LARGEST_SEARCHED:
             return False
         self._is_searched = True
-        found = without_comments(self._body)
-        if found is None:
+        stripped = without_comments(self._body)
+        if stripped is None:
             return False
-        self._body, note = found
+        self._body, note = stripped
         self._signs = decimal_signs(self._body)
         self._note(note)
         return True

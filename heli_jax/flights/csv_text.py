@@ -253,11 +253,11 @@ def _names_columns(comment: str, row: str) -> bool:
 
 def first_row(data: bytes, at: int) -> str | None:
     """The first line from `at` on with anything in it; None where nothing follows."""
-    found = _SOMETHING.search(data, at)
-    if found is None:
+    match = _SOMETHING.search(data, at)
+    if match is None:
         return None
-    begin = max(data.rfind(b"\n", at, found.start()), data.rfind(b"\r", at, found.start()), at - 1)
-    end, _ = _line_end(data, found.start())
+    begin = max(data.rfind(b"\n", at, match.start()), data.rfind(b"\r", at, match.start()), at - 1)
+    end, _ = _line_end(data, match.start())
     return data[begin + 1 : min(end, begin + _LONGEST_LINE)].decode("utf-8", "ignore")
 
 

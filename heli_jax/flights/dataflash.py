@@ -108,11 +108,11 @@ def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, array.array], int]:
     formats = {_FMT: Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
     lengths = {_FMT: _FMT_LENGTH}
     starts: dict[int, array.array] = {}
-    at, damaged, size, told = 0, 0, len(data), 0
+    at, damaged, size, report_at = 0, 0, len(data), 0
     while at + 3 <= size:
-        if at >= told:
+        if at >= report_at:
             progress.advance(at)
-            told = at + progress.STEP
+            report_at = at + progress.STEP
         number = data[at + 2]
         length = lengths.get(number, 0)
         if data[at] != 0xA3 or data[at + 1] != 0x95 or not length:
@@ -195,8 +195,8 @@ def make_log(
         # These messages describe the log and are no samples: what they say is in units, parameters
         # and firmware.
         if name not in ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG"):
-            found, lost = _topics(formats[name], table, units.get(name, {}), scaled)
-            topics += found
+            of_message, lost = _topics(formats[name], table, units.get(name, {}), scaled)
+            topics += of_message
             damaged += lost
     require_samples(path, topics)
     return ChannelLog(

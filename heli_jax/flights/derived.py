@@ -306,8 +306,8 @@ def _without_marks(numbers: np.ndarray) -> np.ndarray:
 
 def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Marked]:
     """By channel the marks in places and samples (N,), of those that have some."""
-    found = {n: at_sure_or_suspected(x) for n, (_, x) in channels.items()}
-    return {n: Marked(*(x[found[n]] for x in pair)) for n, pair in channels.items()}
+    kept = {n: at_sure_or_suspected(x) for n, (_, x) in channels.items()}
+    return {n: Marked(*(x[kept[n]] for x in pair)) for n, pair in channels.items()}
 
 
 def marks_of_sources(

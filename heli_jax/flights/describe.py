@@ -334,10 +334,10 @@ def _with_runs(
     starts = restarts(stamps)
     if not starts.size:
         return table, surveys, starts
-    found = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
-    apart = found.numbers([signal.name])[signal.name]
+    parted = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
+    apart = parted.numbers([signal.name])[signal.name]
     changed = [replace(s, values=apart) if s.name == signal.name else s for s in surveys]
-    return found, changed, starts
+    return parted, changed, starts
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:

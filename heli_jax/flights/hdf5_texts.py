@@ -48,21 +48,21 @@ def _class_of(item: Any) -> str:
 
 def of_attributes(item: Any) -> dict[str, Sequence[Any]]:
     """Lists of texts among a data set's attributes that may name its columns, by attribute."""
-    found = {}
+    attributes = {}
     for name in _ATTRIBUTES:
         if name not in item.attrs:
             continue
         texts = np.ravel(item.attrs[name])
         if 1 < texts.size <= _MOST_TEXTS and texts.dtype.kind in "SUO":
-            found[name] = list(texts)
-    return found
+            attributes[name] = list(texts)
+    return attributes
 
 
 def numbers_of(file: Any) -> dict[str, float]:
     """Single numbers among the attributes of a file, such as a rate."""
-    found = {}
+    numbers = {}
     for name in list(file.attrs)[:_MOST_TEXTS]:
         value = np.asarray(file.attrs[name])
         if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
-            found[name] = float(np.ravel(value)[0])
-    return found
+            numbers[name] = float(np.ravel(value)[0])
+    return numbers

@@ -36,14 +36,14 @@ def open_json(path: Path) -> ArrayTable:
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
     content = _parsed(where, data)
-    found = DataSets()
+    sets = DataSets()
     texts: list[str] = []
     for name, values in _columns(where, content).items():
-        _add(found, name, values, texts)
+        _add(sets, name, values, texts)
     if texts:
         more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
-        found.note(f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}")
-    return found.table(where, "json", data)
+        sets.note(f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}")
+    return sets.table(where, "json", data)
 
 
 def _parsed(where: str, data: bytes) -> Any:
@@ -145,16 +145,16 @@ def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[s
             yield name, value
 
 
-def _add(found: DataSets, name: str, values: list[Any], texts: list[str]) -> None:
+def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None:
     filled = [x for x in values if x is not None]
     if filled and all(isinstance(x, str) for x in filled):
         if is_date(filled[0]):
             dates = seconds_of_dates(values, None)
             if not isinstance(dates, int):
-                found.add(name, dates.seconds, {"units": "s"})
+                sets.add(name, dates.seconds, {"units": "s"})
                 return
         if len(values) <= _MOST_TEXTS:
-            found.add_texts(name, values)
+            sets.add_texts(name, values)
         else:
             texts.append(name)
         return
@@ -168,7 +168,7 @@ def _add(found: DataSets, name: str, values: list[Any], texts: list[str]) -> Non
         texts.append(name)
         return
     if array.size:
-        found.add(name, array, {})
+        sets.add(name, array, {})
 
 
 def _number(value: Any) -> float:

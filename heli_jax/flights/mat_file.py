@@ -84,14 +84,14 @@ def read_mat(data: bytes) -> MatFile:
         # wrote it, so their order tells that of all bytes. Level 4 has no header.
         mark = data[126:128]
         if len(data) > 128 and mark in (b"IM", b"MI"):
-            found = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
+            variables = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
         else:
-            found = dict(_level_4(memoryview(data)))
+            variables = dict(_level_4(memoryview(data)))
         return MatFile(
             # What MATLAB keeps of objects stands behind them without a name.
-            {name: x for name, x in found.items() if isinstance(x, np.ndarray) and name},
-            {name: text for name, text in found.items() if isinstance(text, str)},
-            {name: x.kind for name, x in found.items() if isinstance(x, _Object)},
+            {name: x for name, x in variables.items() if isinstance(x, np.ndarray) and name},
+            {name: text for name, text in variables.items() if isinstance(text, str)},
+            {name: x.kind for name, x in variables.items() if isinstance(x, _Object)},
         )
     except (struct.error, ValueError, UnicodeDecodeError, zlib.error) as e:
         raise DamagedMatFile("a piece of it is no array") from e

@@ -48,8 +48,8 @@ class NamedColumns:
             }
             if names := _chosen(path, count, {p: t for p, t in beside.items() if _are_names(p, t)}):
                 self._names[path] = names
-            if found := _chosen(path, count, {p: t for p, t in beside.items() if _are_units(p, t)}):
-                self._units[path] = found
+            if units := _chosen(path, count, {p: t for p, t in beside.items() if _are_units(p, t)}):
+                self._units[path] = units
 
     def name(self, path: str, column: int) -> str | None:
         """What a column is called; None where nothing says so."""
@@ -58,8 +58,8 @@ class NamedColumns:
 
     def unit(self, path: str, column: int) -> str:
         """The unit of a column, empty where none stands beside the matrix."""
-        found = self._units.get(path)
-        return found[column] if found else ""
+        units = self._units.get(path)
+        return units[column] if units else ""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ def open_numpy(path: Path) -> ArrayTable:
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", _LARGEST)
-    found, objects = DataSets(), []
+    sets, objects = DataSets(), []
 
     def read() -> None:
         for name, content in _members(where, data):
@@ -40,17 +40,17 @@ def open_numpy(path: Path) -> ArrayTable:
             if array is None:
                 objects.append(name)
             else:
-                _add(found, name, array)
+                _add(sets, name, array)
 
     array_table.guarded(path, "file of NumPy", read)
     if objects:
         listed = ", ".join(map(shown, objects[:6]))
         words = f"objects of Python, which are not read: {listed}"
-        if not found.names:
+        if not sets.names:
             problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
             raise wrong(where, problem)
-        found.note(words)
-    return found.table(where, "numpy", data)
+        sets.note(words)
+    return sets.table(where, "numpy", data)
 
 
 def _members(where: str, data: bytes) -> Iterator[tuple[str, bytes]]:
@@ -85,20 +85,20 @@ def _array(content: bytes) -> np.ndarray | None:
     return array.reshape(shape, order="F" if by_columns else "C")
 
 
-def _add(found: DataSets, name: str, array: np.ndarray) -> None:
+def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
     if array.dtype.names is not None:
         for field in array.dtype.names:
-            _add(found, f"{name}.{field}" if name != "data" else field, array[field])
+            _add(sets, f"{name}.{field}" if name != "data" else field, array[field])
         return
     kind = array.dtype.kind
     if kind in "US" and 0 < array.size <= _MOST_TEXTS:
-        found.add_texts(name, [str(x)[:_LONGEST] for x in array.astype(str).ravel()])
+        sets.add_texts(name, [str(x)[:_LONGEST] for x in array.astype(str).ravel()])
     elif kind in "mM":
         unit, count = np.datetime_data(array.dtype)
         if unit in _TICKS and count == 1:
             ticks = array.astype(np.int64).astype(np.float64)
             ticks[np.isnat(array)] = np.nan
-            found.add(name, ticks, {"units": _TICKS[unit]})
+            sets.add(name, ticks, {"units": _TICKS[unit]})
     elif array_table.holds_numbers(array.dtype, array.ndim):
         # In the machine's own order of bytes.
-        found.add(name, array.astype(array.dtype.newbyteorder("=")), {})
+        sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})

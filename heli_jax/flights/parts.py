@@ -24,15 +24,15 @@ def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
     for seconds in clocks:
         rows = np.flatnonzero(np.diff(seconds) > longest_gap(seconds) * (1 + 1e-9))
         gaps += [(float(seconds[i]), float(seconds[i + 1])) for i in rows]
-    found, at = [], begin
+    intervals, at = [], begin
     for before, after in sorted(gaps):
         if before > at:
-            found.append((at, min(before, end)))
+            intervals.append((at, min(before, end)))
         # Gaps of several clocks may overlap.
         at = max(at, after)
     if at < end:
-        found.append((at, end))
-    return [(a, b) for a, b in found if b > a]
+        intervals.append((at, end))
+    return [(a, b) for a, b in intervals if b > a]
 
 
 def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> bool:

@@ -110,13 +110,13 @@ def read_parts(
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
     clocks = [clock.seconds for clock in needed]
-    found = stretches(clocks)
-    if len(found) < 2:
+    intervals = stretches(clocks)
+    if len(intervals) < 2:
         return (_checked(finish(flight_from(logs, request)), request),)
     values = {key: signal.values for key, signal in signals.items()}
     holds = decided_holds(request, values)
     parts, left_out, why = [], [], None
-    for start, end in found:
+    for start, end in intervals:
         name = f"{options.name or 'flight 1'}, part {len(parts) + 1}"
         part = _of_part(request, (start, end), name, holds)
         try:
@@ -137,9 +137,11 @@ def read_parts(
         reasons = {**flight.hold_reason, **reasons}
         parts.append(dataclasses.replace(flight, hold_reason=reasons))
     if not parts:
-        problem = f"{len(found)} parts between gaps, expected one that is long enough; the last: "
+        problem = (
+            f"{len(intervals)} parts between gaps, expected one that is long enough; the last: "
+        )
         raise wrong(request.path, problem + left_out[-1]) from why
-    notes = (*beyond(logs, request), *_notes(found, left_out))
+    notes = (*beyond(logs, request), *_notes(intervals, left_out))
     return (_with_notes(parts[0], notes), *parts[1:])
 
 
@@ -185,11 +187,11 @@ def _of_part(
     return part
 
 
-def _notes(found: list[tuple[float, float]], left_out: list[str]) -> tuple[str, ...]:
-    """What was split and what was left out, in words; `found` [s]."""
-    gaps = [after - before for (_, before), (after, _) in itertools.pairwise(found)]
+def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[str, ...]:
+    """What was split and what was left out, in words; `intervals` [s]."""
+    gaps = [after - before for (_, before), (after, _) in itertools.pairwise(intervals)]
     count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-    note = f"{count} of up to {max(gaps):.3g} s split the run into {len(found)} parts"
+    note = f"{count} of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
     if not left_out:
         return (note,)
     more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""

@@ -106,10 +106,10 @@ def _with_runs(
     assert request.time is not None  # or `load_table` would have refused it
     clock, runs = request.time, request.options.runs
     inner = table.table if isinstance(table, DerivedTable) else table
-    found = with_runs(inner, clock.name, numbers, clock_scale(table, clock), runs)
-    if found is inner:
+    parted = with_runs(inner, clock.name, numbers, clock_scale(table, clock), runs)
+    if parted is inner:
         return table, numbers
-    whole = DerivedTable(found, table.swashplate) if isinstance(table, DerivedTable) else found
+    whole = DerivedTable(parted, table.swashplate) if isinstance(table, DerivedTable) else parted
     return whole, whole.numbers(request.columns)
 
 
@@ -164,14 +164,14 @@ def _of_sources(
 ) -> dict[Key, dict[str, Marked]]:
     """By signal and source the marks in these rows, at the rows' times (N,) [s]."""
     span = (rows.start, rows.stop - 1)
-    found = {}
+    sources = {}
     for key, signal in request.signals.items():
         by_source = marks_of_sources(table, signal.name, span)
-        found[key] = {
+        sources[key] = {
             n: marked._replace(places=seconds[marked.places - rows.start])
             for n, marked in by_source.items()
         }
-    return found
+    return sources
 
 
 def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSignal]:

@@ -59,9 +59,9 @@ def rotor_lines(log: ChannelLog) -> RotorLines | None:
     """
     with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
         for name in fitting_presets(log.format, log.names):
-            found = _by_preset(log, preset(name))
-            if found is not None:
-                return found
+            by_preset = _by_preset(log, preset(name))
+            if by_preset is not None:
+                return by_preset
     return None
 
 
@@ -76,7 +76,7 @@ def _by_preset(log: ChannelLog, table: Preset) -> RotorLines | None:
         return RotorLines(speed.channel, np.nan, np.nan, np.nan, ())
     start, end = span
     rotor = float(np.nanmean(hz[(times >= start) & (times <= end)]))
-    found = []
+    signals = []
     for signal in _SIGNALS:
         chosen = choose(log, table.signals.get(signal, ()))
         # One that is computed from others is none that a sensor shook in.
@@ -84,11 +84,11 @@ def _by_preset(log: ChannelLog, table: Preset) -> RotorLines | None:
             continue
         sampled = _evenly(log.channel(chosen.channel), start, end)
         if sampled is not None:
-            found.append(SignalLines(signal, chosen.channel, lines(*sampled, rotor)))
-    if not found:
+            signals.append(SignalLines(signal, chosen.channel, lines(*sampled, rotor)))
+    if not signals:
         return None
     first = log.first_time
-    return RotorLines(speed.channel, rotor, start - first, end - first, tuple(found))
+    return RotorLines(speed.channel, rotor, start - first, end - first, tuple(signals))
 
 
 def _steady(times: np.ndarray, hz: np.ndarray) -> tuple[float, float] | None:

@@ -87,7 +87,7 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
         table: of rows.
         surveys: of all columns or arrays.
     """
-    found: dict[float, str] = {}
+    rates: dict[float, str] = {}
     for each in surveys:
         step = _is_step(each.name)
         if each.values is None or step is None:
@@ -99,13 +99,13 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
         number = float(values[0])
         rate = 1.0 / number if step else number
         if SLOWEST <= rate <= FASTEST:
-            found.setdefault(rate, f"{shown(each.name)} = {number:g}")
-    if not found:
+            rates.setdefault(rate, f"{shown(each.name)} = {number:g}")
+    if not rates:
         # Of a text alone there may be anything above the rows.
         return getattr(table, "rate_above", None)
-    if len(found) != 1:
+    if len(rates) != 1:
         return None
-    rate, words = next(iter(found.items()))
+    rate, words = next(iter(rates.items()))
     # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words

@@ -230,8 +230,8 @@ def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[S
         return []
     usual = float(np.median(moves[moves > 0]))
     # Once by equal samples, once with the last bit of a frozen sensor going to and fro.
-    found = _runs_out_of_proportion(s, y, facts, usual, 0.0)
-    return found or _runs_out_of_proportion(s, y, facts, usual, _DITHER * usual)
+    stuck = _runs_out_of_proportion(s, y, facts, usual, 0.0)
+    return stuck or _runs_out_of_proportion(s, y, facts, usual, _DITHER * usual)
 
 
 def _runs_out_of_proportion(
@@ -247,7 +247,7 @@ def _runs_out_of_proportion(
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
     least = _longest_by_itself(lengths, moves)
-    found = []
+    stuck = []
     for i in np.flatnonzero(lengths >= least):
         first, last = begins[i], begins[i] + lengths[i] - 1
         begin, end = float(s[first]), float(s[last])
@@ -256,8 +256,8 @@ def _runs_out_of_proportion(
         rests = before < max(_AT_REST * usual, 10.0 * within)
         drifts = np.ptp(y[first : last + 1]) > within
         if end - begin >= STUCK_SECONDS and not rests and not drifts:
-            found.append(Stuck(begin, end, float(y[first])))
-    return sorted(found, key=lambda one: one.begin - one.end)
+            stuck.append(Stuck(begin, end, float(y[first])))
+    return sorted(stuck, key=lambda one: one.begin - one.end)
 
 
 def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
@@ -315,8 +315,8 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
 
 
 def _of_stick(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
-    found = stick_dropouts(x)
-    return None if found is None else Dropouts(found[0], seconds[found[1]])
+    dropouts = stick_dropouts(x)
+    return None if dropouts is None else Dropouts(dropouts[0], seconds[dropouts[1]])
 
 
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

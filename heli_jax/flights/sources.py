@@ -144,8 +144,8 @@ def _by_clocks(log: Table) -> ChannelLog | Table:
     """Arrays whose clocks stand beside them in the file; any other table as it is."""
     swashplate = log.swashplate if isinstance(log, DerivedTable) else None
     table = log.table if isinstance(log, DerivedTable) else log
-    found = by_clocks(table) if isinstance(table, ArrayTable) else None
-    return log if found is None else with_derived(found, swashplate)
+    with_clocks = by_clocks(table) if isinstance(table, ArrayTable) else None
+    return log if with_clocks is None else with_derived(with_clocks, swashplate)
 
 
 def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:

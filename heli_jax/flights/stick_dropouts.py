@@ -27,10 +27,10 @@ def stick_dropouts(x: np.ndarray) -> tuple[float, np.ndarray] | None:
     before, at, after = values[:-2], values[1:-1], values[2:]
     jump = np.minimum(np.abs(at - before), np.abs(at - after))
     away = (lengths[1:-1] <= _SHORT) & (np.abs(after - before) <= _BACK * jump)
-    found, counts = np.unique(at[away], return_counts=True)
-    if not found.size:
+    levels, counts = np.unique(at[away], return_counts=True)
+    if not levels.size:
         return None
-    value = float(found[np.argmax(counts)])
+    value = float(levels[np.argmax(counts)])
     these = away & (at == value)
     rest = x[x != value]
     if (

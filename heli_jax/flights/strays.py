@@ -53,19 +53,19 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
     absurd, too_large = is_absurd(numbers), "larger than any measurement"
     alone &= ~absurd
-    found = ((suspected(numbers), WHY_SUSPECTED), (absurd, too_large), (alone, off))
-    return tuple(Strays(seconds[at], numbers[at], words) for at, words in found if at.any())
+    kinds = ((suspected(numbers), WHY_SUSPECTED), (absurd, too_large), (alone, off))
+    return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())
 
 
-def stray_words(found: Strays) -> str:
+def stray_words(strays: Strays) -> str:
     """`3 samples of -99, the first at 12.3 s, which ...`."""
-    counts = counted(found.values)
+    counts = counted(strays.values)
     words = listed(counts)
     if len(counts) > 3:
-        low, high = found.values.min(), found.values.max()
-        words = f"{found.values.size} samples from {low:.4g} to {high:.4g}"
-    at = "at" if found.times.size == 1 else "the first at"
-    return f"{words}, {at} {found.times[0]:.6g} s, {found.why}"
+        low, high = strays.values.min(), strays.values.max()
+        words = f"{strays.values.size} samples from {low:.4g} to {high:.4g}"
+    at = "at" if strays.times.size == 1 else "the first at"
+    return f"{words}, {at} {strays.times[0]:.6g} s, {strays.why}"
 
 
 def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.ndarray, float]:

@@ -45,8 +45,8 @@ def table_clock(
         stated = stated_rate(table, surveys)
         signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
         if signal is None and stated is not None:
-            (found, said), unit = stated, None
-            signal, guessed = by_rate(found, counter_of(surveys)), True
+            (clock, said), unit = stated, None
+            signal, guessed = by_rate(clock, counter_of(surveys)), True
     else:
         signal, guessed = asked_time(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a

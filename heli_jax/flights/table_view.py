@@ -185,25 +185,25 @@ def with_joined_clock(table: Table) -> Table:
     Args:
         table: of rows.
     """
-    found = _two_columns(table.names)
-    if found is None:
+    clock = _two_columns(table.names)
+    if clock is None:
         return table
     try:
-        columns = table.numbers([found.whole, found.rest])
+        columns = table.numbers([clock.whole, clock.rest])
     # What is wrong with them is told to whom asks for them.
     except InputError:
         return table
-    whole, rest = columns[found.whole], columns[found.rest]
+    whole, rest = columns[clock.whole], columns[clock.rest]
     with np.errstate(invalid="ignore"):
         parts = whole.size > 1 and bool(
             np.all(whole == np.rint(whole))
-            and np.all((rest >= 0) & (rest * found.scale < 1.0))
+            and np.all((rest >= 0) & (rest * clock.scale < 1.0))
             and np.any(np.diff(whole) == 0)
         )
     if not parts:
         return table
-    note = f"{shown(found.whole)} and {shown(found.rest)} are taken as one clock"
-    return TableView(table, clock=found, note=note)
+    note = f"{shown(clock.whole)} and {shown(clock.rest)} are taken as one clock"
+    return TableView(table, clock=clock, note=note)
 
 
 def _two_columns(names: Sequence[str]) -> _Clock | None:

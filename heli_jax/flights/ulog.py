@@ -125,11 +125,11 @@ def _read_messages(path: str, data: bytes, content: _Content) -> None:
 
 
 def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> int:
-    told = at
+    report_at = at
     while at + 3 <= end:
-        if at >= told:
+        if at >= report_at:
             progress.advance(at)
-            told = at + progress.STEP
+            report_at = at + progress.STEP
         size, kind = data[at] | data[at + 1] << 8, data[at + 2]
         body, after = at + 3, at + 3 + size
         limit = min((o for o in content.appended if o > at), default=end)
@@ -164,8 +164,8 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
 def _next_sync(data: bytes, at: int) -> int:
     """Behind the next mark that the logger writes from time to time, or the end."""
     # The mark is itself a message, S, whose body it is; the next message begins right behind it.
-    found = data.find(_SYNC, at)
-    return found + len(_SYNC) if found >= 0 else len(data)
+    position = data.find(_SYNC, at)
+    return position + len(_SYNC) if position >= 0 else len(data)
 
 
 def _take(path: str, kind: str, body: bytes, content: _Content) -> None:

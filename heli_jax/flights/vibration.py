@@ -62,10 +62,10 @@ def lines(
         return ()
     around = _running_median(power, _SURROUNDINGS)
     peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
-    found = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
+    peaks = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
     rate = 1.0 / dt if logged_hz is None else logged_hz
     result = []
-    for i in found[hz[found] >= _SLOWEST]:
+    for i in peaks[hz[peaks] >= _SLOWEST]:
         # Two bins to either side: as wide as the window makes a line.
         part = slice(max(i - 2, 0), i + 3)
         share = float(np.sum(power[part] - around[part])) / total

@@ -229,16 +229,16 @@ class Code:
         self.declared[f"@{own}"] = f"declare {kind} @{own}({takes}) nounwind memory(none)"
         operands = [self.of(v, shared) for v in values]
         if shared or self.lanes == 1:
-            given = ", ".join(f"{kind} {o}" for o in operands)
-            return self.made(f"call {kind} @{own}({given})", dtype, shared)
+            arguments = ", ".join(f"{kind} {o}" for o in operands)
+            return self.made(f"call {kind} @{own}({arguments})", dtype, shared)
         vector, joined = self.vector(kind), "poison"
         for lane in range(self.lanes):
             each = [
                 self.made(f"extractelement {vector} {o}, i64 {lane}", dtype, True).operand
                 for o in operands
             ]
-            given = ", ".join(f"{kind} {o}" for o in each)
-            result = self.made(f"call {kind} @{own}({given})", dtype, True).operand
+            arguments = ", ".join(f"{kind} {o}" for o in each)
+            result = self.made(f"call {kind} @{own}({arguments})", dtype, True).operand
             right = f"insertelement {vector} {joined}, {kind} {result}, i64 {lane}"
             joined = self.made(right, dtype, False).operand
         return Value(joined, dtype, False)

@@ -70,13 +70,13 @@ class GpuKernel:
         results = _memory(self._device, count, tuple((r.shape, r.dtype) for r in self._results))
         run = self._run
         kinds = (run.stays, whole(run.stored), run.carry, self._results)
-        given = [jax.device_put(list(part), self._device) for part in (stays, stored, carry)]
+        on_device = [jax.device_put(list(part), self._device) for part in (stays, stored, carry)]
         tables = [
             self._table(_pointers(arrays, count, kind))
-            for arrays, kind in zip([*given, results], kinds, strict=True)
+            for arrays, kind in zip([*on_device, results], kinds, strict=True)
         ]
         # The driver knows nothing of what JAX is still computing.
-        jax.block_until_ready((given, results, tables))
+        jax.block_until_ready((on_device, results, tables))
         few = count < self._gpu.processors * _THREADS
         threads = _FEW if few else _THREADS
         arguments = [*(t.unsafe_buffer_pointer() for t in tables), 0, count, count]

@@ -72,10 +72,10 @@ class Kernel:
         assert count % self.lanes == 0
         assert self._run.steps >= 1
         # Kept until the call is over: the program has pointers to them.
-        given = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
+        arguments = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
         kinds = (self._run.stays, whole(self._run.stored), self._run.carry)
-        tables = [_pointers(v, count, kind) for v, kind in zip(given, kinds, strict=True)]
+        tables = [_pointers(v, count, kind) for v, kind in zip(arguments, kinds, strict=True)]
         ends = _pointers(results, count, self._results)
         blocks = count // self.lanes
         shares = np.linspace(0, blocks, min(threads, blocks) + 1).astype(int) * self.lanes

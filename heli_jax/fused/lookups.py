@@ -60,10 +60,10 @@ def gathered(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
     return result
 
 
-def _filling(dtype: np.dtype, given: Any) -> Value:
+def _filling(dtype: np.dtype, value: Any) -> Value:
     """What stands for an element beyond the array, as JAX has it."""
-    if given is not None:
-        return constant(given, dtype)
+    if value is not None:
+        return constant(value, dtype)
     if dtype.kind == "f":
         return constant(np.nan, dtype)
     if dtype.kind == "b":

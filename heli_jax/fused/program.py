@@ -83,9 +83,9 @@ def write(run: Run, target: Target) -> Text:
 
     carried = loop(code, steps, carry, step)
     results = translate(code, run.last.jaxpr, run.last.consts, [*stays, *stored, *carried])
-    given = [elements(code, v) for v in results]
-    kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in given]
-    for i, value in enumerate(v for array in given for v in array.ravel()):
+    arrays = [elements(code, v) for v in results]
+    kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in arrays]
+    for i, value in enumerate(v for array in arrays for v in array.ravel()):
         _store(code, value, code.pointer("%results", i))
     code.write("br label %done")
     code.label("done")

@@ -97,9 +97,9 @@ def libdevice() -> Path | None:
     """NVIDIA's library of functions, where CUDA or a package of it is installed."""
     roots = [os.environ.get(n) for n in ("CUDA_HOME", "CUDA_PATH")]
     roots.append("/usr/local/cuda")
-    found = importlib.util.find_spec("nvidia")
+    package = importlib.util.find_spec("nvidia")
     # One package for each part of CUDA 12, and one folder for all parts of CUDA 13.
-    for place in [] if found is None else found.submodule_search_locations or []:
+    for place in [] if package is None else package.submodule_search_locations or []:
         roots += [str(Path(place) / part) for part in ("cuda_nvcc", "cu13", "cu12")]
     for root in roots:
         path = Path(root or "/nowhere") / "nvvm" / "libdevice" / "libdevice.10.bc"

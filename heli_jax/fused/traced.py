@@ -82,24 +82,24 @@ def traced(
     def last(own: Any, records: Any, carry: Any) -> Any:
         return making(own[0], records, own[1]).last(carry)
 
-    found: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
 
-    def begin(shared: Any, given: Any, element: Any) -> Any:
+    def begin(shared: Any, inputs: Any, element: Any) -> Any:
         """What is carried before the first sample, and what stays."""
-        run = making(shared, given, element)
-        carry, found["steps"] = run.carry, run.steps
+        run = making(shared, inputs, element)
+        carry, parts["steps"] = run.carry, run.steps
         own = shared, element
-        of_step, a_step = hoisted(step, own, given, carry, sample)
-        of_last, the_last = hoisted(last, own, given, carry)
+        of_step, a_step = hoisted(step, own, inputs, carry, sample)
+        of_last, the_last = hoisted(last, own, inputs, carry)
         both, n = [*of_step, *of_last], len(of_step)
         # Traced here, where the values that they stay with are at hand.
-        found["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
+        parts["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
             both, records, carry, sample
         )
-        found["last"], shape = jax.make_jaxpr(
+        parts["last"], shape = jax.make_jaxpr(
             lambda v, *rest: the_last(v[n:], *rest), return_shape=True
         )(both, records, carry)
-        found["results"] = jax.tree.structure(shape)
+        parts["results"] = jax.tree.structure(shape)
         return carry, both
 
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
@@ -114,17 +114,17 @@ def traced(
         raise UnsupportedError("what begins with a record of each element's own")
     varies = _vary(closed.jaxpr, arguments[n_common:])[len(carried) :]
     run = Run(
-        found["step"],
-        found["last"],
+        parts["step"],
+        parts["last"],
         tuple(
             Argument(v.shape, np.dtype(v.dtype), not varying)
             for v, varying in zip(stay, varies, strict=True)
         ),
         tuple(Argument(v.shape, v.dtype, not o) for v, o in zip(rows, own_records, strict=True)),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
-        found["steps"],
+        parts["steps"],
     )
-    return Traced(run, found["results"], closed)
+    return Traced(run, parts["results"], closed)
 
 
 def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:

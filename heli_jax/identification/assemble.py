@@ -195,7 +195,7 @@ def assemble(
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
     arrived = bool(best.converged)
     twins = twins_of(problem, solution, e) if arrived else ()
-    second = second_solutions(problem, solution, e, told=twins) if arrived else ()
+    second = second_solutions(problem, solution, e, reported=twins) if arrived else ()
     errors = standard_errors(
         problem,
         solution,
@@ -219,7 +219,7 @@ def assemble(
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
-    found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
+    feedback, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution, e.J) if bool(best.converged) else {}
     stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
@@ -242,7 +242,7 @@ def assemble(
         numbers = _numbers(problem, solution, e, errors, absent)
         status = _status(best, e, verdict)
         estimates = {k: numbers.of_interest[k] for k in layout.free}
-    elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
+    elif bool(best.converged) and not (ahead or instruments or any(f.present for f in feedback)):
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
         sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
         flights = labels(problem.training)
@@ -262,11 +262,14 @@ def assemble(
     correlated = correlated if errors.coloured else {}
     notes = fit_notes(problem, search, optimum, e, numbers, correlated, all_white)
     notes += [*limit_notes(errors.limits), *excitation.aliasing(fast)]
-    told = any(not f.by_amplitude for f in lacking)
-    notes += [*closed_loop, *feedback_trust_notes(moved, Loop(found, instruments, stays))]
+    mentioned = any(not f.by_amplitude for f in lacking)
+    notes += [*closed_loop, *feedback_trust_notes(moved, Loop(feedback, instruments, stays))]
     notes += [*weak_note(weak), *adequacy.sentences]
     # Of several outputs and flights the same is said once.
-    notes += [*(() if all_white else _missing(problem, signals, adequacy, told=told)), *held.notes]
+    notes += [
+        *(() if all_white else _missing(problem, signals, adequacy, mentioned=mentioned)),
+        *held.notes,
+    ]
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -298,12 +301,12 @@ def assemble(
         trace=optimum.trace,
         notes=tuple(dict.fromkeys(notes)),
         reached=solution,
-        feedback=found,
+        feedback=feedback,
         moved_by_feedback=moved,
         held_upright=stays,
         weak_instrument=weak,
         instruments=instruments,
-        disturbed_loop=not all_white and known_no_gusts(problem, found),
+        disturbed_loop=not all_white and known_no_gusts(problem, feedback),
         late_stick=late,
         seed=run.seed,
         timing=run.timing,
@@ -340,13 +343,13 @@ def _feedback(
     # is unbiased in a closed loop too.
     estimates = arrived.of_interest if arrived is not None else {}
     # A late log looks like feedback: each input at the time at which it acted.
-    found = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
-    notes = feedback_notes(problem, found, all(w.white for w in white.values()))
-    return found, (*notes, *untested(problem))
+    feedback = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
+    notes = feedback_notes(problem, feedback, all(w.white for w in white.values()))
+    return feedback, (*notes, *untested(problem))
 
 
 def _missing(
-    problem: Problem, signals: tuple[Signals, ...], adequacy: Adequacy, *, told: bool
+    problem: Problem, signals: tuple[Signals, ...], adequacy: Adequacy, *, mentioned: bool
 ) -> list[str] | tuple[()]:
     """What inputs still explain of the residuals (innovations)."""
     # Where the model is inadequate its own sentences say more.
@@ -358,7 +361,7 @@ def _missing(
             for s, flight in zip(signals, problem.training, strict=True)
         ),
         sensors=is_kinematic(problem.model),
-        told=told,
+        mentioned=mentioned,
     )
 
 
@@ -395,14 +398,14 @@ def _ahead(problem: Problem, params: Any, at: Solution, white: dict[str, Whitene
     """Of an unstable model under filter error, whose simulation says nothing over a whole record:
     by what is predicted some seconds ahead."""
     records, error, expected = [], {}, {}
-    for label, flight, found in zip(
+    for label, flight, prediction in zip(
         labels(problem.training), problem.training, predictions_ahead(at), strict=True
     ):
-        records.append(Record(label, flight.dt, flight.outputs, found.predicted))
-        for n, v in found.predicted.items():
+        records.append(Record(label, flight.dt, flight.outputs, prediction.predicted))
+        for n, v in prediction.predicted.items():
             missed = float(np.nansum(np.square(flight.outputs[n] - v)))
             error[n] = error.get(n, 0.0) + missed
-            expected[n] = expected.get(n, 0.0) + float(np.nansum(found.variance[n]))
+            expected[n] = expected.get(n, 0.0) + float(np.nansum(prediction.variance[n]))
     agreement = {}
     for n in error:
         both = [(r.measured[n], r.simulated[n]) for r in records if n in r.measured]

@@ -141,7 +141,7 @@ def check(problem: Problem) -> Check:
     # determined there may differ from what is at the optimum, for which the fit asks again.
     at = Solution(*guess[:4])
     twins = twins_of(problem, at, guess.e, optimum=False)
-    second = second_solutions(problem, at, guess.e, optimum=False, told=twins)
+    second = second_solutions(problem, at, guess.e, optimum=False, reported=twins)
     around = Around(twins=twins, second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
@@ -210,10 +210,10 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     guess = first_guess(problem)
     ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
-    found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
+    findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
     gusts = guessed_gusts(problem)
     notes = (*ranking.notes, gusts) if gusts else ranking.notes
-    return dataclasses.replace(ranking, record=tuple(f for f in found if f.bad), notes=notes)
+    return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 
 def _starts(
@@ -282,19 +282,19 @@ def fit(
         return _with_doubtful_inputs(problem, guess, assemble(problem, search, optimum, run))
 
 
-def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, found: Fit) -> Fit:
+def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
     """With what moved too far or not far enough at the start values, and where the model did not
     follow from there what moved the wrong way, first of all notes."""
     # Of an angle that is in other units than its rate that is said already, and is surer.
     if contradictions(problem):
-        return found
+        return estimate
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     at_start = (flights, guess.e.simulated, sticks_of(problem.model))
     # A fit follows numbers in any unit, and does not tell.
     doubts = wrong_units(*at_start)
-    if not found.adequacy.adequate:
+    if not estimate.adequacy.adequate:
         doubts += against_start(*at_start)
-    return dataclasses.replace(found, notes=(*(f.sentence for f in doubts), *found.notes))
+    return dataclasses.replace(estimate, notes=(*(f.sentence for f in doubts), *estimate.notes))
 
 
 def _search(

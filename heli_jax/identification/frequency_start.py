@@ -78,12 +78,12 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
         continuity=None,
         first_guess=None,
     )
-    found = fit(in_frequency, max_steps=max_steps)
+    first = fit(in_frequency, max_steps=max_steps)
     values = {
-        name: _value(estimate, found.status, problem.free[name].start)
-        for name, estimate in found.estimates.items()
+        name: _value(estimate, first.status, problem.free[name].start)
+        for name, estimate in first.estimates.items()
     }
-    return FrequencyErrorStart(values, found.status, time.perf_counter() - began, found.notes)
+    return FrequencyErrorStart(values, first.status, time.perf_counter() - began, first.notes)
 
 
 def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:

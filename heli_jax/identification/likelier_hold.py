@@ -9,7 +9,7 @@ from heli_jax.identification.validation.other_hold import likelier_hold
 
 
 def with_likelier_hold(
-    problem: Problem, found: Fit, refit: Callable[[Problem], Fit]
+    problem: Problem, fit: Fit, refit: Callable[[Problem], Fit]
 ) -> tuple[Problem, Fit]:
     """The fit, and what was fitted, with inputs held of which the log left that open, where the
     record bears it out.
@@ -19,17 +19,17 @@ def with_likelier_hold(
 
     Args:
         problem: what was fitted.
-        found: the fit.
+        fit: the fit.
         refit: fits a problem as that one was.
     """
-    if found.status == "not-converged":
-        return problem, found
+    if fit.status == "not-converged":
+        return problem, fit
     # By how much the colour of the residuals widens intervals: the record is worth so much less.
-    wider = [e.sd / e.sd_white for e in found.estimates.values() if e.sd and e.sd_white]
-    held = likelier_hold(problem, found.reached, max(wider, default=1.0))
+    wider = [e.sd / e.sd_white for e in fit.estimates.values() if e.sd and e.sd_white]
+    held = likelier_hold(problem, fit.reached, max(wider, default=1.0))
     if held is None:
-        return problem, found
+        return problem, fit
     again = refit(held.problem)
-    if again.status == "not-converged" or not again.log_likelihood > found.log_likelihood:
-        return problem, found
+    if again.status == "not-converged" or not again.log_likelihood > fit.log_likelihood:
+        return problem, fit
     return held.problem, dataclasses.replace(again, notes=(held.sentence, *again.notes))

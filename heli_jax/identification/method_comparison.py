@@ -119,17 +119,17 @@ def compare_methods(
         report(f"the same by {METHODS[method].label}")
         began = time.perf_counter()
         try:
-            found = fit(problem, starts=starts, seed=seed, max_steps=max_steps)
-            result = MethodResult(method, found, _why_none(found), 0.0)
+            estimate = fit(problem, starts=starts, seed=seed, max_steps=max_steps)
+            result = MethodResult(method, estimate, _why_none(estimate), 0.0)
         except ValueError as e:  # one that fails must not cost the others
             result = MethodResult(method, None, str(e), 0.0)
         results.append(result._replace(seconds=time.perf_counter() - began))
     return MethodComparison(tuple(results))
 
 
-def _why_none(found: Fit) -> str:
-    if found.status != "not-converged":
+def _why_none(fit: Fit) -> str:
+    if fit.status != "not-converged":
         return ""
     # What stopped the optimiser is the first of its notes about itself.
-    stopped = [n for n in found.notes if "stopped" in n]
+    stopped = [n for n in fit.notes if "stopped" in n]
     return stopped[0] if stopped else "it did not converge"

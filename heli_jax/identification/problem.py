@@ -133,8 +133,8 @@ class Problem:
         _check_windows(self)
         _check_offsets(self)
         if not self.training:
-            found = "every one is held out" if self.flights else "the list of flights is empty"
-            raise ValueError(f"no flight to fit: {found}")
+            reason = "every one is held out" if self.flights else "the list of flights is empty"
+            raise ValueError(f"no flight to fit: {reason}")
         for flight in self.flights:
             _check_flight(flight, self)
         _check_model(self)

@@ -45,7 +45,7 @@ _OF_FILTER = (
 
 def with_second_method(
     problem: Problem,
-    found: Fit,
+    first: Fit,
     *,
     undisturbed: Callable[[], Problem] | None = None,
     max_steps: int = 200,
@@ -59,15 +59,15 @@ def with_second_method(
 
     Args:
         problem: what was fitted.
-        found: the fit.
+        first: the fit.
         undisturbed: of filter error, makes the problem by the other method, without a disturbance.
         max_steps: of the other method's optimiser.
         progress: called with a line of text before the work.
     """
     filtered = problem.method == "filter-error"
-    asked = undisturbed is not None and _of_filter(problem, found) if filtered else None
-    if not (_is_asked(problem, found) if asked is None else asked):
-        return found
+    asked = undisturbed is not None and _of_filter(problem, first) if filtered else None
+    if not (_is_asked(problem, first) if asked is None else asked):
+        return first
     if progress is not None:
         why = "the inputs ask for other values" if filtered else "the residuals are coloured"
         progress(f"{why}: the same by {METHODS[_METHOD].label}")
@@ -79,38 +79,38 @@ def with_second_method(
         other = fit(other, max_steps=max_steps)
     except ValueError:
         # It takes fewer problems than output error does; nothing is said then.
-        return found
+        return first
     if other.status == "not-converged" or other.untrusted:
-        return found
+        return first
     apart = _excluded if filtered else _apart
     estimates = {
         n: _interval(other.estimates[n])
-        for n, a in found.estimates.items()
+        for n, a in first.estimates.items()
         if apart(a, other.estimates[n])
     }
     second = SecondMethod(METHODS[_METHOD].label, estimates)
     said = sentence(second, _OF_FILTER if filtered else _OF_OUTPUT_ERROR) if estimates else ""
-    notes = (*found.notes, said) if said else found.notes
-    return dataclasses.replace(found, second_method=second, notes=notes)
+    notes = (*first.notes, said) if said else first.notes
+    return dataclasses.replace(first, second_method=second, notes=notes)
 
 
-def _is_asked(problem: Problem, found: Fit) -> bool:
-    if problem.method != "output-error" or found.status == "not-converged" or not found.coloured:
+def _is_asked(problem: Problem, first: Fit) -> bool:
+    if problem.method != "output-error" or first.status == "not-converged" or not first.coloured:
         return False
     # What is wrong with the record, or explains nothing of it, is said by itself.
-    if found.untrusted or found.adequacy.by_chance or not problem.model.linear:
+    if first.untrusted or first.adequacy.by_chance or not problem.model.linear:
         return False
-    vafs = [m.vaf for m in found.metrics.values()]
+    vafs = [m.vaf for m in first.metrics.values()]
     return bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
 
 
-def _of_filter(problem: Problem, found: Fit) -> bool:
+def _of_filter(problem: Problem, first: Fit) -> bool:
     """Whether filter error's estimates are others than the inputs ask for."""
-    if found.status == "not-converged" or found.untrusted or not problem.model.linear:
+    if first.status == "not-converged" or first.untrusted or not problem.model.linear:
         return False
-    if found.adequacy.by_chance or found.adequacy.ahead or any(f.present for f in found.feedback):
+    if first.adequacy.by_chance or first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
-    return not by_the_inputs(found.reached)
+    return not by_the_inputs(first.reached)
 
 
 def _interval(b: Estimate) -> tuple[float, float, float] | None:

@@ -67,27 +67,27 @@ class Content(NamedTuple):
     axes: tuple[Axis, ...]
 
 
-def content_of(given: Mapping[str, Any]) -> Content:
+def content_of(mapping: Mapping[str, Any]) -> Content:
     """The content of a file from what its YAML holds.
 
     Raises:
         InputError: anything in it is wrong; the sentence begins with the place within the file.
     """
     # Unknown keys first: a misspelt key is the likeliest reason for one that is missing.
-    _known(given, _KEYS, "")
+    _known(mapping, _KEYS, "")
     for key in ("name", "states", "inputs", "outputs", "parameters", "A"):
-        if key not in given:
+        if key not in mapping:
             raise InputError(f"{key}: missing, expected one of a linear model's keys")
-    name = given["name"]
+    name = mapping["name"]
     if not isinstance(name, str) or not _TITLE.fullmatch(name):
         raise InputError(f"name: expected a short name such as roll, got {name!r:.60}")
     # Outputs are not asked for names of their own below: one with a state's name is that state.
     states, inputs, outputs = (
-        {n: _signal(one, f"{key}.{n}") for n, one in _section(given, key).items()}
+        {n: _signal(one, f"{key}.{n}") for n, one in _section(mapping, key).items()}
         for key in ("states", "inputs", "outputs")
     )
     parameters = {
-        n: _quantity(one, f"parameters.{n}") for n, one in _section(given, "parameters").items()
+        n: _quantity(one, f"parameters.{n}") for n, one in _section(mapping, "parameters").items()
     }
     _once({"states": states, "inputs": inputs, "parameters": parameters})
     return Content(
@@ -96,21 +96,21 @@ def content_of(given: Mapping[str, Any]) -> Content:
         inputs,
         outputs,
         parameters,
-        _delays(given, inputs, parameters),
-        _axes(given, states, inputs),
+        _delays(mapping, inputs, parameters),
+        _axes(mapping, states, inputs),
     )
 
 
-def _known(given: Mapping[Any, Any], known: Iterable[str], place: str) -> None:
-    for key in given:
+def _known(mapping: Mapping[Any, Any], known: Iterable[str], place: str) -> None:
+    for key in mapping:
         if key not in known:
             where = f"{place}.{key}" if place else f"{key}"
             raise InputError(f"{where}: unknown key{nearest(str(key), known)}")
 
 
-def _section(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """A section of named things, which may not be empty; their names can be names."""
-    section = as_mapping(given[key], key)
+    section = as_mapping(mapping[key], key)
     if not section:
         raise InputError(f"{key}: empty, expected at least one")
     # Parameters make no matrix larger: only what has rows and columns is bounded.
@@ -129,10 +129,10 @@ def _section(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return section
 
 
-def as_mapping(given: Any, place: str) -> Mapping[str, Any]:
-    if not isinstance(given, Mapping):
-        raise InputError(f"{place}: expected names with values, got {given!r:.60}")
-    return given
+def as_mapping(value: Any, place: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{place}: expected names with values, got {value!r:.60}")
+    return value
 
 
 def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
@@ -145,46 +145,46 @@ def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
             seen[name] = key
 
 
-def _signal(given: Any, place: str) -> Signal:
+def _signal(entry: Any, place: str) -> Signal:
     """A state, input or output: its unit, or {unit, meaning}."""
     # A unit alone is the usual case, and a mapping for it would double the length of a file.
-    given = {"unit": given} if isinstance(given, str) else as_mapping(given, place)
-    _known(given, ("unit", "meaning"), place)
-    si, scale, dimension = _unit(given, place)
-    return Signal(si, scale, dimension, _words(given, "meaning", place))
+    entry = {"unit": entry} if isinstance(entry, str) else as_mapping(entry, place)
+    _known(entry, ("unit", "meaning"), place)
+    si, scale, dimension = _unit(entry, place)
+    return Signal(si, scale, dimension, _words(entry, "meaning", place))
 
 
-def _quantity(given: Any, place: str) -> Quantity:
-    given = as_mapping(given, place)
-    _known(given, ("value", "unit", "source", "meaning", "positive"), place)
-    value = given.get("value")
+def _quantity(entry: Any, place: str) -> Quantity:
+    entry = as_mapping(entry, place)
+    _known(entry, ("value", "unit", "source", "meaning", "positive"), place)
+    value = entry.get("value")
     # In Python true is the number 1, so that it has to be refused by itself, here and below.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{place}.value: expected a number, got {value!r:.40}")
-    si, scale, dimension = _unit(given, place)
+    si, scale, dimension = _unit(entry, place)
     # Finite in SI too: a large number in a large unit overflows only here.
     number = float(value) * scale
     if not math.isfinite(number):
         raise InputError(f"{place}.value: expected a finite number, got {value!r:.40}")
-    positive = given.get("positive", False)
+    positive = entry.get("positive", False)
     if not isinstance(positive, bool):
         raise InputError(f"{place}.positive: expected true or false, got {positive!r:.40}")
-    source = _words(given, "source", place)
+    source = _words(entry, "source", place)
     # Kept in SI, since every result is reported in SI, whatever the file was written in.
     constant = Constant(number, si, source)
-    return Quantity(constant, dimension, positive, _words(given, "meaning", place))
+    return Quantity(constant, dimension, positive, _words(entry, "meaning", place))
 
 
-def _words(given: Mapping[str, Any], key: str, place: str) -> str:
-    words = given.get(key, "")
+def _words(mapping: Mapping[str, Any], key: str, place: str) -> str:
+    words = mapping.get(key, "")
     if not isinstance(words, str):
         raise InputError(f"{place}.{key}: expected words, got {words!r:.40}")
     return words
 
 
-def _unit(given: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
+def _unit(mapping: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
     """The SI unit of the same kind, what takes a number there, and the dimension."""
-    unit = given.get("unit")
+    unit = mapping.get("unit")
     # YAML reads a bare 1 as a number.
     unit = str(unit) if unit == 1 and not isinstance(unit, bool) else unit
     if not isinstance(unit, str):
@@ -203,12 +203,12 @@ def _unit(given: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
 
 
 def _delays(
-    given: Mapping[str, Any],
+    mapping: Mapping[str, Any],
     inputs: Mapping[str, Signal],
     parameters: Mapping[str, Quantity],
 ) -> tuple[tuple[str, str], ...]:
-    found = []
-    for name, parameter in as_mapping(given.get("delays", {}), "delays").items():
+    delays = []
+    for name, parameter in as_mapping(mapping.get("delays", {}), "delays").items():
         place = f"delays.{name}"
         if name not in inputs:
             raise InputError(f"{place}: no such input{nearest(str(name), inputs)}")
@@ -223,10 +223,10 @@ def _delays(
                 f"{place}: expected a parameter in s, got {parameter} in "
                 f"{parameters[parameter].constant.unit}"
             )
-        found.append((name, parameter))
+        delays.append((name, parameter))
     # Only states are looked for: without a rate there is nothing to disturb, and without an angle a
     # mode still has a name.
-    return tuple(found)
+    return tuple(delays)
 
 
 # Name, states that may be its rate, the state that may be its angle.
@@ -239,40 +239,40 @@ _AXES = (
 
 
 def _axes(
-    given: Mapping[str, Any], states: Mapping[str, Signal], inputs: Mapping[str, Signal]
+    mapping: Mapping[str, Any], states: Mapping[str, Signal], inputs: Mapping[str, Signal]
 ) -> tuple[Axis, ...]:
     """The axes that the file states, else those that the names of its states say."""
-    if "axes" not in given:
+    if "axes" not in mapping:
         return tuple(
             Axis(name, rate, angle if angle in states else None)
             for name, rates, angle in _AXES
             for rate in rates
             if rate in states
         )
-    axes = as_mapping(given["axes"], "axes")
+    axes = as_mapping(mapping["axes"], "axes")
     return tuple(_axis(str(n), one, states, inputs) for n, one in axes.items())
 
 
 def _axis(
-    name: str, given: Any, states: Mapping[str, Signal], inputs: Mapping[str, Signal]
+    name: str, entry: Any, states: Mapping[str, Signal], inputs: Mapping[str, Signal]
 ) -> Axis:
     place = f"axes.{name}"
-    given = as_mapping(given, place)
-    _known(given, ("rate", "angle", "stick", "flybar", "flapping"), place)
-    if "rate" not in given:
+    entry = as_mapping(entry, place)
+    _known(entry, ("rate", "angle", "stick", "flybar", "flapping"), place)
+    if "rate" not in entry:
         raise InputError(f"{place}.rate: missing, expected a state")
     # All names in one list, so that each of them is checked in the same way and told with its
     # place.
-    named = [("rate", given["rate"], states)]
+    named = [("rate", entry["rate"], states)]
     for key in ("flybar", "flapping"):
-        several = given.get(key, [])
+        several = entry.get(key, [])
         if not isinstance(several, list):
             raise InputError(f"{place}.{key}: expected a list of states, got {several!r:.40}")
         named += [(key, one, states) for one in several]
     named += [
-        (key, given[key], known)
+        (key, entry[key], known)
         for key, known in (("angle", states), ("stick", inputs))
-        if key in given
+        if key in entry
     ]
     for key, one, known in named:
         if not isinstance(one, str) or one not in known:
@@ -280,9 +280,9 @@ def _axis(
             raise InputError(f"{place}.{key}: no such {kind} {one!r:.40}{nearest(str(one), known)}")
     return Axis(
         name,
-        given["rate"],
-        given.get("angle"),
-        stick=given.get("stick"),
-        flybar=tuple(given.get("flybar", [])),
-        tilt=tuple(given.get("flapping", [])),
+        entry["rate"],
+        entry.get("angle"),
+        stick=entry.get("stick"),
+        flybar=tuple(entry.get("flybar", [])),
+        tilt=tuple(entry.get("flapping", [])),
     )

@@ -119,25 +119,25 @@ class _Parser:
         return ExpressionError(f"{self.text!r:.80}, character {token.at}: {problem}")
 
     def whole(self) -> Node:
-        found = self.sum()
+        node = self.sum()
         if self.now.kind != "end":
             raise self.refuse(f"expected an operator or the end, got {self.now.text!r}", self.now)
-        return found
+        return node
 
     def sum(self) -> Node:
-        found = self.product()
+        node = self.product()
         while self.now.text in ("+", "-"):
             operator = self.take().text
             # From the left, as Python has it: a - b - c is (a - b) - c.
-            found = Binary(operator, found, self.product())
-        return found
+            node = Binary(operator, node, self.product())
+        return node
 
     def product(self) -> Node:
-        found = self.signed()
+        node = self.signed()
         while self.now.text in ("*", "/"):
             operator = self.take().text
-            found = Binary(operator, found, self.signed())
-        return found
+            node = Binary(operator, node, self.signed())
+        return node
 
     def signed(self) -> Node:
         if self.now.text not in ("-", "+"):
@@ -185,11 +185,11 @@ class _Parser:
             return Parameter(token.text)
         if token.text == "(":
             self.deeper(token)
-            found = self.sum()
+            node = self.sum()
             if self.take().text != ")":
                 raise self.refuse("this parenthesis is never closed", token)
             self.depth -= 1
-            return found
+            return node
         raise self.refuse(
             f"expected a number, a parameter or a parenthesis, got {_shown(token)}", token
         )
@@ -210,14 +210,14 @@ def _tokens(text: str) -> Iterator[_Token]:
         if text[at] in " \t\n":
             at += 1
             continue
-        found = _TOKEN.match(text, at)
-        if found is None:
+        match = _TOKEN.match(text, at)
+        if match is None:
             raise ExpressionError(
                 f"{text!r:.80}, character {at + 1}: expected numbers, parameters, + - * / ^ and "
                 f"parentheses, got {text[at]!r}"
             )
-        yield _Token(str(found.lastgroup), found.group(), at + 1)
-        at = found.end()
+        yield _Token(str(match.lastgroup), match.group(), at + 1)
+        at = match.end()
     # A token of its own for the end, so that a message about it has a place in the text.
     yield _Token("end", "", len(text) + 1)
 

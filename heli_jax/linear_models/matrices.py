@@ -34,17 +34,17 @@ class _Unit(NamedTuple):
     """whether a number without a parameter has a meaning there"""
 
 
-def matrices_of(given: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
+def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
     """The entries of A, B, C, D and E.
 
     Args:
-        given: what the YAML holds.
+        mapping: what the YAML holds.
         content: what `content_of` makes of it.
 
     Raises:
         InputError: an entry is wrong, or the parameters' values make one infinite.
     """
-    matrices = _Matrices(given, content).all()
+    matrices = _Matrices(mapping, content).all()
     values = {n: q.constant.value for n, q in content.parameters.items()}
     # The file's own values have to be possible too: a model that cannot be run at its defaults
     # would fail at the first use, far from the line that is wrong.
@@ -129,16 +129,16 @@ class _Matrices:
     def all(self) -> dict[str, tuple[Entry, ...]]:
         states, inputs, outputs = self.content.states, self.content.inputs, self.content.outputs
         # E first: its diagonal decides in which unit its rows of A and B are.
-        found = {"E": self.masses()}
+        matrices = {"E": self.masses()}
         for name, rows, columns in (
             ("A", self.rates, states),
             ("B", self.rates, inputs),
             ("C", self.outputs, states),
             ("D", self.outputs, inputs),
         ):
-            found[name] = self.matrix(name, rows, columns)
+            matrices[name] = self.matrix(name, rows, columns)
         self.check_rows(states, outputs)
-        return found
+        return matrices
 
     def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
         """A matrix as it is written: by row, by column.
@@ -151,21 +151,21 @@ class _Matrices:
         Raises:
             InputError: a row or a column has another name.
         """
-        found = {}
+        by_row = {}
         # Both names are checked before any entry is read, since an entry's unit is asked of its row
         # and column.
         kind = "output" if matrix in ("C", "D") else "state"
-        for row, given in as_mapping(self.given.get(matrix, {}), matrix).items():
+        for row, entries in as_mapping(self.given.get(matrix, {}), matrix).items():
             if row not in known:
                 raise InputError(f"{matrix}.{row}: no such {kind}{nearest(str(row), known)}")
-            for column in as_mapping(given, f"{matrix}.{row}"):
+            for column in as_mapping(entries, f"{matrix}.{row}"):
                 if column not in columns:
                     kind = "input" if matrix in ("B", "D") else "state"
                     raise InputError(
                         f"{matrix}.{row}.{column}: no such {kind}{nearest(str(column), columns)}"
                     )
-            found[row] = given
-        return found
+            by_row[row] = entries
+        return by_row
 
     def matrix(
         self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
@@ -182,52 +182,52 @@ class _Matrices:
         """
         return tuple(
             self.entry(f"{name}.{row}.{column}", one, row, column, rows[row])
-            for row, given in self.rows(name, rows, columns).items()
-            for column, one in given.items()
+            for row, row_entries in self.rows(name, rows, columns).items()
+            for column, one in row_entries.items()
         )
 
     def masses(self) -> tuple[Entry, ...]:
         """E; its diagonal gives its rows their unit."""
-        states, found = self.content.states, []
-        for row, given in self.rows("E", states, states).items():
+        states, entries = self.content.states, []
+        for row, row_entries in self.rows("E", states, states).items():
             # The diagonal before the others of its row, since it says what the whole row is in: a
             # mass times an acceleration is a force.
-            if row in given:
-                node = self.tree(f"E.{row}.{row}", given[row])
+            if row in row_entries:
+                node = self.tree(f"E.{row}.{row}", row_entries[row])
                 try:
                     mass = expression.dimension(node, self.dimensions, PLAIN)
                 except ExpressionError as e:
-                    raise InputError(f"E.{row}.{row}: {given[row]!r:.80}: {e}") from e
+                    raise InputError(f"E.{row}.{row}: {row_entries[row]!r:.80}: {e}") from e
                 rate = self.rates[row].dimension
                 total = tuple(i + j for i, j in zip(rate, mass, strict=True))
                 # Bare numbers of such a row would be in a unit made of the file's and the
                 # parameter's, which no reader could be sure of. They are refused unless the
                 # diagonal is a plain number.
                 self.rates[row] = _Unit(total, self.rates[row].scale, total == rate)
-            for column, one in given.items():
+            for column, one in row_entries.items():
                 place = f"E.{row}.{column}"
                 rate = _over(self.columns[column], _Unit(TIME, 1.0))
-                found.append(self.entry(place, one, row, column, self.rates[row], rate))
-        return tuple(found)
+                entries.append(self.entry(place, one, row, column, self.rates[row], rate))
+        return tuple(entries)
 
-    def tree(self, place: str, given: Any) -> Node:
+    def tree(self, place: str, source: Any) -> Node:
         # In Python true is the number 1, and in a matrix it is a slip.
-        if isinstance(given, bool) or not isinstance(given, int | float | str):
-            raise InputError(f"{place}: expected a number or an expression, got {given!r:.40}")
-        if isinstance(given, str):
+        if isinstance(source, bool) or not isinstance(source, int | float | str):
+            raise InputError(f"{place}: expected a number or an expression, got {source!r:.40}")
+        if isinstance(source, str):
             try:
-                return expression.parse(given, self.content.parameters)
+                return expression.parse(source, self.content.parameters)
             except ExpressionError as e:
                 raise InputError(f"{place}: {e}") from e
-        value = float(given)
+        value = float(source)
         if not math.isfinite(value):
-            raise InputError(f"{place}: expected a finite number, got {given!r:.40}")
+            raise InputError(f"{place}: expected a finite number, got {source!r:.40}")
         return expression.Number(value)
 
     def entry(
         self,
         place: str,
-        given: Any,
+        source: Any,
         row: str,
         column: str,
         of: _Unit,
@@ -237,7 +237,7 @@ class _Matrices:
 
         Args:
             place: where it stands, as A.p.b.
-            given: a number or an expression, as the YAML has it.
+            source: a number or an expression, as the YAML has it.
             row: name of its row.
             column: name of its column.
             of: what the row is in.
@@ -246,8 +246,8 @@ class _Matrices:
         Raises:
             InputError: it is no number or expression, or of another dimension than its place.
         """
-        node = self.tree(place, given)
-        said = f"{place}: {given!r:.80}"
+        node = self.tree(place, source)
+        said = f"{place}: {source!r:.80}"
         over = self.columns[column] if per is None else per
         expected = _over(of, over)
         # Numbers alone, 2*9.81 too: only what names a parameter has units that could be checked,
@@ -262,14 +262,14 @@ class _Matrices:
         try:
             # Parameters are in SI already, so the entry needs no factor once its dimension is
             # right.
-            found = expression.dimension(node, self.dimensions, PLAIN)
+            dimension = expression.dimension(node, self.dimensions, PLAIN)
         except ExpressionError as e:
             raise InputError(f"{said}: {e}") from e
-        if found != expected.dimension:
+        if dimension != expected.dimension:
             raise InputError(
                 f"{said}: expected {_unit_text(expected.dimension)} ({_unit_text(of.dimension)} of "
                 f"the row over {_unit_text(over.dimension)} of the column), got "
-                f"{_unit_text(found)}"
+                f"{_unit_text(dimension)}"
             )
         return Entry(row, column, node, 1.0, said)
 

@@ -93,10 +93,10 @@ _models: OrderedDict[str, tuple[Model, Content, dict[str, tuple[Entry, ...]]]] =
 
 def _read(text: str, path: str) -> LinearModel:
     if text not in _models:
-        given = parse_mapping(text, path)
+        mapping = parse_mapping(text, path)
         try:
-            content = content_of(given)
-            matrices = matrices_of(given, content)
+            content = content_of(mapping)
+            matrices = matrices_of(mapping, content)
         except InputError as e:
             raise InputError(f"{path}: {e}") from e
         _models[text] = (model_of(content, matrices), content, matrices)

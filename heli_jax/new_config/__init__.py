@@ -76,8 +76,8 @@ def write_config(
     chosen = text.Chosen(*_model(model, read, str(log)))
     preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
     signals = None if preset else _signals(chosen.model, read)
-    found = {} if signals is None else signals.known
-    paths, constants, place = _vehicle(chosen, out, vehicle, found)
+    known = {} if signals is None else signals.known
+    paths, constants, place = _vehicle(chosen, out, vehicle, known)
     if paths and signals is not None:
         # The vehicle file has them.
         signals = signals._replace(known={})
@@ -106,8 +106,8 @@ def write_config(
         notes.append(f"{words} yours to give, where {EDIT} stands")
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
-        wanted = ", ".join(naming.names(chosen.model.Outputs))
-        notes.append(f"found none of {wanted} by its name: say which were logged, and as what")
+        outputs = ", ".join(naming.names(chosen.model.Outputs))
+        notes.append(f"found none of {outputs} by its name: say which were logged, and as what")
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
         notes.append(f"{words}: name the stick's, which no rate or angle is")
@@ -124,11 +124,11 @@ def write_config(
 def _used(preset: str | None, model: Any, log: Log, signals: text.Signals | None) -> Sequence[str]:
     """The log's channels that the configuration takes."""
     if signals is not None:
-        found = (*signals.inputs.values(), *signals.outputs.values())
-        return [g.channel for g in found if g is not None]
+        guesses = (*signals.inputs.values(), *signals.outputs.values())
+        return [g.channel for g in guesses if g is not None]
     assert preset is not None
-    wanted = (*naming.names(model.Inputs), *naming.names(model.Outputs))
-    return channels_of_preset(preset, tuple(log.series), wanted)
+    signals_ = (*naming.names(model.Inputs), *naming.names(model.Outputs))
+    return channels_of_preset(preset, tuple(log.series), signals_)
 
 
 def _rate(log: Log, used: Sequence[str], signals: text.Signals | None) -> float | None:
@@ -260,9 +260,9 @@ def _signals(model: Any, log: Log) -> text.Signals:
     for name in naming.names(model.Outputs):
         signal = model_outputs().get(name, name)
         known, unit = called["outputs"].get(signal, []), naming.unit(model.Outputs, name) or "1"
-        found = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
-        if found is not None:
-            outputs[name] = found
+        output = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
+        if output is not None:
+            outputs[name] = output
     # What an output follows is the better reason where one input makes it move.
     if len(inputs) > 1:
         _by_number(model, log, inputs, numbered, taken)
@@ -324,12 +324,12 @@ def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess |
         return None
     chosen = guess.of_known_unit(candidates, log.series, si)
     taken.append(chosen)
-    found = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    scaled = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
     others = [n for n in candidates if n != chosen]
     if not others:
-        return found
+        return scaled
     remark = f"could be {', '.join(others[:3])} as well"
-    return found._replace(remarks=(*found.remarks, remark))
+    return scaled._replace(remarks=(*scaled.remarks, remark))
 
 
 def _full_travel(log: Log) -> float | None:
@@ -344,10 +344,10 @@ def _by_number(
     taken: list[str],
 ) -> None:
     """Inputs whose channels have numbers for names, in the usual order."""
-    for name, found in inputs.items():
+    for name, input in inputs.items():
         si = naming.unit(model.Inputs, name) or "1"
         names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
-        made = None if found is not None else _found(log, names, si, taken)
+        made = None if input is not None else _found(log, names, si, taken)
         if made is not None:
             why = "GUESS: by its number, in the order roll, pitch, throttle, yaw"
             inputs[name] = made._replace(remarks=(why, *made.remarks))
@@ -366,8 +366,8 @@ def _by_correlation(
     motions = {c for names in _names()["outputs"].values() for c in names} - _STICKS_TOO
     moving = guess.by_name(sorted(motions), tuple(log.series))
     measured = {n for n in moving if not names_a_stick(n)}
-    for name, found in inputs.items():
-        if found is not None or not known:
+    for name, input in inputs.items():
+        if input is not None or not known:
             continue
         si = naming.unit(model.Inputs, name) or "1"
         left = {
@@ -392,7 +392,7 @@ def _vehicle(
     chosen: text.Chosen,
     out: Path,
     vehicle: str | None,
-    found: Mapping[str, tuple[str, float]],
+    known: Mapping[str, tuple[str, float]],
 ) -> tuple[dict[Path, str], Mapping[str, float], str | None]:
     """Further files, the constants that are known, and the vehicle's place in the configuration."""
     if chosen.linear and vehicle is None:
@@ -404,7 +404,7 @@ def _vehicle(
     place = out.with_name(f"{out.stem}-vehicle.yaml")
     if place.exists():
         raise InputError(f"{place}: is there already; expected --vehicle with it, or another --out")
-    return {place: text.vehicle(chosen.model, found)}, {}, place.name
+    return {place: text.vehicle(chosen.model, known)}, {}, place.name
 
 
 def _free(

@@ -66,11 +66,11 @@ def channels_of_preset(name: str, series: Collection[str], signals: Collection[s
     inputs, outputs, table = model_inputs(), model_outputs(), preset(name).signals
     meant = [outputs.get(n, inputs[n].command if n in inputs else n) for n in signals]
     # Of several channels the first that the log has is taken.
-    found = []
+    channels = []
     for signal in meant:
         for alternative in table.get(signal, ()):
             needed = sources(alternative.channel, frozenset(series))
             if set(needed) <= set(series):
-                found += needed
+                channels += needed
                 break
-    return found
+    return channels

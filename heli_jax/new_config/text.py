@@ -134,25 +134,25 @@ def _free(name: str, start: float | str | None) -> str:
     return f"    {name}: {{start: {_number(start)}}}"
 
 
-def vehicle(model: Any, found: Mapping[str, tuple[str, float]]) -> str:
+def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     """A vehicle file to fill in.
 
     Args:
         model: whose parameters it has.
-        found: those that the log tells, with the channel that they are the mean of.
+        means: those that the log tells, with the channel that they are the mean of.
     """
     lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
-    given, known = naming.defaults(model.Params), naming.names(model.Params)
+    defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number stands for one that has to be there: it only shows what the model reads.
-    params = model.Params(**{n: given.get(n, 1.0) for n in known})
-    needed = {*(n for n in known if n not in given), *needed_but_missing(model, params)}
+    params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
+    needed = {*(n for n in known if n not in defaults), *needed_but_missing(model, params)}
     for name in known:
         if name not in needed and not _is_read(model, params, name):
             continue
         unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
         value = EDIT if name in needed else f"{float(getattr(params, name)):g}"
-        if name in found:
-            channel, mean = found[name]
+        if name in means:
+            channel, mean = means[name]
             value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
         elif value != EDIT and name in _UNSET:
             meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or let the fit find it"
@@ -207,12 +207,12 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
     if time is not None:
         lines.append(_time(time))
     lines.append("      inputs:")
-    for name, found in signals.inputs.items():
+    for name, signal in signals.inputs.items():
         meaning = naming.meaning(chosen.model.Inputs, name)
-        lines += _signal(name, found, meaning)
+        lines += _signal(name, signal, meaning)
     lines.append("      outputs:")
-    for name, found in signals.outputs.items():
-        lines += _signal(name, found, naming.meaning(chosen.model.Outputs, name))
+    for name, signal in signals.outputs.items():
+        lines += _signal(name, signal, naming.meaning(chosen.model.Outputs, name))
     if not signals.outputs and not signals.wandering:
         return [*lines, *_unknown(chosen.model), *_ranges(signals.ranges)]
     lines += _left_out(signals.wandering)
@@ -261,11 +261,11 @@ def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
     """Angles that would mislead, each as a comment to put back."""
     return [
         line
-        for name, found in wandering.items()
+        for name, signal in wandering.items()
         for line in (
             f"        # GUESS: without {name}, whose error looks integrated from a gyro: it",
             "        # wanders, and filter-error takes it for white noise.",
-            *(f"        # {words.strip()}" for words in _signal(name, found, "")),
+            *(f"        # {words.strip()}" for words in _signal(name, signal, "")),
         )
     ]
 
@@ -319,17 +319,17 @@ def _instruments(excitations: Mapping[str, str]) -> list[str]:
     ]
 
 
-def _signal(name: str, found: Guess | None, meaning: str) -> list[str]:
+def _signal(name: str, guess: Guess | None, meaning: str) -> list[str]:
     words = [f"        # {name}: {_comment(meaning)}"] if meaning else []
-    if found is None:
+    if guess is None:
         # A constant that nobody knows moves nothing: the user says which channel it is.
         return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so"]
-    keys = [f"signal: {_value(found.channel)}", f"unit: {_value(found.unit)}"]
-    if found.offset:
-        keys.append(f"offset: {found.offset:g}")
-    if found.scale != 1.0:
-        keys.append(f"scale: {_number(found.scale)}")
-    remarks = "; ".join(map(_comment, found.remarks))
+    keys = [f"signal: {_value(guess.channel)}", f"unit: {_value(guess.unit)}"]
+    if guess.offset:
+        keys.append(f"offset: {guess.offset:g}")
+    if guess.scale != 1.0:
+        keys.append(f"scale: {_number(guess.scale)}")
+    remarks = "; ".join(map(_comment, guess.remarks))
     return [
         *words,
         f"        {name}: {{{', '.join(keys)}}}" + (f"   # {remarks}" if remarks else ""),

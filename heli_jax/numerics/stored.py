@@ -98,13 +98,13 @@ def _program(
     except Unknown:
         return None
     path = folder / digest
-    found = _read(path)
-    if found is None:
-        found = _traced(function, args)
-        if found is None:
+    program = _read(path)
+    if program is None:
+        program = _traced(function, args)
+        if program is None:
             return None
-        _write(path, *found)
-    exported, outline = found
+        _write(path, *program)
+    exported, outline = program
     run = jax.jit(exported.call)
 
     def called(leaves: list[Any]) -> Any:
@@ -204,10 +204,10 @@ def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
     """What was kept; None where there is nothing, or nothing whole."""
     try:
         head, program = path.read_bytes().split(b"\n", 1)
-        told = json.loads(head)
-        if told["sha256"] != hashlib.sha256(program).hexdigest():
+        header = json.loads(head)
+        if header["sha256"] != hashlib.sha256(program).hexdigest():
             return None
-        return jax.export.deserialize(bytearray(program)), told["outline"]
+        return jax.export.deserialize(bytearray(program)), header["outline"]
     # A file that another program wrote there, or that a full disk cut off, is traced anew.
     except Exception:
         return None
@@ -221,12 +221,12 @@ def _write(path: Path, exported: jax.export.Exported, outline: Any) -> None:
         return
     if len(program) > _LARGEST:
         return
-    told = {"sha256": hashlib.sha256(program).hexdigest(), "outline": outline}
+    header = {"sha256": hashlib.sha256(program).hexdigest(), "outline": outline}
     # A disk that is full or not to be written costs the time of tracing, and nothing else.
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
-            file.write(json.dumps(told).encode() + b"\n" + program)
+            file.write(json.dumps(header).encode() + b"\n" + program)
         Path(file.name).replace(path)
         by_age = sorted(path.parent.iterdir(), key=lambda p: p.stat().st_mtime)
         for old in by_age[:-_MOST]:

@@ -192,9 +192,9 @@ def _by_name(thing: Any) -> bool:
 def named(module: str, name: str) -> Any:
     """What a module has under a qualified name; None where it has nothing."""
     try:
-        found: Any = importlib.import_module(module)
+        value: Any = importlib.import_module(module)
         for part in name.split("."):
-            found = getattr(found, part)
+            value = getattr(value, part)
     except (ImportError, AttributeError):
         return None
-    return found
+    return value

@@ -19,10 +19,10 @@ def described(chart: Chart) -> str:
 
 
 def _panel(panel: Panel) -> str:
-    told = [s for s in panel.series if s.kind != "band" and np.isfinite(s.y).any()]
-    words = [_range(s) for s in told[:_MOST]]
-    if len(told) > _MOST:
-        words.append(f"{len(told) - _MOST} further lines")
+    series = [s for s in panel.series if s.kind != "band" and np.isfinite(s.y).any()]
+    words = [_range(s) for s in series[:_MOST]]
+    if len(series) > _MOST:
+        words.append(f"{len(series) - _MOST} further lines")
     return f"{panel.label}: {', '.join(words)}" if words else ""
 
 

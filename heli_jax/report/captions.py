@@ -96,8 +96,8 @@ def _sampled(name: str, analysis: Analysis) -> str:
     worst = sorted(shares, key=lambda s: -abs(s[1] - 0.95))[:_MOST]
     inside = ", ".join(f"{x} and {y} {percent(share, 0)}" for (x, y), share in worst)
     count = next(iter(samples.values())).size
-    told = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
-    return f"{count} samples, mean and sd: {each}{told}"
+    within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
+    return f"{count} samples, mean and sd: {each}{within}"
 
 
 def _scatter(values: np.ndarray, fit: Fit, name: str) -> str:

@@ -250,8 +250,8 @@ def _of_disturbance(fit: Fit) -> list[Gate]:
         if output.against_disturbance is not None:
             remark = "a simulation knows no disturbance: compared with what the estimated one makes"
             ahead = fit.adequacy.ahead
-            how = "simulated" if ahead is None else f"predicted up to {ahead:g} s ahead"
-            of, ratio = f"{output.output}, {how}", output.against_disturbance
+            kind = "simulated" if ahead is None else f"predicted up to {ahead:g} s ahead"
+            of, ratio = f"{output.output}, {kind}", output.against_disturbance
             lines.append(_most("error power over expected", of, ratio, "", EXPECTED, remark))
     return lines
 

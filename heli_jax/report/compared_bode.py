@@ -20,19 +20,19 @@ BODE_WORDS = (
 
 
 def bode_overlay(
-    found: Sequence[tuple[str, Signals]], flight: str, output: str, input: str
+    by_run: Sequence[tuple[str, Signals]], flight: str, output: str, input: str
 ) -> Figure | None:
     """Gain and phase from an input to the measured output and to each run's simulated one.
 
     None where no run's simulated output has a coherent response to the input.
 
     Args:
-        found: by the runs' labels, the same flight.
+        by_run: by the runs' labels, the same flight.
         flight: its name.
         output: which.
         input: which; runs whose model has none of that name are left out.
     """
-    with_input = [(label, s) for label, s in found if input in s.inputs]
+    with_input = [(label, s) for label, s in by_run if input in s.inputs]
     curves = [
         (label, response)
         for label, s in with_input

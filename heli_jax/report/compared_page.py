@@ -82,16 +82,16 @@ def _link(file: Path, folder: Path) -> str:
 
 def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Picture, str]]:
     """The figures, each with its caption."""
-    for name, output, found in itertools.islice(_overlaps(compared), _MOST_FIGURES):
+    for name, output, by_run in itertools.islice(_overlaps(compared), _MOST_FIGURES):
         unit = _unit(compared, output)
-        made = picture("overlay", functools.partial(_overlay, found, name, output, unit), numbers)
+        made = picture("overlay", functools.partial(_overlay, by_run, name, output, unit), numbers)
         if made is not None:
-            drawn = {label for label, _ in found}
+            drawn = {label for label, _ in by_run}
             missing = [label for label in compared.labels if label not in drawn]
             without = f"no {output} of that log in a flight named {name}, or no result"
             yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
-        for input in dict.fromkeys(n for _, s in found for n in s.inputs):
-            draw = functools.partial(bode_overlay, found, name, output, input)
+        for input in dict.fromkeys(n for _, s in by_run for n in s.inputs):
+            draw = functools.partial(bode_overlay, by_run, name, output, input)
             made = picture("bode", draw, numbers)
             if made is not None:
                 yield made, BODE_WORDS
@@ -112,9 +112,9 @@ def _overlaps(
             log = logs.get(signals.flight, "")
             for output in signals.measured:
                 by_place.setdefault((log, signals.flight, output), []).append((label, signals))
-    for (_, name, output), found in by_place.items():
-        if len(found) > 1:
-            yield name, output, found
+    for (_, name, output), by_run in by_place.items():
+        if len(by_run) > 1:
+            yield name, output, by_run
 
 
 def _unit(compared: ComparedRuns, output: str) -> str:
@@ -129,9 +129,9 @@ def _unit(compared: ComparedRuns, output: str) -> str:
     return ""
 
 
-def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Figure:
+def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Figure:
     (ax,) = panels(None, 2.9, [1.0])
-    first = found[0][1]
+    first = by_run[0][1]
     # By what was measured: one run that diverges would leave of all others a straight line.
     measured = first.measured[output][np.isfinite(first.measured[output])]
     middle = float(np.mean(measured)) if measured.size else 0.0
@@ -139,7 +139,7 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit:
     style.samples(
         ax, first.log_times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
     )
-    for i, (label, signals) in enumerate(found):
+    for i, (label, signals) in enumerate(by_run):
         color = style.CYCLE[i % len(style.CYCLE)]
         dashes = ("-", "--", ":")[i // len(style.CYCLE) % 3]
         simulated = signals.simulated[output]
@@ -153,8 +153,8 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit:
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size))
     ax.set_ylabel(f"{output} [{unit}]" if unit not in ("", "1") else output)
-    begin = min(float(s.log_times[0]) for _, s in found)
-    end = max(float(s.log_times[-1]) for _, s in found)
+    begin = min(float(s.log_times[0]) for _, s in by_run)
+    end = max(float(s.log_times[-1]) for _, s in by_run)
     ax.set_xlim(begin, end if end > begin else begin + 1.0)
     style.legend_above(ax)
     return ax.figure  # pyright: ignore[reportReturnType]

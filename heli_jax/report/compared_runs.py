@@ -83,14 +83,16 @@ class ComparedRuns(NamedTuple):
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows = []
         for name in _in_order(run.estimates for run in self.runs):
-            found = [run.estimates.get(name) for run in self.runs]
-            units = {e.unit for e in found if e is not None}
+            estimates = [run.estimates.get(name) for run in self.runs]
+            units = {e.unit for e in estimates if e is not None}
             cells = [
                 _measured(e, pair, shown_unit if len(units) > 1 else None, arrived=_arrived(run))
-                for e, run in zip(found, self.runs, strict=True)
+                for e, run in zip(estimates, self.runs, strict=True)
             ]
             # Where an optimiser stopped on its way there is nothing to compare.
-            there = [e if _arrived(run) else None for e, run in zip(found, self.runs, strict=True)]
+            there = [
+                e if _arrived(run) else None for e, run in zip(estimates, self.runs, strict=True)
+            ]
             apart = [_difference(there[0], other) for other in there[1:]]
             rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))

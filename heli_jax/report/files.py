@@ -114,14 +114,14 @@ def fit_json(
     )
 
 
-def _sensors(found: SensorAgreement | None) -> dict[str, Any] | None:
-    if found is None:
+def _sensors(agreement: SensorAgreement | None) -> dict[str, Any] | None:
+    if agreement is None:
         return None
     return {
-        "compatible": found.compatible,
-        "verdict": found.verdict,
-        "doubts": list(found.doubts),
-        "shows": {row[0]: row[found.head.index("shows")] for row in found.errors},
+        "compatible": agreement.compatible,
+        "verdict": agreement.verdict,
+        "doubts": list(agreement.doubts),
+        "shows": {row[0]: row[agreement.head.index("shows")] for row in agreement.errors},
     }
 
 

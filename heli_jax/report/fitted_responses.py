@@ -84,7 +84,7 @@ def fitted_responses(
         asked: responses that handling qualities are read off.
     """
     try:
-        found = flight_responses(problem.training, settings)
+        responses = flight_responses(problem.training, settings)
     except ValueError as e:
         words = f"no responses of the flights: {e}"
         return FittedResponses((), 0, (), "", (words,))
@@ -96,17 +96,17 @@ def fitted_responses(
     of = linear_responses(problem.model, params, free, at.state, at.inputs)
     if not all(np.isfinite(M).all() for M in of.matrices):
         words = f"the model cannot be linearised about {at.words or 'zero'}"
-        return FittedResponses((), 0, (), at.words, (*found.notes, words))
-    curves = _Curves(fit, of, tuple(free), (found.omega[0], _BEYOND * found.omega[-1]))
-    pairs = _pairs(found, curves)
+        return FittedResponses((), 0, (), at.words, (*responses.notes, words))
+    curves = _Curves(fit, of, tuple(free), (responses.omega[0], _BEYOND * responses.omega[-1]))
+    pairs = _pairs(responses, curves)
     handling = tuple(
-        Handling(p, _of_model(curves, p), measured_handling(found, p))
+        Handling(p, _of_model(curves, p), measured_handling(responses, p))
         for p in asked
         # One that is fixed, or that does not move, is no part of the fit.
-        if p.input in found.holds and p.output in found.outputs
+        if p.input in responses.holds and p.output in responses.outputs
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
-    return FittedResponses(tuple(pairs[:MOST_PAIRS]), left_out, handling, at.words, found.notes)
+    return FittedResponses(tuple(pairs[:MOST_PAIRS]), left_out, handling, at.words, responses.notes)
 
 
 class _Curves(NamedTuple):
@@ -166,32 +166,32 @@ def _sd(estimate: Estimate, fit: Fit) -> float:
     return max(half / _Z95, e.sd)
 
 
-def _pairs(found: FlightResponses, curves: _Curves) -> list[FittedPair]:
+def _pairs(responses: FlightResponses, curves: _Curves) -> list[FittedPair]:
     ranked = []
-    for name, output in found.outputs.items():
+    for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            mean = octave_mean(found.omega, pair.coherence)
+            mean = octave_mean(responses.omega, pair.coherence)
             used = mean >= COHERENT
             if not used.any():
                 continue
             with np.errstate(all="ignore"):
-                H = without_hold(found.omega, pair.H, found.holds[input])
+                H = without_hold(responses.omega, pair.H, responses.holds[input])
                 sd = pair.sd * np.abs(H / pair.H)
-            model = curves.curve(input, name).at(found.omega)
-            fitted = FittedPair(input, name, found.omega, H, sd, pair.coherence, model)
+            model = curves.curve(input, name).at(responses.omega)
+            fitted = FittedPair(input, name, responses.omega, H, sd, pair.coherence, model)
             ranked.append((float(np.sum(mean[used])), fitted))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
-    found = handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
-    last, w180 = curves.band[1] / _BEYOND, found.numbers.get("w180")
+    qualities = handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
+    last, w180 = curves.band[1] / _BEYOND, qualities.numbers.get("w180")
     needed = last if pair.kind == "open-loop" else 0.5 * last
     if w180 is None or w180.value <= needed:
-        return found
+        return qualities
     beyond = "w180" if w180.value > last else "2 w180"
     words = (
         f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
         "what hangs on it is the model's word alone"
     )
-    return found._replace(sentences=(*found.sentences, words))
+    return qualities._replace(sentences=(*qualities.sentences, words))

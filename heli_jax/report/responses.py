@@ -36,7 +36,7 @@ _DB = 20.0 / np.log(10.0)
 
 def write_responses(
     directory: Path,
-    found: FlightResponses,
+    responses: FlightResponses,
     units: Mapping[str, str],
     title: str,
     handling: Sequence[Handling] = (),
@@ -49,16 +49,16 @@ def write_responses(
 
     Args:
         directory: exists.
-        found: the responses.
+        responses: the responses.
         units: SI, of inputs and outputs by name.
         title: of the page.
         handling: what the data say of handling qualities.
         config: in full, as YAML.
         png: whether figures are PNG files too.
     """
-    write_table(directory / "responses.csv", table(found))
-    _write_netcdf(directory / "responses.nc", found, units)
-    fits = [_content(*fit) for fit in found.fits]
+    write_table(directory / "responses.csv", table(responses))
+    _write_netcdf(directory / "responses.nc", responses, units)
+    fits = [_content(*fit) for fit in responses.fits]
     (directory / "transfer_functions.json").write_text(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -67,9 +67,9 @@ def write_responses(
     )
     (directory / "figures").mkdir()
     pictures, numbers = [], Numbers()
-    for name, output in found.outputs.items():
+    for name, output in responses.outputs.items():
         for input in output.pairs:
-            draw = functools.partial(_draw, found, units, input, name)
+            draw = functools.partial(_draw, responses, units, input, name)
             pictures.append(
                 picture(_stem(input, name), draw, numbers, folder=directory / "figures", png=png)
             )
@@ -79,15 +79,15 @@ def write_responses(
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
         origin=origin(config, _FILES),
-        notes=found.notes,
+        notes=responses.notes,
         fits=Table(
             ("input", "output", "averages", *FIT_HEAD),
             [
-                (w.input, w.output, number(found.outputs[w.output].averages, 3), *fit_row(fit))
-                for w, fit in found.fits
+                (w.input, w.output, number(responses.outputs[w.output].averages, 3), *fit_row(fit))
+                for w, fit in responses.fits
             ],
         ),
-        window=f"{found.window:g}",
+        window=f"{responses.window:g}",
         handling=handling_table(handling),
         handling_sentences=handling_sentences(handling),
     )
@@ -99,17 +99,19 @@ def _stem(input: str, output: str) -> str:
     return f"{output}-{input}"
 
 
-def _draw(found: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Any:
-    measured = found.outputs[output]
+def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Any:
+    measured = responses.outputs[output]
     curves = [
-        (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(found.omega, found.holds[input]))
-        for w, fit in found.fits
+        (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(responses.omega, responses.holds[input]))
+        for w, fit in responses.fits
         if (w.input, w.output) == (input, output) and fit.determined
     ]
-    by = "by its instrument" if input in found.instruments else "direct"
-    note = f"{by}, windows of {found.window:g} s, {measured.averages:.1f} independent averages"
+    by = "by its instrument" if input in responses.instruments else "direct"
+    note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
     unit = quotient(units[output], units[input])
-    return draw_response((input, output), found.omega, measured.pairs[input], unit, note, curves)
+    return draw_response(
+        (input, output), responses.omega, measured.pairs[input], unit, note, curves
+    )
 
 
 def quotient(output: str, input: str) -> str:
@@ -119,21 +121,21 @@ def quotient(output: str, input: str) -> str:
     return f"{output}/({input})" if "/" in input else f"{output}/{input}"
 
 
-def table(found: FlightResponses) -> dict[str, Any]:
+def table(responses: FlightResponses) -> dict[str, Any]:
     """A row for each frequency of each pair: the columns of responses.csv."""
     columns: dict[str, list[Any]] = {n: [] for n in ("input", "output")}
     numbers: dict[str, list[np.ndarray]] = {}
-    for name, output in found.outputs.items():
+    for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            k = found.omega.size
+            k = responses.omega.size
             columns["input"] += [input] * k
             columns["output"] += [name] * k
             with np.errstate(all="ignore"):
                 each = {
-                    "frequency_hz": found.omega / (2.0 * np.pi),
+                    "frequency_hz": responses.omega / (2.0 * np.pi),
                     "gain": np.abs(pair.H),
                     "gain_db": 20.0 * np.log10(np.abs(pair.H)),
-                    "phase_deg": branch_of(found.omega, pair.H, seen_of(found.omega, pair)),
+                    "phase_deg": branch_of(responses.omega, pair.H, seen_of(responses.omega, pair)),
                     "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
@@ -144,14 +146,14 @@ def table(found: FlightResponses) -> dict[str, Any]:
     return {**columns, **{n: np.concatenate(v) for n, v in numbers.items()}}
 
 
-def _write_netcdf(path: Path, found: FlightResponses, units: Mapping[str, str]) -> None:
+def _write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
     import xarray as xr
 
-    inputs = list(next(iter(found.outputs.values())).pairs)
+    inputs = list(next(iter(responses.outputs.values())).pairs)
 
     def stacked(name: str) -> np.ndarray:
         return np.stack(
-            [[getattr(o.pairs[i], name) for i in inputs] for o in found.outputs.values()]
+            [[getattr(o.pairs[i], name) for i in inputs] for o in responses.outputs.values()]
         )
 
     pairs, each = ("output", "input", "frequency"), ("output", "frequency")
@@ -169,29 +171,32 @@ def _write_netcdf(path: Path, found: FlightResponses, units: Mapping[str, str]) 
                 {"long_name": "of several windows"},
             ),
             "composite_imaginary": (pairs, np.imag(picture)),
-            "multiple_coherence": (each, np.stack([o.multiple for o in found.outputs.values()])),
+            "multiple_coherence": (
+                each,
+                np.stack([o.multiple for o in responses.outputs.values()]),
+            ),
             "noise": (
                 each,
-                np.stack([o.noise for o in found.outputs.values()]),
+                np.stack([o.noise for o in responses.outputs.values()]),
                 {"long_name": "density of what the inputs leave", "units": "SI^2/Hz"},
             ),
         },
         {
-            "output": list(found.outputs),
+            "output": list(responses.outputs),
             "input": inputs,
-            "frequency": ("frequency", found.omega / (2.0 * np.pi), {"units": "Hz"}),
+            "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
         },
         {
-            "window_s": found.window,
-            "instruments": " ".join(found.instruments),
-            "units_of_outputs": " ".join(units[n] for n in found.outputs),
+            "window_s": responses.window,
+            "instruments": " ".join(responses.instruments),
+            "units_of_outputs": " ".join(units[n] for n in responses.outputs),
             "units_of_inputs": " ".join(units[n] for n in inputs),
         },
     )
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
 
-def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
+def _content(request: Wanted, fit: TransferFit) -> dict[str, Any]:
     poles_known = all(c.determined for c in fit.denominator)
     zeros_known = all(c.determined for c in fit.numerator)
     delay_known = fit.delay is None or fit.delay.determined
@@ -199,8 +204,8 @@ def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
     status = "converged" if poles_known and zeros_known and delay_known else "not-identifiable"
     status = status if fit.converged else "not-converged"
     return {
-        "input": wanted.input,
-        "output": wanted.output,
+        "input": request.input,
+        "output": request.output,
         "numerator": [_number(c) for c in fit.numerator],
         "denominator": [{"value": 1.0}, *(_number(c) for c in fit.denominator)],
         "delay_s": None if fit.delay is None else _number(fit.delay),

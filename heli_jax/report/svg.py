@@ -62,13 +62,13 @@ def chart_svg(chart: Chart) -> Drawing:
     """Panels below each other, with title, note, legends and axes."""
     apart = len({p.x_limits or chart.x_limits for p in chart.panels}) > 1
     parts, y = _head(chart)
-    told: set[str] = set()
+    shown: set[str] = set()
     for i, panel in enumerate(chart.panels):
         last = i == len(chart.panels) - 1
         # Not a line that its axis names, nor those of a panel above, which have the same colours.
         new = {s.label for s in panel.series if s.label != panel.label.partition(" [")[0]} - {""}
-        legend, rows = _legend(panel, new if new - told else set(), y + 13)
-        told |= new
+        legend, rows = _legend(panel, new if new - shown else set(), y + 13)
+        shown |= new
         top = y + 16 * rows + 6
         parts += legend
         x_limits = panel.x_limits or chart.x_limits

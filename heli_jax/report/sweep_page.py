@@ -92,8 +92,8 @@ def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, 
         name = results.get(stem, stem)
         title, words = _OTHERS.get(png.stem) or _KINDS.get(kind, (png.stem, ""))
         title = title.format(name)
-        told = [name] if kind in _KINDS else list(content["results"])
-        numbers = "; ".join(_range(n, content["results"][n]) for n in told[:_TOLD])
+        names = [name] if kind in _KINDS else list(content["results"])
+        numbers = "; ".join(_range(n, content["results"][n]) for n in names[:_TOLD])
         alt = f"{title}: {words}. Over the sweep {numbers}."
         yield of_file(png, title, alt), f"{title}: {words}. (figures/{png.stem}.svg, .png)"
 

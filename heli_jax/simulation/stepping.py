@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import core
 from jaxtyping import Array, Float, PyTree
 
 from heli_jax import naming
@@ -62,7 +63,7 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
             )
         inputs = jax.tree.map(jnp.asarray, flight)
     # Backwards, or on the spot, a run would end like any other. Traced it has no value yet.
-    if dt is not None and not isinstance(dt, jax.core.Tracer) and not np.all(np.asarray(dt) > 0):
+    if dt is not None and not isinstance(dt, core.Tracer) and not np.all(np.asarray(dt) > 0):
         raise ValueError(f"dt: expected a sample time above zero [s], got {dt}")
     if dt is None:
         raise ValueError(

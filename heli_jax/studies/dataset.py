@@ -40,7 +40,7 @@ def dataset(
     """
     axes = tuple(study.axes)
     estimates = [_estimates(fit) for fit in fits]
-    parameters = list(dict.fromkeys(name for found in estimates for name in found))
+    parameters = list(dict.fromkeys(name for by_name in estimates for name in by_name))
     units = [_unit(name, estimates) for name in parameters]
 
     def over_fits(values: Sequence[Any], dtype: Any, further: tuple[int, ...] = ()) -> np.ndarray:
@@ -53,7 +53,7 @@ def dataset(
     coordinates["unit"] = ("parameter", np.array(units, _TEXT))
     variables: dict[str, Any] = {}
     for name, (key, words) in _ESTIMATE.items():
-        numbers = [[_of(found, p, key) for p in parameters] for found in estimates]
+        numbers = [[_of(by_name, p, key) for p in parameters] for by_name in estimates]
         values = over_fits(numbers, float, (len(parameters),))
         variables[name] = ((*axes, "parameter"), values, {"long_name": words})
     texts = {
@@ -129,11 +129,11 @@ def _estimates(fit: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
 
 
 def _of(estimates: Mapping[str, Mapping[str, Any]], parameter: str, key: str) -> float:
-    found = estimates.get(parameter)
+    estimate = estimates.get(parameter)
     # fit.json has the value at which the optimiser stopped even where it is no estimate.
-    if found is None or found["sd"] is None:
+    if estimate is None or estimate["sd"] is None:
         return math.nan
-    return _number(found[key])
+    return _number(estimate[key])
 
 
 def _number(value: float | None) -> float:
@@ -141,7 +141,7 @@ def _number(value: float | None) -> float:
 
 
 def _unit(name: str, estimates: Sequence[Mapping[str, Mapping[str, Any]]]) -> str:
-    units = {found[name]["unit"] for found in estimates if name in found}
+    units = {by_name[name]["unit"] for by_name in estimates if name in by_name}
     return units.pop() if len(units) == 1 else "differs"
 
 

@@ -61,18 +61,18 @@ def described(job: Job) -> dict[str, Any]:
 
 
 def _reducer(reduce: Reduce) -> dict[str, Any]:
-    how = reduce.how
-    if isinstance(how, str):
-        words: dict[str, Any] = {"how": how}
+    reducer = reduce.how
+    if isinstance(reducer, str):
+        words: dict[str, Any] = {"how": reducer}
     else:
-        function = how.update if isinstance(how, reducers.Streaming) else how
+        function = reducer.update if isinstance(reducer, reducers.Streaming) else reducer
         # A name and a fingerprint: the repr of a function has its address in memory.
         name = getattr(function, "__qualname__", str(type(function)))
         words = {"how": name, "source": _source(function)}
     words |= {
         k: v for k, v in (("signal", reduce.signal), ("input", reduce.input)) if v is not None
     }
-    return words | ({"gain": reduce.gain} if how == "margins" else {})
+    return words | ({"gain": reduce.gain} if reducer == "margins" else {})
 
 
 def _source(function: Callable[..., Any]) -> str:

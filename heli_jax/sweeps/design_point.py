@@ -236,15 +236,15 @@ def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int)
     return results
 
 
-def _of_function(name: str, how: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
+def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
     """What a function of the user's gives for a run, by name.
 
     Raises:
         ValueError: it fails, or gives no real number.
     """
-    called = getattr(how, "__qualname__", str(how))
+    called = getattr(function, "__qualname__", str(function))
     try:
-        results = {n: jnp.asarray(v) for n, v in _named(name, how(run)).items()}
+        results = {n: jnp.asarray(v) for n, v in _named(name, function(run)).items()}
     except Exception as e:  # whatever the function raises
         # JAX's own sentences go on for pages.
         first = str(e).partition("\n")[0]

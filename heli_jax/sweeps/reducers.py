@@ -195,19 +195,19 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
         ValueError: an unknown `how`, an output or input that the model lacks, or none where one is
             needed.
     """
-    where, how = f"reduce.{name}", reduce.how
+    where, reducer = f"reduce.{name}", reduce.how
     # Here and not at the first run: a sweep of hours shall not end with a misspelt name.
-    if isinstance(how, str) and how not in (*REDUCERS, *LINEAR):
+    if isinstance(reducer, str) and reducer not in (*REDUCERS, *LINEAR):
         known = [*REDUCERS, *LINEAR]
-        raise ValueError(f"{where}.how: unknown reducer {how!r}{nearest(how, known)}")
+        raise ValueError(f"{where}.how: unknown reducer {reducer!r}{nearest(reducer, known)}")
     _check_signal(where, reduce, outputs)
     _check_loop(where, reduce, inputs)
 
 
 def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
     """Refuse a signal that is missing, unknown or of no use."""
-    how, signal = reduce.how, reduce.signal
-    if (how == "margins" or how in REDUCERS) and signal is None:
+    reducer, signal = reduce.how, reduce.signal
+    if (reducer == "margins" or reducer in REDUCERS) and signal is None:
         raise ValueError(f"{where}.signal: missing, expected one of {', '.join(outputs)}")
     if signal is not None and signal not in outputs:
         raise ValueError(
@@ -215,9 +215,9 @@ def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
         )
     # A signal that would be ignored is refused too: a result of one output and of all of them look
     # alike in a table.
-    whole = callable(how) and not isinstance(how, Streaming)
-    if signal is not None and (whole or how == "modes"):
-        what = "modes are" if how == "modes" else "a function of a Trajectory is"
+    whole = callable(reducer) and not isinstance(reducer, Streaming)
+    if signal is not None and (whole or reducer == "modes"):
+        what = "modes are" if reducer == "modes" else "a function of a Trajectory is"
         raise ValueError(f"{where}.signal: {what} of no one signal, expected none")
 
 

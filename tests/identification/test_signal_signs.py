@@ -171,7 +171,7 @@ def test_the_remedy_of_missing_dynamics_is_said_once():
     assert "Several starts" in of_p
     assert of_q.endswith("s after it moved.")
     # The score test has said it then.
-    assert all(s.endswith("s after it moved.") for s in missing_dynamics((servo,), told=True))
+    assert all(s.endswith("s after it moved.") for s in missing_dynamics((servo,), mentioned=True))
 
 
 def test_an_output_before_its_stick_is_said_before_any_fit():

@@ -57,8 +57,8 @@ class _MotionSensors(Device):
     def __init__(self, model: Model, shown: tuple[str, ...]) -> None:
         self.asked = shown
         self.motion = motion_of(model) if {"imu", "airspeed"} & set(shown) else None
-        found = {letter: rate_of(model, letter) for letter in "pqr"}
-        self.body_rates = {letter: rate for letter, rate in found.items() if rate is not None}
+        rates = {letter: rate_of(model, letter) for letter in "pqr"}
+        self.body_rates = {letter: rate for letter, rate in rates.items() if rate is not None}
         params: dict[str, Quantity] = {}
         outputs: dict[str, Quantity] = {}
         if "imu" in shown:

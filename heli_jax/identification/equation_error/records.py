@@ -95,9 +95,9 @@ def _segment(
     structure: Structure,
     outputs: Mapping[str, np.ndarray],
     part: slice,
-    how: tuple[int, Mapping[str, float]],
+    timing: tuple[int, Mapping[str, float]],
 ) -> Segment:
-    (half, late), dt = how, flight.dt
+    (half, late), dt = timing, flight.dt
     made = {n: smoothing.smoothed(y, dt, half) for n, y in outputs.items()}
     n = part.stop - part.start
     # Inputs are known before the segment too, where a delayed one comes from.

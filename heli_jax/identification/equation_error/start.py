@@ -106,12 +106,12 @@ def equation_error_start(
             regression = regression._replace(names=selection.selected, base=kept.base)
             optimum = _optimum(kept, regression)
     sd = np.sqrt(np.maximum(np.diag(errors.covariance(optimum.rows)), 0.0))
-    found = {
+    coefficients = {
         n: (float(v), float(s))
         for n, v, s in zip(regression.names, optimum.values, sd, strict=True)
         if selection is None or n in selection.selected
     }
-    values = {n: _value(setup, n, found, {**reasons, **null}, selection) for n in free}
+    values = {n: _value(setup, n, coefficients, {**reasons, **null}, selection) for n in free}
     hidden = {s.states[i]: None for s in setup.structures for i in s.hidden}
     return EquationErrorStart(
         values,
@@ -315,13 +315,13 @@ def _nothing(setup: _Setup, names: Sequence[str]) -> str:
 def _value(
     setup: _Setup,
     name: str,
-    found: Mapping[str, tuple[float, float]],
+    coefficients: Mapping[str, tuple[float, float]],
     reasons: Mapping[str, str],
     selection: Selection | None,
 ) -> StartValue:
     unit = naming.unit(setup.model.Params, name) or "1"
-    if name in found:
-        value, sd = found[name]
+    if name in coefficients:
+        value, sd = coefficients[name]
         inside = _inside(setup.free[name], value)
         moved = "" if inside == value else f"{value:.4g} lies outside its bounds"
         return StartValue(inside, sd, unit, "equation error", moved)

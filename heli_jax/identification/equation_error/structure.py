@@ -152,7 +152,7 @@ def _by_derivatives(
         right.append(side)
     # Once only: each derivative more has so much more noise.
     more = _solved(value[np.ix_(rows, rest)], np.stack(right))
-    return {**shown, **{rest[j]: found for j, found in more.items()}}
+    return {**shown, **{rest[j]: columns for j, columns in more.items()}}
 
 
 def held(model: Model, base: Mapping[str, float], structures: Sequence[Structure]) -> set[str]:
@@ -170,7 +170,7 @@ def held(model: Model, base: Mapping[str, float], structures: Sequence[Structure
     """
     names = tuple(n for n in naming.names(model.Params) if not np.isnan(base[n]))
     at = matrices(model, base, names, generic(len(names)))
-    found: set[str] = set()
+    held_names: set[str] = set()
     for hidden in {s.hidden for s in structures}:
         block = np.ix_(hidden, hidden)
         depends = np.abs(at.slope[block]) > 0
@@ -178,8 +178,10 @@ def held(model: Model, base: Mapping[str, float], structures: Sequence[Structure
         # the hidden states integrated at a wrong one, least squares would fit the rest to the wrong
         # signal.
         loop = _closing((at.value[block] != 0) & ~depends.any(axis=-1))
-        found |= {names[j] for j in np.flatnonzero((depends & loop[..., None]).any(axis=(0, 1)))}
-    return found | set(dict(model.delays).values())
+        held_names |= {
+            names[j] for j in np.flatnonzero((depends & loop[..., None]).any(axis=(0, 1)))
+        }
+    return held_names | set(dict(model.delays).values())
 
 
 def generic(count: int) -> Float[np.ndarray, " q"]:

@@ -313,8 +313,8 @@ def filtered_flights(
         # One record of a small model: written out in rows the exact filter takes as long, and two
         # seconds less to compile.
         if not (small and len(group) == 1):
-            found = innovations_together(layout, data, noise, u, group)
-            together |= dict(zip(group, found, strict=True))
+            innovations = innovations_together(layout, data, noise, u, group)
+            together |= dict(zip(group, innovations, strict=True))
     return tuple(
         together[i] if i in together else _filtered(layout, data, noise, u, i)
         for i in range(len(data.flights))

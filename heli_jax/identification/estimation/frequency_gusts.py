@@ -124,10 +124,10 @@ def _before(
         cells = _Cells(*(v[np.isfinite(cells.H).all((1, 2))] for v in cells))
         if not cells.f.size:
             return flat
-        found = _described(cells, corners)
-    if not all(np.isfinite(v).all() for v in found):
+        parameters = _described(cells, corners)
+    if not all(np.isfinite(v).all() for v in parameters):
         return flat
-    q, r = found
+    q, r = parameters
     made = {}
     for K, of in at.items():
         S0 = _spectrum(np.nan_to_num(of.H), q @ _shapes(of.f, corners), r)

@@ -340,7 +340,7 @@ def errors_of_lines(
         noise: with the whitening of each record.
         z: the unknowns.
     """
-    u, found = unpack(layout, data, z), {}
+    u, errors = unpack(layout, data, z), {}
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
@@ -359,8 +359,8 @@ def errors_of_lines(
         each = (machines.signals, y)
         made = by_flight(data, members, ready, of_some, machines.matrices, each)
         for k, i in enumerate(members):
-            found[i] = [v[k] for v in made]
-    return [one for i in range(len(data.flights)) for one in found[i]]
+            errors[i] = [v[k] for v in made]
+    return [one for i in range(len(data.flights)) for one in errors[i]]
 
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:

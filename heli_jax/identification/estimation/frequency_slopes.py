@@ -134,8 +134,8 @@ def products_of_lines(
                 made.append(jax.vmap(_Sums.products)(sums))
             return jax.tree.map(lambda *v: sum(v), *made)
 
-        given = (machines.signals, slopes.signals, measured(layout, data, members))
-        each = (given, None if machines.by is None else (machines.by, slopes.by))
+        measured_signals = (machines.signals, slopes.signals, measured(layout, data, members))
+        each = (measured_signals, None if machines.by is None else (machines.by, slopes.by))
         common = (machines.matrices, slopes.matrices)
         made = by_flight(data, members, ready, of_some, common, each)
         total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
@@ -146,7 +146,7 @@ def _of_record(
     common: tuple[Resolved, Matrices, Matrices],
     record: Record,
     by_instrument: Array,
-    given: tuple[Signals, Signals, Array],
+    measured_signals: tuple[Signals, Signals, Array],
     instruments: tuple[Signals, Signals] | None,
 ) -> _Sums:
     """Of one record of a few flights, with a leading axis.
@@ -155,10 +155,10 @@ def _of_record(
         common: the machine at the lines, itself, and its derivatives.
         record: which samples it is.
         by_instrument: whether instruments are used.
-        given: the inputs, their derivatives, and what was measured.
+        measured_signals: the inputs, their derivatives, and what was measured.
         instruments: the inputs by instrument and their derivatives.
     """
-    (at, m, dm), (signals, ds, y) = common, given
+    (at, m, dm), (signals, ds, y) = common, measured_signals
     by = None if instruments is None else instruments[0]
     e, X_by = errors_of_some(at, m, record, signals, y, by)
     driven = jax.vmap(lambda e, ds: _Driven(e.X, e.signals, _lines(record, ds)))(e, ds)
@@ -304,7 +304,7 @@ def _differentiated(
 
 def _moving(make: Callable[[Array], Machines], v: Float[Array, " q"]) -> list[bool]:
     """Of each array of the machines whether it hangs on v: what does not costs nothing then."""
-    found: list[bool] = []
+    moving: list[bool] = []
 
     @jax.custom_jvp
     def look(*leaves: Array) -> Array:
@@ -312,9 +312,9 @@ def _moving(make: Callable[[Array], Machines], v: Float[Array, " q"]) -> list[bo
 
     def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
         zero = jax.custom_derivatives.SymbolicZero
-        found.extend(not isinstance(t, zero) for t in tangents)
+        moving.extend(not isinstance(t, zero) for t in tangents)
         return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
 
     look.defjvp(rule, symbolic_zeros=True)
     jax.eval_shape(lambda t: jax.jvp(lambda v: look(*jax.tree.leaves(make(v))), (v,), (t,)), v)
-    return found
+    return moving

@@ -139,8 +139,8 @@ class FusedRuns:
         stays = part.run.stays(own, common)
         stored = [np.asarray(v) for v in jax.tree.leaves(records)]
         if not isinstance(part.kernel, Kernel):
-            given = [[jnp.asarray(v) for v in of] for of in (stays, stored, carry)]
-            (triangle,) = part.kernel(*given)
+            arguments = [[jnp.asarray(v) for v in of] for of in (stays, stored, carry)]
+            (triangle,) = part.kernel(*arguments)
         else:
             (triangle,) = part.kernel([np.asarray(v) for v in stays], stored, carry, cores())
         return full(np.asarray(triangle))
@@ -321,10 +321,10 @@ def _size(jaxpr: Any) -> int:
     return total
 
 
-def _compare(found: np.ndarray, expected: np.ndarray) -> None:
+def _compare(computed: np.ndarray, expected: np.ndarray) -> None:
     size = np.sqrt(np.abs(np.diagonal(expected, axis1=1, axis2=2)))
-    near = np.abs(found - expected) <= 1e-6 * size[:, :, None] * size[:, None, :]
-    alike = (near | (np.isnan(found) & np.isnan(expected))).all(axis=(1, 2))
+    near = np.abs(computed - expected) <= 1e-6 * size[:, :, None] * size[:, None, :]
+    alike = (near | (np.isnan(computed) & np.isnan(expected))).all(axis=(1, 2))
     # Of most: a run that leaves its steady flight by itself magnifies any rounding.
     if np.mean(alike) < 0.5:
         raise CudaError("the GPU gives other numbers than the processor")

@@ -83,11 +83,11 @@ def linearisation_notes(layout: Layout, data: Data, noise: Noise, e: Evaluation)
     moved = _moved(layout, data, noise, e, left)
     if moved is None:
         return notes
-    told = {n: v for n, v in moved.items() if abs(v) >= _TOLD}
-    words = ", ".join(f"{n} by {v:+.2g}" for n, v in told.items())
+    notable = {n: v for n, v in moved.items() if abs(v) >= _TOLD}
+    words = ", ".join(f"{n} by {v:+.2g}" for n, v in notable.items())
     notes.append(
         f"What the linear model leaves out moves {words} standard deviations."
-        if told
+        if notable
         else f"What the linear model leaves out moves no estimate by {_TOLD} standard deviations."
     )
     share = max(float(np.max(flight.share)) for flight in left)

@@ -88,8 +88,8 @@ def _rest(model: Model, params: Any, inputs: Any) -> tuple[Any, Array]:
     initial state."""
     start = naming.ravel(model.initial_state(params), jnp.result_type(float))
 
-    def rates(x: Array, given: Any) -> Array:
-        p, u = given
+    def rates(x: Array, arguments: Any) -> Array:
+        p, u = arguments
         return naming.ravel(model.vector_field(p, naming.unravel(model.State, x), u), x.dtype)
 
     still = jax.lax.stop_gradient((params, inputs))

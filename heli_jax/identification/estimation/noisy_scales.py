@@ -57,8 +57,8 @@ def slopes_at(layout: Layout, noise: Noise, e: Evaluation, last: int) -> Any:
     if not names or not len(noise.scale_slopes):
         return noise.scale_slopes
     at = [layout.of_interest.index(n) for n in names]
-    found = 2.0 * e.r[last] * e.J[last, at] / e.slopes[at] + noise.scale_slopes
-    return np.asarray(found, np.asarray(noise.scale_slopes).dtype)
+    slopes = 2.0 * e.r[last] * e.J[last, at] / e.slopes[at] + noise.scale_slopes
+    return np.asarray(slopes, np.asarray(noise.scale_slopes).dtype)
 
 
 def slopes_changed(before: Noise, after: Noise) -> float:

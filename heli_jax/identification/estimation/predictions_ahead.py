@@ -49,8 +49,11 @@ def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
     samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in data.flights)
     errors = jax.device_get(_errors(layout, data, noise, z, samples))
     return tuple(
-        Ahead({n: np.asarray(f.outputs[n]) - e for n, e in found.error.items()}, found.variance)
-        for f, found in zip(data.flights, errors, strict=True)
+        Ahead(
+            {n: np.asarray(f.outputs[n]) - e for n, e in innovations.error.items()},
+            innovations.variance,
+        )
+        for f, innovations in zip(data.flights, errors, strict=True)
     )
 
 

@@ -97,7 +97,7 @@ def own_at(
     """
     if not noise.own:
         return noise.own
-    here, found = _log_det(layout, noise, e.J, measured), {}
+    here, slopes = _log_det(layout, noise, e.J, measured), {}
     for name, before in noise.own.items():
         i = layout.of_interest.index(name)
         # Of a parameter that keeps its sign the coordinate is about its logarithm.
@@ -105,8 +105,8 @@ def own_at(
         apart = float(np.log(there.named[i] / e.named[i]))
         slope = (_log_det(layout, noise, there.J, measured) - here) / apart
         at = [slope, np.log(e.named[i])] if np.isfinite(slope) else before
-        found[name] = np.asarray(at, before.dtype)
-    return found
+        slopes[name] = np.asarray(at, before.dtype)
+    return slopes
 
 
 def _log_det(layout: Layout, noise: Noise, J: np.ndarray, measured: int) -> float:

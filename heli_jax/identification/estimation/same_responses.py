@@ -124,9 +124,9 @@ def same_responses(
     if not (np.isfinite(slopes).all() and sizes[-1] > _DETERMINED * sizes[0]):
         return []
     values = _values(layout, data, here)
-    found: list[np.ndarray] = []
+    ends: list[np.ndarray] = []
     for factor, i in itertools.product(_FACTORS, range(here.size)):
-        if len(found) == _MOST or differ.evaluations > _EVALUATIONS:
+        if len(ends) == _MOST or differ.evaluations > _EVALUATIONS:
             break
         start = here.copy()
         limits = (data.sign[i], data.low[i], data.high[i])
@@ -142,10 +142,10 @@ def same_responses(
         # Of two lags in series that change places the verdict tells by itself.
         if np.allclose(np.sort(there), np.sort(values), rtol=_MOVED):
             continue
-        known = [_values(layout, data, z) for z in found]
+        known = [_values(layout, data, z) for z in ends]
         if not any(np.allclose(there, v, rtol=_MOVED) for v in known):
-            found.append(end)
-    return found
+            ends.append(end)
+    return ends
 
 
 def _with_the_same(

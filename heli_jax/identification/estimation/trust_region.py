@@ -152,17 +152,17 @@ def within_reach(
     return eqx.tree_at(lambda s: s.y_eval, state, nearer)
 
 
-def within_radius(state: Any, y: Float[Array, " q"], wanted: Bool[Array, ""] | bool = True) -> Any:
+def within_radius(state: Any, y: Float[Array, " q"], limited: Bool[Array, ""] | bool = True) -> Any:
     """The solver's state, its next point no further from y than its radius.
 
     Args:
         state: after a step.
         y: the unknowns at the last point that was accepted.
-        wanted: whether there is to be a radius at all.
+        limited: whether there is to be a radius at all.
     """
     step = state.y_eval - y
     size = _norm2(state.f_info.jac.mv(step))
-    radius = jnp.where(wanted, state.search_state.radius, jnp.inf)
+    radius = jnp.where(limited, state.search_state.radius, jnp.inf)
     nearer = y + step * jnp.minimum(1.0, radius / jnp.where(size > 0, size, 1.0))
     # Where there is no radius the point is the solver's own, to the last digit.
     return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))

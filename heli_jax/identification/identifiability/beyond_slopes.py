@@ -203,7 +203,7 @@ def _reaching(
         reach: by parameter, from the optimum to the ends of its interval by slopes, in the
             optimiser's coordinate.
     """
-    found = {}
+    intervals = {}
     for name, distance in reach.items():
         i = at.layout.of_interest.index(name)
 
@@ -218,8 +218,8 @@ def _reaching(
         there = [value(float(p.z[i]) + side * p.left * distance) for p in along for side in (-1, 1)]
         low, high = min(*known, *there), max(*known, *there)
         if low < min(known) or high > max(known):
-            found[name] = (low, high)
-    return found
+            intervals[name] = (low, high)
+    return intervals
 
 
 class _Point(NamedTuple):
@@ -244,8 +244,8 @@ def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
         Q, R = np.linalg.qr(J)
         left = -(Q.T @ now.r)
         damped = np.vstack([R, ridge * np.eye(len(R))])
-        wanted = np.concatenate([left, np.zeros(len(R))])
-        part = np.linalg.lstsq(damped, wanted, rcond=None)[0]
+        target = np.concatenate([left, np.zeros(len(R))])
+        part = np.linalg.lstsq(damped, target, rcond=None)[0]
         promised = float(left @ left - np.sum((left - R @ part) ** 2))
         if promised < _ENOUGH:
             break

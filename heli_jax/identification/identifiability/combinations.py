@@ -136,7 +136,7 @@ def sums(
     if not all(np.linalg.norm(v) > 0 for v in moved):
         return ()
     W, pivots = row_reduced(np.array([unit_vector(v) for v in moved]), unknowns)
-    found = []
+    combinations = []
     for i in range(W.shape[1]):
         factors = np.zeros(W.shape[1])
         factors[i] = 1.0
@@ -150,8 +150,8 @@ def sums(
         if len({units.get(u.name, u.name) for u in members}) > 1:
             continue
         if all(u.logarithmic for u in members):
-            found.append(_sum(factors, covariance, unknowns, to_value))
-    return tuple(c for c in found if c.is_bounded)
+            combinations.append(_sum(factors, covariance, unknowns, to_value))
+    return tuple(c for c in combinations if c.is_bounded)
 
 
 def _sum(

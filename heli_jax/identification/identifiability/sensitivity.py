@@ -252,8 +252,8 @@ class Around(NamedTuple):
         def tied(
             null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
         ) -> tuple[Combination, ...]:
-            found = asked(null, covariance, unknowns) if self.combined else ()
-            return tuple(c for c in found if c.name not in self.open_combinations)
+            joint = asked(null, covariance, unknowns) if self.combined else ()
+            return tuple(c for c in joint if c.name not in self.open_combinations)
 
         return tied
 

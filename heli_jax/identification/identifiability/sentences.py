@@ -147,14 +147,16 @@ def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:
     for names in _tied_together(pairs):
         inside = [pair for pair in pairs if pair.first in names]
         ordered = [u.name for u in facts.unknowns if u.name in names]
-        how = f"correlation {inside[0].correlation:+.5f}"
+        correlations = f"correlation {inside[0].correlation:+.5f}"
         if len(inside) > 1:
             members = len(names) * (len(names) - 1) // 2
             count = f"all {members}" if len(inside) == members else f"{len(inside)} of {members}"
             sizes = [abs(pair.correlation) for pair in inside]
-            how = f"correlations of {count} pairs from {min(sizes):.5f} to {max(sizes):.5f} in size"
+            correlations = (
+                f"correlations of {count} pairs from {min(sizes):.5f} to {max(sizes):.5f} in size"
+            )
         lines.append(
-            f"{listed(ordered)} can hardly be told apart ({how}): "
+            f"{listed(ordered)} can hardly be told apart ({correlations}): "
             f"{way_out(tuple(ordered), facts, 1)}."
         )
     return lines

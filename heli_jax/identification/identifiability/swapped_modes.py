@@ -59,7 +59,7 @@ def second_solutions(
     e: Evaluation,
     *,
     optimum: bool = True,
-    told: Sequence[tuple[str, str]] = (),
+    reported: Sequence[tuple[str, str]] = (),
 ) -> tuple[SecondSolution, ...]:
     """Other admissible values of the free parameters that the data do not tell from those here.
 
@@ -68,7 +68,7 @@ def second_solutions(
         at: the point.
         e: what it tells.
         optimum: whether it is one, about which the other unknowns may follow.
-        told: pairs of parameters of which it is said already that their values may be exchanged.
+        reported: pairs of parameters whose values are said already to be exchangeable.
     """
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     names = [n for n in problem.free if n in values]
@@ -80,15 +80,15 @@ def second_solutions(
         starts = _starts(family)
         if not starts:
             return ()
-        found: list[np.ndarray] = []
+        others: list[np.ndarray] = []
         for start in starts:
             z = _same_responses(family, start)
-            if z is not None and not any(np.allclose(z, other, atol=0.02) for other in found):
-                found.append(z)
+            if z is not None and not any(np.allclose(z, other, atol=0.02) for other in others):
+                others.append(z)
     valley, solutions = Valley(problem, at, e), []
-    for z in found:
+    for z in others:
         one = _as_good(valley, family, z, optimum)
-        if one is not None and not any(set(one.changed) <= set(pair) for pair in told):
+        if one is not None and not any(set(one.changed) <= set(pair) for pair in reported):
             solutions.append(one)
     return tuple(solutions)
 
@@ -220,7 +220,7 @@ def _starts(family: _Family) -> list[np.ndarray]:
     slopes = np.where(family.log & np.isfinite(slopes), slopes, 0.0)
     starts = []
     for i, j in pairs:
-        wanted = math.log((here[j] / here[i]).real) * np.array([1.0, -1.0])
+        target = math.log((here[j] / here[i]).real) * np.array([1.0, -1.0])
         for a, b in itertools.combinations(range(q), 2):
             E = slopes[np.ix_([i, j], [a, b])]
             # Each of the two has to make a mode of its own.
@@ -231,7 +231,7 @@ def _starts(family: _Family) -> list[np.ndarray]:
             if each < _MAKES or abs(np.linalg.det(E)) < _MAKES * each:
                 continue
             z = np.zeros(q)
-            z[[a, b]] = np.linalg.solve(E, wanted)
+            z[[a, b]] = np.linalg.solve(E, target)
             if np.max(np.abs(z)) < _REACH:
                 starts.append((each, z))
     starts.sort(key=lambda one: -one[0])

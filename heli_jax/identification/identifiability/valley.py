@@ -196,7 +196,7 @@ def _stays(
 ) -> bool:
     """Whether a combination is the same at all points, and its parameters are not."""
     values = {u.name: u.value for u in unknowns}
-    told = False
+    has_moved = False
     for point in points:
         if c.kind == "sum":
             parts = [w * (point[n] - values[n]) for n, w in c.exponents.items()]
@@ -209,7 +209,7 @@ def _stays(
             parts = [w * math.log(ratios[n]) for n, w in c.exponents.items()]
             size, sd = 1.0, c.sd / c.value if c.value else 0.0
         moved = sum(abs(part) for part in parts)
-        told = told or moved > _MOVED * size
+        has_moved = has_moved or moved > _MOVED * size
         if abs(sum(parts)) > max(2.0 * sd, _STAYS * moved):
             return False
-    return told
+    return has_moved

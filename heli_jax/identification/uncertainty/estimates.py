@@ -197,11 +197,11 @@ def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
         estimates: of the free parameters.
     """
     sample = max(f.dt for f in problem.training)
-    found = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
+    delays = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
     return [
         f"by {n} = {1e3 * e.value:.3g} ms it answers before its input, unless the clocks of stick "
         "and response differ"
-        for n, e in found
+        for n, e in delays
         if e.upper95 is not None and e.upper95 < -sample
     ]
 

@@ -178,13 +178,13 @@ def _sample(
     block = -(-count // _BLOCKS)
     split = jax.vmap(lambda key: jax.random.split(key, block * _BLOCKS))(pairs[:, 1])
     some = jax.jit(jax.vmap(lambda state, keys: jax.lax.scan(step, state, keys)))
-    found = []
+    chunks = []
     with stages.stage(f"NUTS, {_CHAINS} chains", total=count):
         for i in range(0, count, block):
             chains, drawn = some(chains, split[:, i : i + block])
-            found.append(jax.device_get(drawn))
+            chunks.append(jax.device_get(drawn))
             stages.advance(min(block, count - i))
-    joined = jax.tree.map(lambda *v: np.concatenate(v, axis=1)[:, settling:count], *found)
+    joined = jax.tree.map(lambda *v: np.concatenate(v, axis=1)[:, settling:count], *chunks)
     positions, statistics = joined
     # One for all chains: it was adapted before they began.
     size = np.broadcast_to(np.asarray(parameters["step_size"]), statistics["lp"].shape)

@@ -136,6 +136,6 @@ def _check(data: Data, holds: Any, record: list[Flight], where: str, model: Any)
                 {n: float(v) for n, v in flight.known.items()},
             ),
         }
-        for name, (wanted, got) in expected.items():
-            if wanted != got:
-                raise ValueError(f"{where}: expected {name} {wanted} as the fit has, got {got}")
+        for name, (value, got) in expected.items():
+            if value != got:
+                raise ValueError(f"{where}: expected {name} {value} as the fit has, got {got}")

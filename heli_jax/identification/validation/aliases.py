@@ -141,7 +141,7 @@ def fast_modes(
         noise: sd by flight and output, SI; without it nothing is said to be undetermined.
     """
     free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
-    found = []
+    modes = []
     for i, flight in enumerate(problem.training):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
         params = naming.replace(problem.vehicle, **(free | known))
@@ -155,8 +155,8 @@ def fast_modes(
         )
         moving = [n for n in free if n not in known]
         fast = _of_flight(problem, flight, params, at, moving, noise[i] if noise else None)
-        found += [] if fast is None else [fast]
-    return found
+        modes += [] if fast is None else [fast]
+    return modes
 
 
 def _of_flight(
@@ -225,14 +225,14 @@ def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMo
         return list(modes)
     values = dict(zip(valley.at.layout.of_interest, valley.e.named, strict=True))
     worse = max(SAME, _AS_GOOD * float(np.sum(np.square(np.asarray(valley.e.r, np.float64)))))
-    found = []
+    aliased = []
     for mode in modes:
         more = []
         for name, factor in () if mode.undetermined else mode.turning:
             point = valley.visit({name: float(values[name]) * factor}, {}, priors=True)
             more += [name] if point is not None and point.excess <= worse else []
-        found.append(mode._replace(undetermined=(*mode.undetermined, *more)))
-    return found
+        aliased.append(mode._replace(undetermined=(*mode.undetermined, *more)))
+    return aliased
 
 
 def _known_otherwise(problem: Problem, name: str) -> bool:

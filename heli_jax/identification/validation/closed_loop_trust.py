@@ -114,16 +114,16 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
 
 
 def mean_share(
-    told: Float[np.ndarray, "q q"],
+    information: Float[np.ndarray, "q q"],
 ) -> Callable[[Float[np.ndarray, "q q"]], Float[np.ndarray, " q"]]:
     """What makes of a part of the information the share that each unknown has of it, 0 to 1.
 
     Args:
-        told: the whole information.
+        information: the whole information.
     """
-    sd = np.sqrt(np.maximum(np.diagonal(told), 1e-300))
+    sd = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     # A parameter that is not determined has no standard deviation to be moved by.
-    covariance = np.linalg.pinv(told / np.outer(sd, sd), rcond=1e-12, hermitian=True)
+    covariance = np.linalg.pinv(information / np.outer(sd, sd), rcond=1e-12, hermitian=True)
 
     def mean(of: Float[np.ndarray, "q q"]) -> Float[np.ndarray, " q"]:
         part = covariance @ (of / np.outer(sd, sd)) @ covariance
@@ -251,16 +251,16 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
     )
 
 
-def known_no_gusts(problem: Problem, found: Sequence[Feedback]) -> bool:
+def known_no_gusts(problem: Problem, feedback: Sequence[Feedback]) -> bool:
     """Whether inputs follow the response in a fit in time that knows no gusts.
 
     Args:
         problem: says the method.
-        found: of `feedback_of`.
+        feedback: of `feedback_of`.
     """
     estimator = estimator_of(problem.method)
     in_time = not (estimator.by_instrument or estimator.fits_responses)
-    return in_time and not estimator.process_noise and any(one.present for one in found)
+    return in_time and not estimator.process_noise and any(one.present for one in feedback)
 
 
 class _Lines(NamedTuple):

@@ -63,7 +63,7 @@ def is_it_enough(
         compare: whether to compute what further outputs and manoeuvres would do, too.
     """
     flights = list(zip(labels(problem.training), problem.training, strict=True))
-    found = [
+    findings = [
         *logging_rate(problem, flights, at.noise.sd),
         *bands(problem.training),
         *_of_feedback(problem, feedback),
@@ -81,27 +81,27 @@ def is_it_enough(
         *late_inputs(flights, feedback),
     ]
     if compare:
-        found += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
+        findings += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
     else:
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
-        found.append(Finding("next flight", "note", words))
-    return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))
+        findings.append(Finding("next flight", "note", words))
+    return tuple(sorted(findings, key=lambda f: _ORDER[f.severity]))
 
 
 def judged_again(
-    problem: Problem, found: Sequence[Finding], params: Any, sd: Sequence[Mapping[str, Any]]
+    problem: Problem, findings: Sequence[Finding], params: Any, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[Finding, ...]:
     """The findings with the logging rate at the estimates.
 
     Args:
         problem: what was fitted.
-        found: at the start values.
+        findings: at the start values.
         params: the model's Params with the estimates in place, SI.
         sd: of the residuals by flight and output, SI.
     """
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
-    kept = [f for f in found if f.topic != "logging rate"]
+    kept = [f for f in findings if f.topic != "logging rate"]
     return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
 

@@ -145,8 +145,8 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
             continue
         count = flight.n_samples // 2
         X, y = _lines(drives, count), _lines([flight.outputs[n] for n in names], count)
-        for name, found in zip(names, _in_bands(y, y, np.ones((len(y), 1)), X), strict=True):
-            sums[name] = sums.get(name, np.zeros(4)) + found
+        for name, statistics in zip(names, _in_bands(y, y, np.ones((len(y), 1)), X), strict=True):
+            sums[name] = sums.get(name, np.zeros(4)) + statistics
     return {
         name: float(scipy.special.chdtrc(freedom, statistic))
         for name, (statistic, freedom, *_) in sums.items()
@@ -192,8 +192,8 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
             # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
             sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
         size = sizes[id(W)]
-        for name, found in zip(names, _in_bands(e, y, size, X), strict=True):
-            sums[name] = sums.get(name, np.zeros(4)) + found
+        for name, statistics in zip(names, _in_bands(e, y, size, X), strict=True):
+            sums[name] = sums.get(name, np.zeros(4)) + statistics
     return {
         name: Followed(
             float(scipy.special.chdtrc(freedom, statistic)),
@@ -240,6 +240,6 @@ def _in_bands(
         # Not the model's response: a wrong model's may be larger than anything that was measured.
         scale = np.mean(size[band] ** 2, axis=0)[:, None]
         chance = m[:, None] * np.maximum(whole - parts, 0.0) / (n - m)[:, None]
-        found = np.column_stack([statistic, 2.0 * m, scale * (parts - chance)])
-        total += np.where(asked[:, None], found, 0.0)
+        statistics = np.column_stack([statistic, 2.0 * m, scale * (parts - chance)])
+        total += np.where(asked[:, None], statistics, 0.0)
     return total

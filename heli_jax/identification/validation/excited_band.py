@@ -75,8 +75,8 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
     barely = hardly_moving(alike, moving)
     pooled = _pooled(seen, moving, alike[0].dt)
     if pooled is not None:
-        together, found = _moving_together(pooled, moving), _coherent_bands(pooled, moving, seen)
-        return [*barely, *found, *together]
+        together, coherent = _moving_together(pooled, moving), _coherent_bands(pooled, moving, seen)
+        return [*barely, *coherent, *together]
     together = _short_together(alike, moving)
     return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
 

@@ -107,7 +107,7 @@ def feedback(
     blocks = lag_blocks(max(1, min(round(_LONGEST / dt), len(innovations) // 10)))
     # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
     tests = together * len(inputs) * len(outputs) * len(blocks)
-    found = []
+    dependent = []
     for name, values in free.items():
         each = correlations_with_sums(values, innovations, blocks)
         # Of several that are sure beyond all numbers the correlation decides.
@@ -121,8 +121,8 @@ def feedback(
         )
         lag, label = (blocks[b][0] * dt, blocks[b][1] * dt), flight.name or "flight 1"
         late = steps.get(name, 0) * flight.dt
-        found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
-    return tuple(found)
+        dependent.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
+    return tuple(dependent)
 
 
 class _Tested(NamedTuple):
@@ -220,17 +220,17 @@ def feedback_of(
 
 
 def _delay(
-    problem: Problem, flight: Flight, name: str, found: Mapping[str, tuple[float, float | None]]
+    problem: Problem, flight: Flight, name: str, delays: Mapping[str, tuple[float, float | None]]
 ) -> tuple[float, float, bool]:
     """Of an input its delay and its sd [s], as far as they are known, and whether that was
     estimated."""
     delay, variance, estimated = 0.0, 0.0, False
     own = dict(problem.model.delays).get(name)
-    if own is not None and own not in found:
+    if own is not None and own not in delays:
         stated = flight.known.get(own)
         delay = float(getattr(problem.vehicle, own) if stated is None else stated)
     for parameter in ("time_shift", own):
-        value, sd = found.get(parameter or "", (0.0, None))
+        value, sd = delays.get(parameter or "", (0.0, None))
         if sd is not None:
             delay, variance, estimated = delay + value, variance + sd**2, True
     return delay, math.sqrt(variance), estimated
@@ -254,16 +254,16 @@ def untested(problem: Problem) -> list[str]:
 
 
 def feedback_notes(
-    problem: Problem, found: Sequence[Feedback], white: bool | None = None
+    problem: Problem, feedback: Sequence[Feedback], white: bool | None = None
 ) -> list[str]:
     """What a closed loop does to the estimates, and what to do; nothing where there is none.
 
     Args:
         problem: says the method and what can be disturbed.
-        found: of `feedback_of`.
+        feedback: of `feedback_of`.
         white: whether the errors that the method asks to be white are; None before a fit.
     """
-    present = [one for one in found if one.present]
+    present = [one for one in feedback if one.present]
     filtered = estimator_of(problem.method).process_noise
     # With disturbances in the model and white innovations the noise model is right, and the direct
     # estimate is unbiased in a closed loop too.

@@ -42,7 +42,7 @@ def wrong_units(
         simulated: at the start values, by flight and output (N,), SI.
         sticks: by output the input that moves it, of `signal_signs.sticks_of`; without it any.
     """
-    found = []
+    findings = []
     for (label, flight), run in zip(flights, simulated, strict=True):
         for name, signal in (flight.source.inputs if flight.source else {}).items():
             if signal.constant is not None:
@@ -53,8 +53,8 @@ def wrong_units(
             if other is None or not sizes:
                 continue
             if all(s and other.factor / _NEAR < s < other.factor * _NEAR for s in sizes):
-                found.append(_said(label, name, signal, other, moved, sizes))
-    return found
+                findings.append(_said(label, name, signal, other, moved, sizes))
+    return findings
 
 
 def _other(signal: Signal, values: np.ndarray) -> _Other | None:

@@ -56,10 +56,10 @@ def correlations_with_sums(
     # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's own.
     most = [min(4 * (last - first + 1) + 20, N - 1) for first, last in blocks]
     signals = _Signals(u, e, most, blocks)
-    found = Correlated(*np.zeros((2, e.shape[1], len(blocks))))
-    found.p_value[:] = 1.0
+    correlated = Correlated(*np.zeros((2, e.shape[1], len(blocks))))
+    correlated.p_value[:] = 1.0
     if not power > 0:
-        return found
+        return correlated
     for b, (block, lags) in enumerate(zip(blocks, most, strict=True)):
         own = signals.of_sums(block, lags)
         size = np.sqrt(power * np.maximum(own[0], 0.0))
@@ -70,9 +70,9 @@ def correlations_with_sums(
         variance = 1.0 + 2.0 * (signals.of_u[1 : lags + 1] @ autocorrelation)
         sd = np.sqrt(np.maximum(variance, 0.1) / n)
         p_value = 2.0 * scipy.special.ndtr(-np.abs(correlation) / sd)
-        found.p_value[:, b] = np.where(moves, p_value, 1.0)
-        found.correlation[:, b] = correlation
-    return found
+        correlated.p_value[:, b] = np.where(moves, p_value, 1.0)
+        correlated.correlation[:, b] = correlation
+    return correlated
 
 
 class _Signals:

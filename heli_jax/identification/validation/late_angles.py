@@ -56,14 +56,14 @@ def late_angles(problem: Problem) -> list[Finding]:
     """
     known = _behind_devices(problem.model)
     pairs = [(r, a) for r, a in rates_and_angles(problem.model) if not known & {r, a}]
-    found = []
+    findings = []
     for label, flight in zip(labels(problem.training), problem.training, strict=True):
         for rate, angle in pairs:
             if rate in flight.outputs and angle in flight.outputs:
                 late = lateness(flight.outputs[angle], flight.outputs[rate], flight.dt)
                 if late is not None and late.matters(flight.dt):
-                    found.append(_finding(label, rate, angle, late))
-    return found
+                    findings.append(_finding(label, rate, angle, late))
+    return findings
 
 
 def _behind_devices(model: Model) -> set[str]:
@@ -87,22 +87,22 @@ class Lateness(NamedTuple):
         return abs(self.late) > max(_LEAST, dt, _SURE * self.sd)
 
 
-def _finding(label: str, rate: str, angle: str, found: Lateness) -> Finding:
-    late = found.late
+def _finding(label: str, rate: str, angle: str, lateness: Lateness) -> Finding:
+    late = lateness.late
     first, second = (angle, rate) if late > 0 else (rate, angle)
     criterion = f"delay of the angle against its integrated rate [s], {_LEAST:g}"
-    if found.other is not None:
+    if lateness.other is not None:
         words = (
             f"{label}: {angle} and {rate} go together only where one of them is moved in time, and "
-            f"the motion repeats itself: {angle} is logged {late:.2g} s or {found.other:.2g} s "
+            f"the motion repeats itself: {angle} is logged {late:.2g} s or {lateness.other:.2g} s "
             f"later than {rate} (negative: earlier). State the delay if it is known, or leave one "
             "of the two out."
         )
         return Finding("late output", "doubt", words, late, criterion)
     words = (
         f"{label}: {first} is logged {abs(late):.2g} s later than {second}, with which it goes "
-        f"together then (sd {found.sd:.1g} s): a fit of both takes that for the machine's; state "
-        f"it ({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
+        f"together then (sd {lateness.sd:.1g} s): a fit of both takes that for the machine's; "
+        f"state it ({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
     )
     return Finding("late output", "doubt", words, late, criterion)
 

@@ -42,7 +42,7 @@ def late_inputs(
         feedback: inputs that follow the response, of which it is said that they may be late.
     """
     said = {(one.flight, one.input) for one in feedback if one.present}
-    found = []
+    findings = []
     for label, flight in flights:
         surest: dict[str, tuple[float, float, str]] = {}
         for output, y in flight.outputs.items():
@@ -50,8 +50,8 @@ def late_inputs(
             if led is not None and (label, led[2]) not in said:
                 share, lead, name = led
                 surest[name] = max(surest.get(name, (0.0, 0.0, "")), (share, lead, output))
-        found += [_finding(label, name, *one) for name, one in surest.items()]
-    return found
+        findings += [_finding(label, name, *one) for name, one in surest.items()]
+    return findings
 
 
 def led_by(

@@ -71,12 +71,12 @@ def logging_rate(
         modes, hidden = _modes_that_show(problem, params, flight, _shown_from(flight, noise))
         if hidden:
             findings.append(_not_judged(label, hidden))
-        found = [
+        of_flight = [
             *_of_inputs(label, flight, modes, where),
             *_of_outputs(label, flight, modes, where),
         ]
-        findings += [f for f in found if f.severity != "ok"]
-        every += found
+        findings += [f for f in of_flight if f.severity != "ok"]
+        every += of_flight
     return findings if findings or not every else [min(every, key=_value)]
 
 

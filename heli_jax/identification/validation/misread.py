@@ -85,12 +85,12 @@ def record_doubts(problem: Problem) -> RecordDoubts:
     """
     # Of both questions once: sorting long records is what takes the time.
     facts = [facts_of(flight) for flight in problem.training]
-    found = [*misread(problem), *dropouts(problem, facts), *clipped(problem, facts)]
+    doubts = [*misread(problem), *dropouts(problem, facts), *clipped(problem, facts)]
     odd = odd_flights(problem.training)
-    words = dict.fromkeys(one.words for one in found if one.words)
+    words = dict.fromkeys(one.words for one in doubts if one.words)
     return RecordDoubts(
         [
-            *(one.finding for one in found),
+            *(one.finding for one in doubts),
             *rate_against_angle(problem),
             *turned_sensors(problem),
             *(one.finding for one in odd),
@@ -125,8 +125,8 @@ def clipped(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
         problem: the flights.
         facts: of each fitted flight.
     """
-    found = cut_off(list(zip(labels(problem.training), facts, strict=True)))
-    return [Misread(finding, words) for finding, words in found]
+    cut = cut_off(list(zip(labels(problem.training), facts, strict=True)))
+    return [Misread(finding, words) for finding, words in cut]
 
 
 def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:

@@ -69,7 +69,7 @@ class Explained(NamedTuple):
 
 
 def missing_dynamics(
-    flights: tuple[Left, ...], *, sensors: bool = False, told: bool = False
+    flights: tuple[Left, ...], *, sensors: bool = False, mentioned: bool = False
 ) -> list[str]:
     """Sentences on what inputs still explain of the residuals.
 
@@ -77,11 +77,11 @@ def missing_dynamics(
         flights: those that were fitted.
         sensors: whether inputs and outputs are sensors that are compared with each other, between
             which there are no dynamics; of each output the input that explains most is named.
-        told: whether it is said elsewhere already that dynamics are missing.
+        mentioned: whether it is said elsewhere already that dynamics are missing.
     """
     pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
     # By output and input over all flights, so that one missing servo is one sentence.
-    found: dict[tuple[str, str], Explained] = {}
+    explained: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
         e, u, dt, holes = flight.residuals[output], flight.inputs[name], flight.dt, ()
         own = own_samples(np.isfinite(e))
@@ -90,18 +90,18 @@ def missing_dynamics(
         one = explained_by(e, u, dt, by_chance=_BY_CHANCE / len(pairs), holes=holes)
         if one is None or one.share < _WORTH_IT:
             continue
-        known = found.get((output, name))
+        known = explained.get((output, name))
         if known is None or one.share > known.share:
-            found[output, name] = one
+            explained[output, name] = one
     if sensors:
         most = {
-            output: max(e.share for (o, _), e in found.items() if o == output)
-            for output, _ in found
+            output: max(e.share for (o, _), e in explained.items() if o == output)
+            for output, _ in explained
         }
-        found = {pair: e for pair, e in found.items() if e.share == most[pair[0]]}
-    remedy = "" if told else _OF_SENSORS if sensors else _OF_A_MACHINE
+        explained = {pair: e for pair, e in explained.items() if e.share == most[pair[0]]}
+    remedy = "" if mentioned else _OF_SENSORS if sensors else _OF_A_MACHINE
     sentences = []
-    for (output, name), one in found.items():
+    for (output, name), one in explained.items():
         away = output in FORCES and not sensors
         sentences.append(_sentence(output, name, one, remedy + away * _OF_AN_ACCELERATION))
         # The remedy of all of them is the same: the first one says it.

@@ -273,7 +273,7 @@ def _each_by_itself(
     # Behind the end of a candidate nothing is measured, and rows of that are zero.
     measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
     z = _joined(at, [_begins_as(at, 0, linear=True)])
-    found = []
+    sensitivities = []
     for candidate in candidates:
         inputs = {**rest, candidate.input: np.pad(candidate.values, (0, n - m))}
         part = numbers._replace(
@@ -282,8 +282,8 @@ def _each_by_itself(
         )
         data = at.data._replace(flights=(part,))
         s = sensitivity_at(problem, at.layout, evaluate(at.layout, data, at.noise, z))
-        found += _by_flight(s, at.layout, data)
-    return found
+        sensitivities += _by_flight(s, at.layout, data)
+    return sensitivities
 
 
 def _sensitivity(

@@ -85,8 +85,8 @@ def noisy_inputs(
     layout = at.layout
     if is_kinematic(layout.model) or layout.estimator.noise_spectrum or problem.window is not None:
         return ()
-    found = [_of_input(problem, at, e, estimates, n) for n in naming.names(layout.model.Inputs)]
-    return tuple(one for one in found if one is not None)
+    inputs = [_of_input(problem, at, e, estimates, n) for n in naming.names(layout.model.Inputs)]
+    return tuple(one for one in inputs if one is not None)
 
 
 def with_noisy_inputs(adequacy: Adequacy, noisy: tuple[NoisyInput, ...]) -> Adequacy:

@@ -88,10 +88,10 @@ def odd_flights(flights: Sequence[Flight]) -> list[OddFlight]:
             parameters are compared.
     """
     names = labels(tuple(flights))
-    found: list[OddFlight] = []
+    odd: list[OddFlight] = []
     for alike in _groups(flights):
-        found += _of_group([flights[i] for i in alike], [names[i] for i in alike], alike)
-    return found
+        odd += _of_group([flights[i] for i in alike], [names[i] for i in alike], alike)
+    return odd
 
 
 def _groups(flights: Sequence[Flight]) -> list[list[int]]:
@@ -114,7 +114,7 @@ def _of_group(flights: list[Flight], names: list[str], indices: list[int]) -> li
         for i, s in enumerate(spectra)
         if any(_followed(s, n, len(s.outputs)).any() for n in s.outputs)
     ]
-    found = []
+    odd = []
     for i, (flight, own) in enumerate(zip(flights, spectra, strict=True)):
         others = [spectra[j] for j in leading if j != i]
         # Of two that both answer, each in its own way, nobody knows which is the odd one.
@@ -126,8 +126,8 @@ def _of_group(flights: list[Flight], names: list[str], indices: list[int]) -> li
         if bad:
             still = tuple(n for n in moving if not np.ptp(flight.inputs[n]) > 0)
             most = max(left[n] for n in bad)
-            found.append(OddFlight(indices[i], names[i], bad, most, still))
-    return found
+            odd.append(OddFlight(indices[i], names[i], bad, most, still))
+    return odd
 
 
 def _spectra(flight: Flight, moving: list[str], length: int) -> _Spectra:

@@ -187,10 +187,10 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
     nuisances = _span(_real(J[:, k:])) if J.shape[1] > k else np.zeros((2 * e.size, 0))
     whole = _real(J[:, :k])
     own = _without(nuisances, whole)
-    told = np.linalg.norm(own, axis=0) > _SAME * np.linalg.norm(whole, axis=0)
-    if not told.any():
+    shows = np.linalg.norm(own, axis=0) > _SAME * np.linalg.norm(whole, axis=0)
+    if not shows.any():
         return 1.0
-    basis, white = _span(own[:, told]), _without(nuisances, _real(e[:, None]))
+    basis, white = _span(own[:, shows]), _without(nuisances, _real(e[:, None]))
     turns = 2.0 * np.pi * np.random.default_rng(0).random((e.size, _SURROGATES))
     anew = _without(nuisances, _real(_complex(white) * np.exp(1j * turns)))
     anew *= np.linalg.norm(white) / np.linalg.norm(anew, axis=0)
@@ -226,8 +226,8 @@ def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray
         """(F, a, b), of filtered columns a with columns b, these filtered too or not."""
         a, filters = (a.astype(tried.dtype), of_tried) if b is tried else (a, G)
         each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-        found = power @ np.real(each) if both else filters @ _real(each)
-        return found.reshape(len(G), a.shape[1], b.shape[1])
+        gains = power @ np.real(each) if both else filters @ _real(each)
+        return gains.reshape(len(G), a.shape[1], b.shape[1])
 
     n = asked.beside
     known, right = products(n, asked.known), products(n, tried)

@@ -91,16 +91,16 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     Args:
         flights: by what each is called.
     """
-    found = []
+    saturated = []
     for label, flight in flights:
         for (name, kind), facts in facts_of(flight).items():
             if sum(facts.shares) > 0:
-                found.append((sum(facts.shares), label, kind, name, facts))
-    if not found:
+                saturated.append((sum(facts.shares), label, kind, name, facts))
+    if not saturated:
         words = "no signal piles up at an end of its range."
         return [Finding("saturation", "ok", words, 0.0, _RAIL_LIMIT)]
-    found.sort(key=lambda f: -f[0])
-    return [_saturated(*f) for f in found[:_MOST_NAMED]]
+    saturated.sort(key=lambda f: -f[0])
+    return [_saturated(*f) for f in saturated[:_MOST_NAMED]]
 
 
 def cut_off(flights: Sequence[tuple[str, Facts]]) -> list[tuple[Finding, str]]:
@@ -154,16 +154,16 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     Args:
         flights: by what each is called.
     """
-    found: list[tuple[float, str]] = []
+    doubts: list[tuple[float, str]] = []
     for label, flight in flights:
         for (name, kind), facts in facts_of(flight).items():
             if facts.marks and kind == "output":
                 words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
-                found.append((0.0, f"{words}at what the log says of such values."))
+                doubts.append((0.0, f"{words}at what the log says of such values."))
             least = DROP_SHARE if kind == "output" else 0.0
             if facts.dropouts is not None and facts.dropped >= least:
                 words = dropout_words(label, flight, (name, kind), facts)
-                found.append((facts.dropped * facts.size * facts.usual, words))
+                doubts.append((facts.dropped * facts.size * facts.usual, words))
             for at in facts.stretches:
                 length = at.end - at.begin
                 words = (
@@ -171,14 +171,14 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
                     f"{at.begin:.4g} s on, while other signals change: it is no measurement there;"
                     " leave this part out."
                 )
-                found.append((length, words))
-    if not found:
+                doubts.append((length, words))
+    if not doubts:
         words = "no output stays at one value while others change."
         return [Finding("stuck outputs", "ok", words, 0.0, _STUCK_LIMIT)]
-    found.sort(key=lambda f: -f[0])
+    doubts.sort(key=lambda f: -f[0])
     return [
         Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
-        for length, words in found[:_MOST_NAMED]
+        for length, words in doubts[:_MOST_NAMED]
     ]
 
 
@@ -203,20 +203,20 @@ def strays(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     Args:
         flights: by what each is called.
     """
-    found = [
+    stray = [
         (odd.times.size, f"{label}: {name} has {stray_words(odd)}: kept, and fitted as measured; ")
         for label, flight in flights
         for (name, _), facts in facts_of(flight).items()
         for odd in facts.strays
     ]
-    if not found:
+    if not stray:
         words = "no sample stands far outside of all others."
         return [Finding("stray samples", "ok", words, 0.0, _STRAY_LIMIT)]
-    found.sort(key=lambda f: -f[0])
+    stray.sort(key=lambda f: -f[0])
     remedy = "empty these cells of the log, or give a window without them."
     return [
         Finding("stray samples", "doubt", words + remedy, float(count), _STRAY_LIMIT)
-        for count, words in found[:_MOST_NAMED]
+        for count, words in stray[:_MOST_NAMED]
     ]
 
 

@@ -54,12 +54,12 @@ def rate_against_angle(problem: Problem) -> list[Finding]:
     """
     pairs = rates_and_angles(problem.model)
     flights = problem.training
-    found = []
+    findings = []
     for label, flight in zip(labels(flights), flights, strict=True):
         for rate, angle in pairs:
             if rate in flight.outputs and angle in flight.outputs:
-                found += _of_pair(label, flight, rate, angle)
-    return found
+                findings += _of_pair(label, flight, rate, angle)
+    return findings
 
 
 def rates_and_angles(model: Model) -> list[tuple[str, str]]:
@@ -72,7 +72,7 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def contradictions(problem: Problem) -> list[str]:
     """In a few words each angle that runs against its integrated rate, or is in other units: no
     model follows both."""
-    found = []
+    sentences = []
     for flight in problem.training:
         for rate, angle in rates_and_angles(problem.model):
             if rate not in flight.outputs or angle not in flight.outputs:
@@ -82,10 +82,10 @@ def contradictions(problem: Problem) -> list[str]:
                 continue
             size = abs(ratio[0] * ratio[1]) ** 0.5
             if ratio[0] < 0:
-                found.append(f"{angle} runs against the integral of {rate}")
+                sentences.append(f"{angle} runs against the integral of {rate}")
             elif 1.0 / _NEARLY < max(size, 1.0 / size) / _DEGREE < _NEARLY:
-                found.append(f"{angle} moves {size:.3g} times as far as the integral of {rate}")
-    return list(dict.fromkeys(found))
+                sentences.append(f"{angle} moves {size:.3g} times as far as the integral of {rate}")
+    return list(dict.fromkeys(sentences))
 
 
 def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
@@ -97,7 +97,7 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     backward, off = size < 0, abs(smallest) > _FACTOR or abs(largest) < 1.0 / _FACTOR
     if not (backward or off):
         return _of_scale(label, flight, rate, angle, ratio)
-    how = f"{abs(size):.3g} times as far as" if off else "as far as"
+    distance = f"{abs(size):.3g} times as far as" if off else "as far as"
     alike = np.sign(smallest) * np.sqrt(smallest / largest)
     against = f", and against it (correlation {alike:+.2f})" if backward else ""
     reasons = ["one of the two has the wrong sign (invert)"] if backward else []
@@ -106,7 +106,8 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     elif off:
         reasons.append("the unit or the scale of one of the two is wrong")
     words = (
-        f"{label}: {angle} moves {how} the integral of {rate}{against}: {' and '.join(reasons)}."
+        f"{label}: {angle} moves {distance} the integral of {rate}{against}: "
+        f"{' and '.join(reasons)}."
     )
     criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
     return [Finding("signs and units", "doubt", words, size, criterion)]
@@ -234,7 +235,7 @@ def against_start(
         simulated: by flight and output (N,), SI.
         sticks: by output the input that moves it, of `sticks_of`; without it any of them may.
     """
-    found = []
+    findings = []
     for (label, flight), run in zip(flights, simulated, strict=True):
         signs = {
             name: c
@@ -246,8 +247,8 @@ def against_start(
             stick = (sticks or {}).get(name, " or ".join(flight.inputs))
             groups.setdefault(stick, {})[name] = c
         for stick, group in groups.items():
-            found += _of_stick(label, stick, group)
-    return found
+            findings += _of_stick(label, stick, group)
+    return findings
 
 
 def sticks_of(model: Model) -> dict[str, str]:

@@ -23,7 +23,7 @@ def smoothed(flights: Sequence[tuple[str, Flight]], *, process_noise: bool) -> l
         flights: by what each is called.
         process_noise: whether the method holds predictions against the noise of the outputs.
     """
-    found = []
+    findings = []
     for label, flight in flights:
         without = {n: flight.outputs[n] for n in noiseless(flight.outputs)}
         if not without:
@@ -32,5 +32,7 @@ def smoothed(flights: Sequence[tuple[str, Flight]], *, process_noise: bool) -> l
         words = f"{label}: {noiseless_words(without, flight.dt)}; nothing faster is in it."
         if process_noise:
             words = f"{words} {REMEDY}"
-        found.append(Finding("smoothed", "doubt" if process_noise else "note", words, part, _LIMIT))
-    return found
+        findings.append(
+            Finding("smoothed", "doubt" if process_noise else "note", words, part, _LIMIT)
+        )
+    return findings

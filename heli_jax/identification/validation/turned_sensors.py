@@ -28,7 +28,7 @@ def turned_sensors(problem: Problem) -> list[Finding]:
         problem: the flights that are fitted.
     """
     flights = problem.training
-    found = []
+    findings = []
     for label, flight in zip(labels(flights), flights, strict=True):
         angle = _turn(flight)
         if angle is not None:
@@ -39,8 +39,8 @@ def turned_sensors(problem: Problem) -> list[Finding]:
                 "and a fit takes that for coupling of roll and pitch. Turn the columns of one."
             )
             criterion = f"{np.degrees(_TURNED):.2g} deg"
-            found.append(Finding("signs and units", "doubt", words, float(size), criterion))
-    return found
+            findings.append(Finding("signs and units", "doubt", words, float(size), criterion))
+    return findings
 
 
 def _turn(flight: Flight) -> float | None:

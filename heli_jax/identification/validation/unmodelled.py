@@ -164,13 +164,13 @@ def unmodelled(
     if not names:
         return ()
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
-    found, J = [], sensitivities(at, e)
+    lacking, J = [], sensitivities(at, e)
     for name in names:
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            found.append(_said(at, e, name, one, sds, flights))
-    return tuple(found)
+            lacking.append(_said(at, e, name, one, sds, flights))
+    return tuple(lacking)
 
 
 class _Asked(NamedTuple):
@@ -228,24 +228,24 @@ def unasked(at: Solution) -> tuple[str, ...]:
 
 
 def with_unmodelled(
-    adequacy: Adequacy, found: tuple[Unmodelled, ...], gappy: tuple[str, ...] = ()
+    adequacy: Adequacy, lacking: tuple[Unmodelled, ...], gappy: tuple[str, ...] = ()
 ) -> Adequacy:
     """The adequacy, no plain yes where something that matters is missing, or was not asked for.
 
     Args:
         adequacy: as judged by size and whiteness, or in frequency.
-        found: of `unmodelled`.
+        lacking: of `unmodelled`.
         gappy: the outputs of which that was not asked.
     """
     if gappy:
         words = f"what {', '.join(gappy)} may lack was not asked, since samples are missing"
         limited = [adequacy.limited] if adequacy.limited else []
         adequacy = adequacy._replace(limited="; ".join([*limited, words]))
-    if not found:
+    if not lacking:
         return adequacy
-    adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in found)))
+    adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in lacking)))
     words = [adequacy.limited] if adequacy.limited else []
-    words += [f.words for f in found if f.matters]
+    words += [f.words for f in lacking if f.matters]
     return adequacy._replace(limited="; ".join(words))
 
 

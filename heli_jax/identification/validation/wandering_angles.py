@@ -16,7 +16,7 @@ def wandering_notes(problem: Problem) -> list[str]:
         return []
     pairs = [(a.angle, a.rate) for a in axes_of(problem.model) if a.angle is not None]
     flights = [f.outputs for f in problem.flights]
-    found = [
+    wandering = [
         (angle, rate)
         for angle, rate in pairs
         # Where the rate's is not white either, the whole log was smoothed or resampled.
@@ -28,5 +28,5 @@ def wandering_notes(problem: Problem) -> list[str]:
         f"The error of {angle} is no white noise, which the filter takes it for: it looks "
         f"integrated from a gyro, as an autopilot's attitude is, and wanders. That can bias every "
         f"estimate: fit without {angle}, which says nothing that {rate} does not, and compare."
-        for angle, rate in found
+        for angle, rate in wandering
     ]

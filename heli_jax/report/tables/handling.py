@@ -45,12 +45,12 @@ def _sources(entries: Sequence[Handling]) -> tuple[str, ...]:
 
 
 def _cell(of: HandlingQualities | str | None, name: str) -> str:
-    found = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
-    if found is None or not found.known:
+    value = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
+    if value is None or not value.known:
         return NOT_DETERMINED
     # Pilots' criteria count in rad/s, rotors and filters in Hz.
-    hz = f", {number(found.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
-    return _shown(found) + hz
+    hz = f", {number(value.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
+    return _shown(value) + hz
 
 
 def _shown(n: Number) -> str:
