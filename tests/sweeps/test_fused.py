@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -96,6 +97,21 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     assert found.attrs["split"]["backend"] == "xla"
     said = next(s for s in said if "no translation" in s)
     assert re.search(r"of the operation erf_inv \(at test_fused.py:\d+\)", said)
+
+
+def test_a_long_table_of_a_model(bench30, record):
+    # A model's own constants, of one axis and of two, longer than what stays in registers.
+    points, rows = np.linspace(-1.0, 1.0, 201), np.sin(np.outer(np.arange(90), [1.0, 2.0]))
+
+    def vector_field(p, s, u):
+        d = STAND.vector_field(p, s, u)
+        k = jnp.clip((100 * s.dphi + 45).astype(int), 0, 89)
+        lag = jnp.interp(s.dphi, points, np.tanh(points)) + 0.1 * jnp.asarray(rows)[k, 1]
+        return naming.replace(d, dphi=d.dphi - lag)
+
+    model = dataclasses.replace(STAND, vector_field=vector_field, linear=False)
+    design = paired({"initial.dphi": np.linspace(-0.9, 0.9, 9)})
+    agree(1e-13, model, bench30, record, design, {"rms": Reduce("rms", "roll")})
 
 
 def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkeypatch):
