@@ -7,6 +7,7 @@ this process, after one of each that compiles. Times are a record's, of all core
 may use; the estimates have to agree.
 """
 
+import argparse
 import time
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,9 @@ def timed(fit: Fit, runs: int, least: int) -> tuple[float, Bootstrap]:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     print(f"{cores()} cores; a record of {N} samples, 8 unknowns, in ms")
     solvers: dict[str, dict[str, Any]] = {"exact": {}, "rk4": {"solver": "rk4"}}
     for label, how in solvers.items():

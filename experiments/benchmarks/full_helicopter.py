@@ -4,6 +4,8 @@ Flapping, tail force and power, governor and inflow in any descent: from hover, 
 with 4 steps a sample, small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
 """
 
+import argparse
+
 import helicopter as consistent
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,9 @@ STICK_STEPS = {
 
 
 def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     run = consistent.hover_and_steps(MODEL, STICK_STEPS)
     Ixx = jnp.asarray(consistent.IXX)
     ours, seconds = consistent.compile_time(consistent.batch(run, MODEL), Ixx)

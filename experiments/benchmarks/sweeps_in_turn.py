@@ -7,8 +7,8 @@ that of the same round. What a processor waits for (the disk, the other thread) 
     .venv/bin/python experiments/benchmarks/sweeps_in_turn.py [exact | rk4] [ROUNDS]
 """
 
+import argparse
 import os
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -50,8 +50,13 @@ def processor_time(run: Callable[[], Any]) -> float:
 
 
 def main() -> None:
-    asked = sys.argv[1:] or ["exact"]
-    solver, rounds = asked[0], int(asked[1]) if len(asked) > 1 else 5
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("solver", nargs="?", choices=list(SIZES), default="exact", help="(exact)")
+    parser.add_argument("rounds", nargs="?", type=int, default=5, help="in turn (5)")
+    options = parser.parse_args()
+    solver, rounds = options.solver, options.rounds
     few, many = SIZES[solver]
     found = ways(solver)
     taken = np.array(
