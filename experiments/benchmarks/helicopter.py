@@ -9,6 +9,7 @@ counts least; each pair is run in turn, and the figures are the medians of the t
 ratios. Compilation is from the trace to the machine code.
 """
 
+import argparse
 import ctypes
 import math
 import os
@@ -335,6 +336,9 @@ def check_derivative(
 
 
 def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     run = hover_and_steps()
     rows: list[tuple[str, tuple[float, float, float], str]] = []
     seconds: dict[str, float] = {}

@@ -62,7 +62,7 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
     if operand.shape == ():
         return scalar(code, operand)
     if operand.dtype != object:
-        return code.load(code.table(operand), _flat(code, operand.shape, at), operand.dtype)
+        return code.load(code.table(operand), flat(code, operand.shape, at), operand.dtype)
     if all(not i.operand.startswith("%") for i in at):
         return operand[tuple(int(i.operand) for i in at)]
     if operand.size > LONG:
@@ -84,7 +84,8 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
     return chosen
 
 
-def _flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:
+def flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:
+    """Where an element of an array that is stored row by row stands, counted from the first."""
     flat = at[0]
     for length, index in zip(shape[1:], at[1:], strict=True):
         flat = code.operation("mul", flat, constant(length, INDEX))

@@ -1,13 +1,13 @@
 """The text of a program for whole runs of many vehicles: from the first sample to the last."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.fused.code import Code, Target, UnsupportedError, Value, constant, type_of
 from heli_jax.fused.loops import loop
-from heli_jax.fused.operands import INDEX, Elements, Operand, Stored, elements
+from heli_jax.fused.operands import INDEX, LONG, Elements, Operand, Stored, elements, flat
 from heli_jax.fused.translate import translate
 
 
@@ -171,10 +171,10 @@ def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
 
 def _tables(
     code: Code, name: str, arguments: Sequence[Argument]
-) -> tuple[list[tuple[Argument, list[str]]], dict[int, Elements]]:
-    """Pointers to the rows of what is not shared, and the elements of what is."""
+) -> tuple[list[tuple[Argument, list[str]]], dict[int, Operand]]:
+    """Pointers to the rows of what is not shared, and what is."""
     rows: list[tuple[Argument, list[str]]] = []
-    shared: dict[int, Elements] = {}
+    shared: dict[int, Operand] = {}
     place = 0
     for i, argument in enumerate(arguments):
         size = int(np.prod(argument.shape))
@@ -186,12 +186,20 @@ def _tables(
             rows.append((argument, pointers))
             continue
         rows.append((argument, []))
-        values = np.empty(argument.shape, object)
-        for k, at in enumerate(np.ndindex(argument.shape)):
-            index = Value(str(k), INDEX, True)
-            values[at] = code.load(pointers[0], index, argument.dtype)
-        shared[i] = values
+        table = Stored(argument.shape, argument.dtype, _looked_up(code, pointers[0], argument))
+        # A long one, such as a model's table, stays in memory: it can be looked something up in.
+        shared[i] = table if size > LONG else elements(code, table)
     return rows, shared
+
+
+def _looked_up(
+    code: Code, pointer: str, argument: Argument
+) -> Callable[[tuple[Value, ...]], Value]:
+    def element(at: tuple[Value, ...]) -> Value:
+        place = flat(code, argument.shape, at) if at else constant(0, INDEX)
+        return code.load(pointer, place, argument.dtype)
+
+    return element
 
 
 def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:

@@ -311,6 +311,7 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "concatenate": _joined,
     "stack": _stacked,
     "rev": _reversed,
+    "tile": lambda code, inputs, params: np.tile(elements(code, inputs[0]), params["reps"]),
     "reduce_sum": _reduction("add"),
     "reduce_max": _reduction("max"),
     "reduce_min": _reduction("min"),

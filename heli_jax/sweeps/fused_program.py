@@ -27,6 +27,8 @@ from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
 
 _NVIDIA = ("gpu", "cuda")
+_SOLVERS = ("exact", "rk4", "Euler")
+"""those with a translation: the others of diffrax's are made with operations of their own"""
 _COMPARED = 32
 """elements that a GPU and the processor both compute, before the GPU is believed"""
 
@@ -63,6 +65,8 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
         return "its runs are kept whole, or none is made"
     if on_gpu and not _has_processor():
         return "JAX_PLATFORMS leaves no processor to compare a GPU's numbers with"
+    if job.solver not in _SOLVERS:
+        return f"there is no translation of the solver {job.solver}"
     if importlib.util.find_spec("llvmlite") is None:
         return "llvmlite is not installed"
     try:

@@ -207,7 +207,7 @@ def job(
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, options.trajectories)
-    _check_precision(options.precision)
+    _check_precision(model, options.precision)
     # A linear model has an exact step, so that no error of a solver stands in its results.
     solver = options.solver or ("exact" if model.linear else "rk4")
     if solver == "exact" and not model.linear:
@@ -233,7 +233,7 @@ def job(
     return Job(model, numbers, flights, design, dict(reduce), **checked._asdict())
 
 
-def _check_precision(precision: str) -> None:
+def _check_precision(model: Model, precision: str) -> None:
     if precision not in ("float64", "float32"):
         raise ValueError(f"precision: expected float64 or float32, got {precision!r}")
     # JAX would compute in float32 without a word, under the heading float64.
@@ -242,6 +242,29 @@ def _check_precision(precision: str) -> None:
             "precision: float64 is switched off in JAX, expected "
             "jax.config.update('jax_enable_x64', True), or precision='float32'"
         )
+    if precision == "float32":
+        _check_single(model)
+
+
+def _check_single(model: Model) -> None:
+    """Refuse a model that makes float64 of float32, as with a table of NumPy's: what is carried
+    from one sample to the next would change its type."""
+
+    def computed(p: Any, s: Any, u: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        given = model.Params(**p), model.State(**s), model.Inputs(**u)
+        return naming.asdict(model.vector_field(*given)), naming.asdict(model.output(*given))
+
+    single = jax.ShapeDtypeStruct((), np.float32)
+    classes = (model.Params, model.State, model.Inputs)
+    found = jax.eval_shape(computed, *(dict.fromkeys(naming.names(c), single) for c in classes))
+    for function, values in zip(("vector_field", "output"), found, strict=True):
+        for name, value in values.items():
+            if value.dtype == np.float64:
+                raise ValueError(
+                    f"precision: the {function} of model {model.name!r} gives {name} in float64 "
+                    "though all it is given is float32; expected float64, or its arrays made as "
+                    "jnp.asarray(table, x.dtype), x a state"
+                )
 
 
 def _check_vehicle(model: Model, params: Any, design: Design, flights: tuple[Flight, ...]) -> None:

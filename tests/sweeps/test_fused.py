@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -66,6 +67,9 @@ def test_a_sweep_that_cannot_be_fused(bench30, record, tmp_path):
     assert found.attrs["split"]["backend"] == "xla"
     with pytest.raises(ValueError, match=r"backend: this sweep cannot be fused: its runs are kept"):
         sweep(STAND, bench30, record, design, reduce, backend="fused")
+    design = paired({"Ixx": [0.03, 0.04]})
+    with pytest.raises(ValueError, match="there is no translation of the solver Tsit5"):
+        sweep(STAND, bench30, record, design, reduce, backend="fused", solver="Tsit5")
     with pytest.raises(ValueError, match="backend: expected one of auto, xla, fused, got 'gpu'"):
         sweep(STAND, bench30, record, design, reduce, backend="gpu")
 
@@ -96,6 +100,35 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     assert found.attrs["split"]["backend"] == "xla"
     said = next(s for s in said if "no translation" in s)
     assert re.search(r"of the operation erf_inv \(at test_fused.py:\d+\)", said)
+
+
+def test_a_long_table_of_a_model(bench30, record):
+    # A model's own constants, of one axis and of two, longer than what stays in registers.
+    points, rows = np.linspace(-1.0, 1.0, 201), np.sin(np.outer(np.arange(90), [1.0, 2.0]))
+
+    def vector_field(p, s, u):
+        d = STAND.vector_field(p, s, u)
+        k = jnp.clip((100 * s.dphi + 45).astype(int), 0, 89)
+        lag = jnp.interp(s.dphi, points, np.tanh(points)) + 0.1 * jnp.asarray(rows)[k, 1]
+        twice = jnp.tile(jnp.stack([s.phi, s.dphi]), 2)
+        return naming.replace(d, dphi=d.dphi - lag - 0.1 * twice[3])
+
+    model = dataclasses.replace(STAND, vector_field=vector_field, linear=False)
+    design = paired({"initial.dphi": np.linspace(-0.9, 0.9, 9)})
+    agree(1e-13, model, bench30, record, design, {"rms": Reduce("rms", "roll")})
+
+
+def test_a_model_that_leaves_single_precision(bench30, record):
+    def vector_field(p, s, u):
+        d = STAND.vector_field(p, s, u)
+        return naming.replace(d, dphi=d.dphi.astype(np.float64))
+
+    model = dataclasses.replace(STAND, vector_field=vector_field, linear=False)
+    design, reduce = paired({"Ixx": [0.03, 0.04]}), {"rms": Reduce("rms", "roll")}
+    with pytest.raises(
+        ValueError, match=r"precision: the vector_field of model .* dphi in float64"
+    ):
+        sweep(model, bench30, record, design, reduce, precision="float32")
 
 
 def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkeypatch):
