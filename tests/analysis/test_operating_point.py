@@ -61,6 +61,7 @@ def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering)
         assert H(np.array([w]))[0] == pytest.approx(hovering(w), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_disturbed_helicopter_is_trimmed_without_its_disturbance(xcell):
     plain = models.helicopter("consistent")
     model = with_disturbance(plain, "roll", 2)

@@ -142,6 +142,7 @@ def test_the_old_names_of_the_speeds_are_accepted_with_a_warning():
         StartConfig.model_validate({"ahead": 8.0, "forward_speed": 8.0})
 
 
+@pytest.mark.slow
 def test_hover_in_a_wind_is_flight_the_other_way(xcell):
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
     still = trim(models.helicopter("consistent"), p, Condition(forward_speed=6.0))
@@ -309,6 +310,7 @@ def test_power_off_needs_a_collective_stick(xcell):
         trim(models.helicopter("consistent"), xcell, power_off=True)
 
 
+@pytest.mark.slow
 def test_a_flybarless_machine_hovers(vehicles_folder):
     trex = load_vehicle(vehicles_folder / "t-rex-550.yaml")
     model = models.helicopter(flybarless=True)

@@ -61,6 +61,7 @@ def test_every_derivative_is_the_second_program_s(variant):
     assert ring < 20
 
 
+@pytest.mark.slow
 def test_each_correction_can_be_turned_on_alone():
     rng = np.random.default_rng(2)
     v, s, u = scattered(rng)

@@ -1,5 +1,7 @@
 """What is translated against JAX itself, operation by operation and in random expressions."""
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -387,7 +389,7 @@ def expressions(draw, depth=4):
     }[how]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8 if os.environ.get("CI") == "true" else 15, deadline=None)
 @given(expressions())
 def test_a_random_expression(expression):
     def once(stays, u, x):
