@@ -141,3 +141,10 @@ def test_sections_have_the_fields_of_their_records(section, record):
     defaults = {n: f.default for n, f in section.model_fields.items() if not f.is_required()}
     assert tuple(section.model_fields) == record._fields
     assert defaults == record._field_defaults
+
+
+@pytest.mark.parametrize("key", ["fit.starts", "fit.free.Ixx.start", "flights.0.rate"])
+def test_true_is_no_number(key):
+    # YAML writes it without quotes, and Python counts with it as with 1.
+    with pytest.raises(InputError, match=r"expected a number, got true$"):
+        configuration.load(ROOT / "configs" / "bench-roll.yaml", {key: True})

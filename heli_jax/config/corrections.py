@@ -7,9 +7,10 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import Field, StrictBool
 
 from heli_jax import naming, units
+from heli_jax.config.section import Section
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal
@@ -20,12 +21,7 @@ _LATEST = 1.0
 """s; a delay beyond is another unit, or another clock"""
 
 
-class _Strict(BaseModel):
-    # As in a configuration: a misspelt key would leave an error on the signal.
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Conversion(_Strict):
+class Conversion(Section):
     """Of the log's numbers, as in `signals`."""
 
     scale: Finite = 1.0
@@ -38,7 +34,7 @@ class Conversion(_Strict):
         return f"{{scale: {self.scale:g}, offset: {self.offset:g}, invert: {self.invert}}}".lower()
 
 
-class SignalCorrection(_Strict):
+class SignalCorrection(Section):
     """What one signal of a log showed: (1 + scale) truth + bias, late by the delay."""
 
     of: str = ""
@@ -53,7 +49,7 @@ class SignalCorrection(_Strict):
     """by which the log's numbers were read when this was found"""
 
 
-class Corrections(_Strict):
+class Corrections(Section):
     """A file of corrections."""
 
     found_by: str = ""

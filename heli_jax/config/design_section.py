@@ -2,19 +2,15 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from heli_jax.config.section import Section
 from heli_jax.config.simulate_section import StartConfig
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    # An unknown key is an error: a misspelt `upper` would leave an axis without its end.
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class AxisConfig(_Strict):
+class AxisConfig(Section):
     """The values of one axis: from lower to upper, a list, or a column of the table."""
 
     lower: Finite | None = None
@@ -33,7 +29,7 @@ class AxisConfig(_Strict):
     """of these numbers; the model's SI unit unless given"""
 
 
-class DesignConfig(_Strict):
+class DesignConfig(Section):
     """A design of experiments: which values the axes take, one design point after the other."""
 
     # Which of the other keys a kind may have is refused where the design is made, with a sentence
@@ -53,7 +49,7 @@ class DesignConfig(_Strict):
     """of lhs and sobol; the sweep's and the place among its designs unless given"""
 
 
-class ReduceConfig(_Strict):
+class ReduceConfig(Section):
     """A result of each run."""
 
     # Checked against the reducers where the sweep is put together: a path may lead to any function.
@@ -67,7 +63,7 @@ class ReduceConfig(_Strict):
     """of margins: the feedback, input = -gain signal"""
 
 
-class TrajectoriesConfig(_Strict):
+class TrajectoriesConfig(Section):
     """Runs to keep."""
 
     signals: list[str]

@@ -2,8 +2,9 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
+from pydantic import BeforeValidator, model_validator
 
+from heli_jax.config.section import Section
 from heli_jax.errors import nearest
 
 
@@ -49,13 +50,11 @@ _Size = Annotated[
 ]
 
 
-class DisturbanceConfig(BaseModel):
+class DisturbanceConfig(Section):
     """Random pushes on derivatives of states: simulation draws them, filter error estimates them.
 
     `axis: roll` and `on: [roll]` mean the same.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     # One axis, whose parameters are sigma_w and tau_w without a name behind them; `on` with several
     # gives each state a size of its own.

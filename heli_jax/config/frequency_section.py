@@ -2,7 +2,9 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic import BeforeValidator, Field, StrictBool, model_validator
+
+from heli_jax.config.section import Section
 
 _Coherence = Annotated[float, Field(ge=0, lt=1)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -17,10 +19,8 @@ def increasing(band: Any) -> Any:
     return band
 
 
-class TransferConfig(BaseModel):
+class TransferConfig(Section):
     """A transfer function to be fitted to one response."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
     """the model's name"""
@@ -46,10 +46,8 @@ class TransferConfig(BaseModel):
         return self
 
 
-class PairConfig(BaseModel):
+class PairConfig(Section):
     """A response that is to be fitted."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
     """the model's name"""
@@ -61,10 +59,8 @@ class PairConfig(BaseModel):
     """likewise"""
 
 
-class HandlingConfig(BaseModel):
+class HandlingConfig(Section):
     """A response that handling qualities are read off."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
     """the model's name"""
@@ -84,10 +80,8 @@ class HandlingConfig(BaseModel):
         return self
 
 
-class FrequencyConfig(BaseModel):
+class FrequencyConfig(Section):
     """Which frequencies, in windows of which length."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
     """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""

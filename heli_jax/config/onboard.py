@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, StrictBool, model_validator
 
+from heli_jax.config.section import Section
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import ORDER, with_delays
 from heli_jax.dynamics.onboard.filters import Filter, check_delay
@@ -13,12 +14,6 @@ from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
 from heli_jax.dynamics.onboard.sensors import with_sensors
 from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.errors import InputError
-
-
-class _Strict(BaseModel):
-    # An unknown key is an error: a device that is misspelt would be left out, and its lag would
-    # pass for a delay of the machine.
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _names(value: object) -> object:
@@ -55,7 +50,7 @@ NamesOrPairs = Annotated[
 Order = Annotated[int, Field(ge=1, le=8)]
 
 
-class ServosConfig(_Strict):
+class ServosConfig(Section):
     """Equal servos on some inputs (`with_servos`)."""
 
     on: Names
@@ -70,7 +65,7 @@ class ServosConfig(_Strict):
     """ends the names of its parameters: omega_servo, ..."""
 
 
-class RateLoopConfig(_Strict):
+class RateLoopConfig(Section):
     """A flybarless unit (`with_rate_loop`)."""
 
     on: NamesOrPairs = None
@@ -83,7 +78,7 @@ class RateLoopConfig(_Strict):
     """whether its gyro is a first-order lag (tau_gyro)"""
 
 
-class GyroConfig(_Strict):
+class GyroConfig(Section):
     """A gyro on the tail (`with_gyro`)."""
 
     on: NamesOrPairs = None
@@ -94,7 +89,7 @@ class GyroConfig(_Strict):
     """whether its gyro is a first-order lag (tau_gyro)"""
 
 
-class SensorsConfig(_Strict):
+class SensorsConfig(Section):
     """What the log's sensors do (`with_sensors`)."""
 
     imu: StrictBool = False
@@ -111,7 +106,7 @@ class SensorsConfig(_Strict):
     """states by which each delay is approximated"""
 
 
-class DelaysConfig(_Strict):
+class DelaysConfig(Section):
     """Delays of inputs and outputs (`with_delays`)."""
 
     inputs: NamesOrPairs = []
@@ -127,7 +122,7 @@ FROM_LOG = "from log"
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class FilterConfig(_Strict):
+class FilterConfig(Section):
     """A filter between a sensor and the log (`Filter`)."""
 
     kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
@@ -206,7 +201,7 @@ def _notches(value: object) -> object:
 Notches = Annotated[list[_Positive], BeforeValidator(_notches)]
 
 
-class VibrationConfig(_Strict):
+class VibrationConfig(Section):
     """What shakes the sensors, to give lines of the spectrum a name."""
 
     rotor: _Positive
@@ -215,7 +210,7 @@ class VibrationConfig(_Strict):
     """of the speed: rad/s, rpm, Hz"""
 
 
-class OnboardConfig(_Strict):
+class OnboardConfig(Section):
     """What stands between stick and blade, motion and log; each on what stands before it."""
 
     servos: Annotated[

@@ -3,13 +3,14 @@
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic import BeforeValidator, Field, StrictBool, model_validator
 
 from heli_jax.config.design_section import SweepConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.flight_values import one_log, window_choice
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
+from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
 from heli_jax.config.simulate_section import SimulateConfig
 from heli_jax.errors import nearest
@@ -26,12 +27,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 # the same fields (a test holds that). Two, not one: pydantic would read a NamedTuple from a list as
 # well, call a misspelt key an unexpected argument, and write a list into the run's config.yaml; and
 # made of pydantic's classes they would bring it into the identification.
-class _Strict(BaseModel):
-    # An unknown key is an error: a misspelt `lower` would leave the parameter without a bound.
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class LinearConfig(_Strict):
+class LinearConfig(Section):
     """A model from a file (docs/linear-models.md)."""
 
     linear: str
@@ -53,7 +49,7 @@ def _model_choice(value: Any) -> Any:
     return LinearConfig(**value)
 
 
-class TimeConfig(_Strict):
+class TimeConfig(Section):
     signal: str | None = None
     """the column of time stamps, or with a rate one that counts samples"""
     unit: str = "s"
@@ -115,7 +111,7 @@ class SignalsConfig(PresetConfig):
     (docs/frequency.md)"""
 
 
-class AlignConfig(_Strict):
+class AlignConfig(Section):
     """A motion that both logs hold, from which the lag between their clocks is found."""
 
     # A word of Python's own, so that the field has another name.
@@ -137,7 +133,7 @@ class AlsoSignalsConfig(SignalsConfig):
         return self
 
 
-class AlsoConfig(_Strict):
+class AlsoConfig(Section):
     """A further log of the same flight (docs/logs.md)."""
 
     log: str
@@ -150,7 +146,7 @@ class AlsoConfig(_Strict):
     """which flight of a log that holds several, from 1"""
 
 
-class FlightConfig(_Strict):
+class FlightConfig(Section):
     log: Annotated[str, BeforeValidator(one_log, json_schema_input_type=str | list[str])]
     """the file; its path begins at the configuration. A list is a study with a fit for each
     (docs/studies.md)"""
@@ -185,14 +181,14 @@ class FlightConfig(_Strict):
     """a file of `heli-jax compatibility`: errors of the sensors, taken off the signals"""
 
 
-class PriorConfig(_Strict):
+class PriorConfig(Section):
     mean: Finite
     """of a normal distribution, in SI"""
     sd: Positive
     """standard deviation, in SI"""
 
 
-class FreeConfig(_Strict):
+class FreeConfig(Section):
     # NaN and not None, as `Free` has it; a default is not validated, what a file says is.
     start: Finite = math.nan
     """may be left out where the vehicle file has a value, or `fit.start` finds it"""
@@ -218,7 +214,7 @@ def _offset_choice(value: object) -> object:
     )
 
 
-class NuisanceConfig(_Strict):
+class NuisanceConfig(Section):
     initial_state: bool = True
     """whether the state at the first sample is estimated, of each flight"""
     bias: bool = True
@@ -246,7 +242,7 @@ def _instrument_choice(value: object) -> object:
     )
 
 
-class IntervalsConfig(_Strict):
+class IntervalsConfig(Section):
     """Intervals beside the Gaussian one."""
 
     profile: list[str] = []
@@ -257,7 +253,7 @@ class IntervalsConfig(_Strict):
     """draws of each of four chains (extra `bayes`); 0 for none"""
 
 
-class ShootingConfig(_Strict):
+class ShootingConfig(Section):
     """Multiple shooting: windows with initial states of their own."""
 
     window: Positive
@@ -267,7 +263,7 @@ class ShootingConfig(_Strict):
     range; null: free"""
 
 
-class StartMethodConfig(_Strict):
+class StartMethodConfig(Section):
     """Where the starts of the free parameters come from."""
 
     method: Literal["given", "equation-error", "frequency-error"] = "given"
@@ -301,7 +297,7 @@ def _start_method(value: Any) -> Any:
     return {"method": value} if isinstance(value, str) else value
 
 
-class FitConfig(_Strict):
+class FitConfig(Section):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     """by what model and data are compared"""
@@ -360,7 +356,7 @@ class FitConfig(_Strict):
         return self
 
 
-class RLSConfig(_Strict):
+class RLSConfig(Section):
     # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
     """of the discrete transfer function"""
@@ -370,13 +366,13 @@ class RLSConfig(_Strict):
     """factor by which each sample counts less than the next"""
 
 
-class ReportConfig(_Strict):
+class ReportConfig(Section):
     # Half a second of each fit, and a page shows none of them.
     png: bool = False
     """whether figures are PNG files too, beside SVG"""
 
 
-class Config(_Strict):
+class Config(Section):
     """One experiment."""
 
     model: Annotated[str | LinearConfig, BeforeValidator(_model_choice)]

@@ -2,8 +2,9 @@
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic import BeforeValidator, Field, StrictBool, model_validator
 
+from heli_jax.config.section import Section
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.origins import scale_problem
@@ -12,12 +13,7 @@ from heli_jax.flights.preset import preset
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    # An unknown key is an error: a misspelt `invert` would leave a sign that nobody sees.
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ScaledConfig(_Strict):
+class ScaledConfig(Section):
     """(number in the log - offset) scale, in the stated unit, inverted or not."""
 
     scale: _Finite = 1.0
@@ -81,7 +77,7 @@ def _booleans(value: object) -> object:
 _Booleans = Annotated[Any, BeforeValidator(_booleans, json_schema_input_type=bool | list[bool])]
 
 
-class CcpmConfig(_Strict):
+class CcpmConfig(Section):
     """The servos of a swashplate and where they lift it (`heli_jax.flights.ccpm.Swashplate`)."""
 
     servos: list[str]
@@ -126,7 +122,7 @@ class CcpmConfig(_Strict):
         )
 
 
-class PresetConfig(_Strict):
+class PresetConfig(Section):
     """What of the signals comes from a table or from a geometry (docs/logs.md)."""
 
     preset: str | None = None

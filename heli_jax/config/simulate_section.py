@@ -3,18 +3,15 @@
 import warnings
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from heli_jax.config.section import Section
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    # An unknown key is an error: a misspelt `duration` would leave a run as it was.
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class StickConfig(_Strict):
+class StickConfig(Section):
     """How one input moves in a simulation."""
 
     # "sweep" is the older name of "chirp".
@@ -34,14 +31,14 @@ class StickConfig(_Strict):
     """first and last frequency of a chirp [Hz]"""
 
 
-class NoiseConfig(_Strict):
+class NoiseConfig(Section):
     sd: Positive
     """standard deviation, in `unit`"""
     unit: str | None = None
     """the output's SI unit unless given"""
 
 
-class StartConfig(_Strict):
+class StartConfig(Section):
     """The steady flight in which a run of the whole helicopter begins."""
 
     forward_speed: Finite = 0.0
@@ -70,7 +67,7 @@ class StartConfig(_Strict):
         return content
 
 
-class SimulateConfig(_Strict):
+class SimulateConfig(Section):
     """A run that the project makes itself.
 
     The whole helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
