@@ -621,7 +621,10 @@ def test_a_model_of_ones_own(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not TREX.exists(), reason="the real logs are not at ../shared/data")
-@pytest.mark.parametrize("flybar_free", [False, True], ids=["If-fixed", "If-free"])
+@pytest.mark.parametrize(
+    "flybar_free",
+    [pytest.param(False, id="If-fixed", marks=pytest.mark.slow), pytest.param(True, id="If-free")],
+)
 def test_a_real_record(tmp_path, capsys, flybar_free):
     signals = {
         "time": {"signal": "t"},

@@ -322,16 +322,19 @@ def _search(
     known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
     first = starting.Search(problem, layout, begun, search.max_steps)
     optima = first.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
-    if further is not None and explains_little(first, noise, optima):
-        report(SAID_FURTHER)
-        more = further_starts(layout, problem, guess.z, further)
-        optima += first.run(noise, more, report, nearing=layout.estimator.nearing)
-        points = jnp.concatenate([points, more])
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
     if shooting is not None:
         best, notes = shooting, (SAID,)
+    if further is not None and explains_little(first, noise, best):
+        report(SAID_FURTHER)
+        more = further_starts(layout, problem, guess.z, further)
+        optima += first.run(noise, more, report, nearing=layout.estimator.nearing)
+        points = jnp.concatenate([points, more])
+        better = min(optima, key=starting.rank)
+        if starting.rank(better) < starting.rank(best):
+            best, notes = better, ()
     optimum = relax_noise_covariance(search, noise, best)
     optimum = optimum._replace(notes=(*notes, *optimum.notes))
     # Relaxation ends where its first weights of the outputs lead: tried from others too.

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.drawn_starts import draw
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
-from heli_jax.identification.estimation.multistart import Search, rank
+from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise
@@ -19,19 +19,18 @@ _LITTLE = 0.5
 _DRAWN = 5
 
 
-def explains_little(search: Search, noise: Noise, optima: list[Optimum]) -> bool:
-    """Whether the best optimum of a linear model by output error explains less than half of the
+def explains_little(search: Search, noise: Noise, best: Optimum) -> bool:
+    """Whether the optimum of a linear model by output error explains less than half of the
     outputs' variance; of others nothing is asked, which take long.
 
     Args:
         search: that ended there.
         noise: of the measurements, by which its rows were divided.
-        optima: one for each start.
+        best: the best optimum so far.
     """
     layout = search.layout
     if not layout.model.linear or layout.disturbance or not layout.estimator.rows_are_samples:
         return False
-    best = min(optima, key=rank)
     left = float(best.cost) * measured_count(search.data) / search.variation(noise)
     return not (bool(best.converged) and 1.0 - left > _LITTLE)
 

@@ -179,6 +179,7 @@ def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
     assert "predicted up to 2 s ahead misses" in bad.reasons[0]
 
 
+@pytest.mark.slow
 def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     model, _, start, flight = made(bench30, 3)
     right = fit(Problem(model, start, [flight], FREE, method="filter-error"))

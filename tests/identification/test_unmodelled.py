@@ -115,9 +115,12 @@ def test_what_was_not_asked_leaves_no_plain_yes():
 
 
 METHODS = ("output-error", "frequency-error", "frequency-response")
+QUICK = [
+    pytest.param(m, marks=pytest.mark.slow if m == "frequency-response" else ()) for m in METHODS
+]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", QUICK)
 def test_a_mode_that_is_left_out_leaves_no_plain_yes(method):
     # Its residual is white, or nearly, and holds a few per cent of the output's power.
     found = fitted(with_payload, method, noise=0.3)
@@ -129,7 +132,7 @@ def test_a_mode_that_is_left_out_leaves_no_plain_yes(method):
     assert "No interval allows" in note
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", QUICK)
 def test_a_saturation_that_is_left_out_is_named(method):
     found = fitted(saturated, method, noise=0.02)
     assert "the response of p depends on amplitude" in found.adequacy.summary
@@ -153,7 +156,7 @@ def test_a_flight_with_a_stick_of_another_scale_is_named():
     assert "the response of p differs between two and the others" in found.adequacy.summary
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", QUICK)
 def test_a_machine_that_changes_over_the_record_leaves_no_plain_yes(method):
     def slows_down(u):
         """p of a rotor that loses a fifth of its moment steadily."""
