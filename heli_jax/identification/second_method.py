@@ -15,6 +15,7 @@ Source: J. A. Hausman, Specification tests in econometrics, Econometrica 46 (197
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS
@@ -64,15 +65,16 @@ def with_second_method(
         max_steps: of the other method's optimiser.
         progress: called with a line of text before the work.
     """
+    question = _QUESTIONS.get(problem.method)
     filtered = problem.method == "filter-error"
-    asked = undisturbed is not None and _of_filter(problem, first) if filtered else None
-    if not (_is_asked(problem, first) if asked is None else asked):
+    if question is None or (filtered and undisturbed is None) or _is_doubtful(problem, first):
+        return first
+    if not question.is_asked(first):
         return first
     if progress is not None:
-        why = "the inputs ask for other values" if filtered else "the residuals are coloured"
-        progress(f"{why}: the same by {METHODS[_METHOD].label}")
+        progress(f"{question.why}: the same by {METHODS[_METHOD].label}")
     try:
-        if undisturbed is not None and filtered:
+        if filtered and undisturbed is not None:
             other = undisturbed()
         else:
             other = dataclasses.replace(problem, method=_METHOD, window=None, continuity=None)
@@ -82,33 +84,33 @@ def with_second_method(
         return first
     if other.status == "not-converged" or other.untrusted:
         return first
-    apart = _excluded if filtered else _apart
     estimates = {
         n: _interval(other.estimates[n])
         for n, a in first.estimates.items()
-        if apart(a, other.estimates[n])
+        if question.is_apart(a, other.estimates[n])
     }
     second = SecondMethod(METHODS[_METHOD].label, estimates)
-    said = sentence(second, _OF_FILTER if filtered else _OF_OUTPUT_ERROR) if estimates else ""
-    notes = (*first.notes, said) if said else first.notes
+    notes = (*first.notes, sentence(second, question.remedy)) if estimates else first.notes
     return dataclasses.replace(first, second_method=second, notes=notes)
 
 
-def _is_asked(problem: Problem, first: Fit) -> bool:
-    if problem.method != "output-error" or first.status == "not-converged" or not first.coloured:
-        return False
-    # What is wrong with the record, or explains nothing of it, is said by itself.
-    if first.untrusted or first.adequacy.by_chance or not problem.model.linear:
-        return False
+def _is_doubtful(problem: Problem, first: Fit) -> bool:
+    """Whether what is wrong with the record, or explains nothing of it, is said by itself, or the
+    model is none that the other method takes as it is."""
+    if first.status == "not-converged" or not problem.model.linear:
+        return True
+    return bool(first.untrusted) or first.adequacy.by_chance
+
+
+def _is_disturbed(first: Fit) -> bool:
+    """Whether disturbances colour output error's residuals and take a good part of an output."""
     vafs = [m.vaf for m in first.metrics.values()]
-    return bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
+    return first.coloured and bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
 
 
-def _of_filter(problem: Problem, first: Fit) -> bool:
+def _inputs_ask_for_others(first: Fit) -> bool:
     """Whether filter error's estimates are others than the inputs ask for."""
-    if first.status == "not-converged" or first.untrusted or not problem.model.linear:
-        return False
-    if first.adequacy.by_chance or first.adequacy.ahead or any(f.present for f in first.feedback):
+    if first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
     return not by_the_inputs(first.reached)
 
@@ -144,7 +146,7 @@ def _excluded(a: Estimate, b: Estimate) -> bool:
     )
 
 
-def sentence(second: SecondMethod, why: str = _OF_OUTPUT_ERROR) -> str:
+def sentence(second: SecondMethod, why: str) -> str:
     """For the notes of a fit.
 
     Args:
@@ -156,3 +158,24 @@ def sentence(second: SecondMethod, why: str = _OF_OUTPUT_ERROR) -> str:
         for n, v in second.estimates.items()
     )
     return f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. {why}"
+
+
+class _Question(NamedTuple):
+    """What is asked of a fit by one method."""
+
+    is_asked: Callable[[Fit], bool]
+    why: str
+    """it is, in words"""
+    is_apart: Callable[[Estimate, Estimate], bool]
+    """of its estimate, and of the other method's"""
+    remedy: str
+
+
+_QUESTIONS = {
+    "output-error": _Question(
+        _is_disturbed, "the residuals are coloured", _apart, _OF_OUTPUT_ERROR
+    ),
+    "filter-error": _Question(
+        _inputs_ask_for_others, "the inputs ask for other values", _excluded, _OF_FILTER
+    ),
+}

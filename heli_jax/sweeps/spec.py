@@ -251,13 +251,14 @@ def _check_single(model: Model) -> None:
     from one sample to the next would change its type."""
 
     def computed(p: Any, s: Any, u: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        given = model.Params(**p), model.State(**s), model.Inputs(**u)
-        return naming.asdict(model.vector_field(*given)), naming.asdict(model.output(*given))
+        arguments = model.Params(**p), model.State(**s), model.Inputs(**u)
+        results = model.vector_field(*arguments), model.output(*arguments)
+        return naming.asdict(results[0]), naming.asdict(results[1])
 
     single = jax.ShapeDtypeStruct((), np.float32)
     classes = (model.Params, model.State, model.Inputs)
-    found = jax.eval_shape(computed, *(dict.fromkeys(naming.names(c), single) for c in classes))
-    for function, values in zip(("vector_field", "output"), found, strict=True):
+    results = jax.eval_shape(computed, *(dict.fromkeys(naming.names(c), single) for c in classes))
+    for function, values in zip(("vector_field", "output"), results, strict=True):
         for name, value in values.items():
             if value.dtype == np.float64:
                 raise ValueError(

@@ -12,11 +12,9 @@ import numpy as np
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.residual_slopes import (
-    every_of,
     longest,
-    own_of,
+    of_one_clock,
     sensitivities,
-    usable,
 )
 from heli_jax.identification.validation.score_test import lines_of, pulled_away
 
@@ -36,12 +34,8 @@ def by_the_inputs(at: Solution) -> bool:
     flights, k = longest(at), len(layout.of_interest)
     J, chances = sensitivities(at, e), []
     for name in sorted({n for i in flights for n in layout.outputs[i]}):
-        those = [i for i in flights if usable(at, e, i, name)]
-        those = [i for i in those if every_of(at, i, name) == every_of(at, those[0], name)]
         lines = []
-        for i in those:
-            own = own_of(at, i, name)
-            assert own is not None  # or the flight were not usable
+        for i, own in of_one_clock(at, e, name):
             left, slopes = np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows]
             lines.append(lines_of(left, slopes, np.zeros((left.size, 0)), own.holes))
         lines = [one for one in lines if one is not None]

@@ -67,16 +67,18 @@ def own_of(at: Solution, i: int, name: str) -> OwnSamples | None:
     return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
 
 
-def every_of(at: Solution, i: int, name: str) -> int:
-    """Every how many samples of the grid an output was sampled; 0 where that cannot be said.
+def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
+    """The flights whose residual of an output can be asked, and where it was sampled in each; of
+    one clock, since filters are of samples.
 
     Args:
         at: where the fit ended.
-        i: the flight.
+        e: what that tells.
         name: the output.
     """
-    own = own_of(at, i, name)
-    return own.every if own is not None else 0
+    flights = [(i, own_of(at, i, name)) for i in longest(at) if usable(at, e, i, name)]
+    samples = [(i, own) for i, own in flights if own is not None]
+    return [(i, own) for i, own in samples if own.every == samples[0][1].every]
 
 
 def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:

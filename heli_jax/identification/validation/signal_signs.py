@@ -141,8 +141,17 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
     one part after the other (the jackknife)."""
     squares = [[float(part @ part) for part in np.array_split(x, PARTS)] for x in (first, second)]
     left = [sum(of) - np.asarray(of) for of in squares]
-    logs = 0.5 * np.log(left[0] / left[1])
-    return float(np.sqrt((PARTS - 1) * np.var(logs)))
+    return jackknife_sd(0.5 * np.log(left[0] / left[1]))
+
+
+def jackknife_sd(each: Sequence[float] | np.ndarray) -> float:
+    """Standard deviation of what all parts of a record give together, by what is given without one
+    part after the other.
+
+    Args:
+        each: without the first of the `PARTS` parts, without the second, and so on.
+    """
+    return float(np.sqrt((PARTS - 1) * np.var(each)))
 
 
 def angle_over_rate(
@@ -180,12 +189,32 @@ def _changes(
     both = angle_and_integral(angle, rate, dt)
     if both is None:
         return None
+    first, second = (changes_within(v, dt) for v in both)
+    return first, second
+
+
+def changes_within(signal: Float[np.ndarray, " N"], dt: float) -> np.ndarray:
+    """By how much a signal changes over `WITHIN`, without the mean.
+
+    Args:
+        signal: without a missing sample.
+        dt: [s].
+    """
     steps = max(1, round(WITHIN / dt))
     # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
     # is not divided by a sample time.
-    changes = [v[steps:] - v[:-steps] for v in both]
-    first, second = (v - v.mean() for v in changes)
-    return first, second
+    changes = signal[steps:] - signal[:-steps]
+    return changes - changes.mean()
+
+
+def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
+    """Of a signal with straight lines between its samples, from zero.
+
+    Args:
+        rate: without a missing sample.
+        dt: [s].
+    """
+    return np.concatenate([np.zeros(1), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
 
 
 def angle_and_integral(
@@ -205,8 +234,7 @@ def angle_and_integral(
         return None
     # Headings jump by a turn where they pass south.
     turned = np.unwrap(whole[0])
-    halves = 0.5 * dt * (whole[1][1:] + whole[1][:-1])
-    return turned, np.concatenate([np.zeros(1), np.cumsum(halves)])
+    return turned, integral(whole[1], dt)
 
 
 def filled(signal: np.ndarray, dt: float) -> np.ndarray | None:

@@ -11,7 +11,14 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.signal_signs import PARTS, WITHIN, filled
+from heli_jax.identification.validation.signal_signs import (
+    PARTS,
+    WITHIN,
+    changes_within,
+    filled,
+    integral,
+    jackknife_sd,
+)
 
 _TURNED = np.sin(np.radians(3.0))
 """below which a mounting is as good as straight"""
@@ -59,24 +66,16 @@ def _turn(flight: Flight) -> float | None:
     # What the angles' rates are of p and q by kinematics, in which the turn is a small correction.
     of_roll = np.tan(theta) * (q * np.sin(phi) + r * np.cos(phi))
     of_pitch = q * (np.cos(phi) - 1.0) - r * np.sin(phi)
-    X = np.stack([_changes(v, dt, steps) for v in (p, q)], axis=1)
+    X = np.stack([changes_within(integral(v, dt), dt) for v in (p, q)], axis=1)
     parts = []
     for angle, rest, other in ((phi, of_roll, 1), (theta, of_pitch, 0)):
-        y = angle[steps:] - angle[:-steps] - _changes(rest, dt, steps)
-        parts.append(_part(X, y - y.mean(), other))
+        parts.append(_part(X, changes_within(angle - integral(rest, dt), dt), other))
     (a, sd_a), (b, sd_b) = parts
     alike = a * b < 0 and 1.0 / _ALIKE < abs(a / b) < _ALIKE
     if not (alike and abs(a) > _SURE * sd_a and abs(b) > _SURE * sd_b):
         return None
     size = 0.5 * (b - a)
     return float(np.arcsin(np.clip(size, -1.0, 1.0))) if abs(size) > _TURNED else None
-
-
-def _changes(rate: np.ndarray, dt: float, steps: int) -> np.ndarray:
-    """By how much the integral of a rate changes over some steps, without the mean."""
-    whole = np.concatenate([np.zeros(1), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
-    changes = whole[steps:] - whole[:-steps]
-    return changes - changes.mean()
 
 
 def _part(X: np.ndarray, y: np.ndarray, k: int) -> tuple[float, float]:
@@ -89,4 +88,4 @@ def _part(X: np.ndarray, y: np.ndarray, k: int) -> tuple[float, float]:
     along = [X[i].T @ y[i] for i in rows]
     whole, both = sum(products), sum(along)
     each = [np.linalg.solve(whole - P, both - v)[k] for P, v in zip(products, along, strict=True)]
-    return float(np.linalg.solve(whole, both)[k]), float(np.sqrt((PARTS - 1) * np.var(each)))
+    return float(np.linalg.solve(whole, both)[k]), jackknife_sd(each)

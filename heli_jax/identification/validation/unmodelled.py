@@ -29,9 +29,8 @@ from heli_jax.identification.validation.residual_drives import (
     of_single_flights,
 )
 from heli_jax.identification.validation.residual_slopes import (
-    every_of,
     longest,
-    own_of,
+    of_one_clock,
     sensitivities,
     usable,
 )
@@ -255,13 +254,10 @@ def _of_output(
     """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
     where nothing can be asked."""
     moving = moving_inputs(at)
-    flights = [i for i in longest(at) if usable(at, e, i, name)]
-    # The bank's filters are of samples: those of one clock go together.
-    flights = [i for i in flights if every_of(at, i, name) == every_of(at, flights[0], name)]
+    samples = of_one_clock(at, e, name)
+    flights = [i for i, _ in samples]
     over_time, each = changing(at, J, name, flights), []
-    for i in flights:
-        own = own_of(at, i, name)
-        assert own is not None  # or the flight were not usable
+    for i, own in samples:
         X = drives(at, e, i, name, moving)
         X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
         X = np.concatenate([X, over_time[i][own.rows]], axis=1)
@@ -309,8 +305,8 @@ def _said(
         sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
-    first = next(i for i in longest(at) if usable(at, e, i, name))
-    dt = float(at.data.flights[first].dt) * every_of(at, first, name)
+    first, own = of_one_clock(at, e, name)[0]
+    dt = float(at.data.flights[first].dt) * own.every
     odd = ""
     if one.odd is not None:
         called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
