@@ -127,8 +127,8 @@ def _used(preset: str | None, model: Any, log: Log, signals: text.Signals | None
         guesses = (*signals.inputs.values(), *signals.outputs.values())
         return [g.channel for g in guesses if g is not None]
     assert preset is not None
-    signals_ = (*naming.names(model.Inputs), *naming.names(model.Outputs))
-    return channels_of_preset(preset, tuple(log.series), signals_)
+    needed = (*naming.names(model.Inputs), *naming.names(model.Outputs))
+    return channels_of_preset(preset, tuple(log.series), needed)
 
 
 def _rate(log: Log, used: Sequence[str], signals: text.Signals | None) -> float | None:
