@@ -7,23 +7,25 @@ slopes let expect.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import (
-    measured_count,
-    residual_and_jacobian,
+from heli_jax.identification.identifiability.ends_by_likelihood import (
+    Inside,
+    Profile,
+    follow,
+    lost_of,
+    squares_of,
 )
 from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
-from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
+from heli_jax.identification.identifiability.verdict import Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, value_of
@@ -36,22 +38,10 @@ _VALLEY = 0.9
 """correlation beyond which two parameters lie along a valley, which bends"""
 _INFLATED = 1.5
 """factor by which autocorrelated residuals may make intervals wider"""
-_AS_EXPECTED = 1.15
-"""factor by which the root of what is lost may differ from what the slopes say: the interval of the
-slopes is then as wide as that of the likelihood within about as much"""
 _TOGETHER = 0.99
 """correlation beyond which what is open of one parameter is open of the other"""
 _SINGULAR = 0.999
 """correlation beyond which the valley is so long that chance has put the optimum along it"""
-_ENOUGH = 0.05
-"""squares that a further step may promise where a search stops"""
-_STEPS = 10
-"""of Levenberg and Marquardt at most for each point"""
-_RIDGE = 1.0 / 3.0
-"""one over how far a step may go, in coordinates most of which are logarithms, for nothing"""
-_HUGE = 1e50
-_OUTWARDS, _POINTS = 1.7, 7
-"""factor from one point of a profile to the next further out, and how many there are to a side"""
 _BY_CHANCE = 1e-3
 """probability that initial states which are those of rest gain as much of the likelihood"""
 _REST = 1e-6
@@ -93,50 +83,22 @@ def beyond_slopes(
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
     """
     lacking = {*verdict.undetermined, *verdict.without_effect}
-    sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    n = len(sd)
-    related = np.abs(np.where(np.eye(n), 0.0, verdict.correlation)).max(1, initial=0.0)
-    # A disturbance makes intervals wide, of which it is said elsewhere, and leaves a likelihood of
-    # white residuals that means little.
-    least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
-    asked = (reaches[:n] < _INFLATED * Z95) | (related > _TOGETHER)
-    wide = [
-        (i, u)
-        for i, u in enumerate(unknowns_of(problem, at.layout, e))
-        if u.name in problem.free
-        and (u.logarithmic or u.symmetric)
-        and not (u.name in lacking or u.at_bound)
-        and asked[i]
-        and (sd[i] * reaches[i] > Z95 * least[i] or _may_vanish(problem, u, sd[i] * reaches[i]))
-    ]
+    wide = _wide(problem, at, e, verdict, reaches)
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES
     null = _open_at_rest(problem, at, e, lacking, reaches)
     opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
-    limits, one_sided, along = {}, [], []
-    R = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     # What is open already goes along with anything, and tells nothing of where the others go.
-    R[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
-    # Columns of one size: beside one that is larger by far another would count as none at all.
-    norms = np.linalg.norm(R, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    inverse = np.linalg.pinv(R / norms, rcond=1e-10) / norms[:, None]
-    # Several that go together along one valley have as many ways to fit the noise: their intervals
-    # are those that hold for all of them at once.
-    together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
-    certain = math.sqrt(scipy.special.chdtri(len(wide), _BY_CHANCE)) / Z95
+    inverse = _inverse(e, verdict.names, lacking)
+    limits, one_sided, along = {}, [], []
     for i, u in wide:
         # What goes along with one that is open to a side is open with it.
-        tied = any(
-            abs(verdict.correlation[i, verdict.names.index(n)]) > _TOGETHER for n in one_sided
-        )
-        if u.name in opened or tied:
+        if u.name in opened or _goes_with(verdict, i, one_sided):
             one_sided += [u.name] * (u.name not in opened)
             continue
-        reach = together * float(reaches[i])
-        others = np.abs(np.delete(verdict.correlation[i], i)).max(initial=0.0)
-        far = (certain if others > _SINGULAR else together) * float(reaches[i])
-        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach, far, [])
+        reach, far = _levels(verdict, i, len(wide))
+        column, white = inverse @ inverse[i], float(reaches[i])
+        profile = Profile(problem, at, e, i, u, column, reach * white, far * white, [])
         ends = profile.ends()
         if ends is None:
             one_sided.append(u.name)
@@ -145,25 +107,74 @@ def beyond_slopes(
             low, high = sorted(end.value for end in ends)
             limits[u.name] = (low, high)
     # Also those that were asked before the one that is open, or were too narrow to be asked.
-    at_side = [i for i, n in enumerate(verdict.names) if n in one_sided]
+    open_ended = tuple(one_sided)
     one_sided += [
         n
         for i, n in enumerate(verdict.names)
         if n in problem.free
         and n not in {*one_sided, *opened, *lacking}
-        and np.abs(verdict.correlation[i, at_side]).max(initial=0.0) > _TOGETHER
+        and _goes_with(verdict, i, open_ended)
     ]
     if along:
         # Where what is open stays. What was asked itself went along with it already.
-        R[:, [i for i, n in enumerate(verdict.names) if n in one_sided]] = 0.0
-        still = np.linalg.pinv(R / norms, rcond=1e-10) / norms[:, None]
+        still = _inverse(e, verdict.names, {*lacking, *one_sided})
+        n = len(verdict.names)
         distances = np.linalg.norm(still, axis=1)[:n] * reaches[:n]
         gone = {*one_sided, *opened, *lacking, *(u.name for _, u in wide)}
         each = zip(verdict.names, distances.tolist(), strict=True)
-        known = {name: d for name, d in each if name not in gone}
-        limits |= _reaching(at, e, along, known)
+        limits |= _reaching(at, e, along, {name: d for name, d in each if name not in gone})
     limits = {n: ends for n, ends in limits.items() if n not in one_sided}
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
+
+
+def _wide(
+    problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
+) -> list[tuple[int, Unknown]]:
+    """The parameters that the likelihood is asked of, by their place among the unknowns."""
+    sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    n = len(sd)
+    related = np.abs(np.where(np.eye(n), 0.0, verdict.correlation)).max(1, initial=0.0)
+    # A disturbance makes intervals wide, of which it is said elsewhere, and leaves a likelihood of
+    # white residuals that means little.
+    asked = (reaches[:n] < _INFLATED * Z95) | (related > _TOGETHER)
+    least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    return [
+        (i, u)
+        for i, u in enumerate(unknowns_of(problem, at.layout, e))
+        if u.name in problem.free
+        and (u.logarithmic or u.symmetric)
+        and not (u.name in lacking or u.at_bound)
+        and asked[i]
+        and (sd[i] * reaches[i] > Z95 * least[i] or _may_vanish(problem, u, sd[i] * reaches[i]))
+    ]
+
+
+def _inverse(e: Evaluation, names: Sequence[str], open_: set[str]) -> Float[np.ndarray, "q k"]:
+    """A root of the covariance of all unknowns by the slopes, without those that are open."""
+    R = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
+    R[:, [i for i, n in enumerate(names) if n in open_]] = 0.0
+    # Columns of one size: beside one that is larger by far another would count as none at all.
+    norms = np.linalg.norm(R, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    return np.linalg.pinv(R / norms, rcond=1e-10) / norms[:, None]
+
+
+def _goes_with(verdict: Verdict, i: int, names: Sequence[str]) -> bool:
+    """Whether an unknown lies along one valley with any of those named."""
+    at = [verdict.names.index(n) for n in names]
+    return bool(np.abs(verdict.correlation[i, at]).max(initial=0.0) > _TOGETHER)
+
+
+def _levels(verdict: Verdict, i: int, count: int) -> tuple[float, float]:
+    """Factors to the reach of a parameter, one of so many that are asked: of its interval, and of
+    what has to be lost at a factor of ten."""
+    # Several that go together along one valley have as many ways to fit the noise: their intervals
+    # are those that hold for all of them at once.
+    together = math.sqrt(scipy.special.chdtri(count, 0.05)) / Z95
+    others = np.abs(np.delete(verdict.correlation[i], i)).max(initial=0.0)
+    certain = math.sqrt(scipy.special.chdtri(count, _BY_CHANCE)) / Z95
+    return together, certain if others > _SINGULAR else together
 
 
 def _may_vanish(problem: Problem, u: Unknown, reach: float) -> bool:
@@ -176,19 +187,10 @@ def _may_vanish(problem: Problem, u: Unknown, reach: float) -> bool:
     return u.symmetric and low < 0.0 < high and reach >= u.distance
 
 
-class _Inside(NamedTuple):
-    """A point along an open parameter that is as likely as those within an interval."""
-
-    z: np.ndarray
-    """(q,)"""
-    left: float
-    """part of the interval of any other parameter that it leaves to that, 0 to 1"""
-
-
 def _reaching(
     at: Solution,
     e: Evaluation,
-    along: list[_Inside],
+    along: list[Inside],
     reach: Mapping[str, float],
 ) -> dict[str, tuple[float, float]]:
     """Intervals that hold where the others go along a parameter that is open, if they do not yet.
@@ -222,204 +224,6 @@ def _reaching(
     return intervals
 
 
-class _Point(NamedTuple):
-    """The best that is found with some coordinates held."""
-
-    z: np.ndarray
-    squares: float
-    """sum of them, less what a further step promises; infinite where nothing is found"""
-
-
-def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
-    """From z (q,) to the smallest sum of squares with the coordinates held (q,) where they are."""
-    moving = ~held
-    ridge = _RIDGE
-    now = _rows_at(at, z)
-    squares, promised = _squares(now.r), math.inf
-    for _ in range(_STEPS):
-        J = now.J[:, moving]
-        # Past that the squares of a simulation that has diverged are no numbers.
-        if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
-            return _Point(now.z, math.inf)
-        Q, R = np.linalg.qr(J)
-        left = -(Q.T @ now.r)
-        damped = np.vstack([R, ridge * np.eye(len(R))])
-        target = np.concatenate([left, np.zeros(len(R))])
-        part = np.linalg.lstsq(damped, target, rcond=None)[0]
-        promised = float(left @ left - np.sum((left - R @ part) ** 2))
-        if promised < _ENOUGH:
-            break
-        step = np.zeros(z.size)
-        step[moving] = part
-        then = _rows_at(at, now.z + step)
-        gained = squares - _squares(then.r)
-        # Negated: also what is not finite is no step.
-        if gained > 0:
-            now, squares, ridge = then, squares - gained, max(_RIDGE, ridge / 10.0)
-        elif ridge > _RIDGE * 1e4:
-            break
-        else:
-            ridge *= 10.0
-    return _Point(now.z, squares - promised)
-
-
-class _Rows(NamedTuple):
-    """All that a step needs of a point: the simulation in time would cost some methods more."""
-
-    z: Float[np.ndarray, " q"]
-    r: Float[np.ndarray, " n"]
-    J: Float[np.ndarray, "n q"]
-
-
-def _rows_at(at: Solution, z: np.ndarray) -> _Rows:
-    there = jnp.asarray(z, at.z.dtype)
-    made = residual_and_jacobian(at.layout, at.data, at.noise, there)
-    each = jax.device_get((there, made.r, made.J))
-    return _Rows(*(np.asarray(v, np.float64) for v in each))
-
-
-def _squares(r: np.ndarray) -> float:
-    r = np.asarray(r, np.float64)
-    with np.errstate(all="ignore"):
-        return float(r @ r)
-
-
-def _lost(at: Solution, first: float, squares: float) -> float:
-    """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
-    if not math.isfinite(squares):
-        return math.inf
-    # What a further step promises may be all there is.
-    if squares <= 0.0:
-        return 0.0
-    n = measured_count(at.data)
-    lost = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
-    return max(0.0, float(lost))
-
-
-class _End(NamedTuple):
-    """One end of an interval."""
-
-    value: float
-    as_expected: bool
-    """whether it is where the slopes have it"""
-
-
-class _Profile(NamedTuple):
-    """The likelihood along one parameter, all others at their best."""
-
-    problem: Problem
-    at: Solution
-    e: Evaluation
-    """at the optimum"""
-    i: int
-    u: Unknown
-    along: np.ndarray
-    """(q,) column of the covariance: how the others go with it to first order"""
-    reach: float
-    """root of what may be lost within the interval"""
-    certain: float
-    """root of what has to be lost at a factor of ten"""
-    inside: list[_Inside]
-    """what was visited and is as likely as what is within the interval"""
-
-    def ends(self) -> tuple[_End, _End] | None:
-        """Both ends; None where one of them is not within the factor of ten."""
-        low = self.end(-1)
-        high = self.end(1) if low is not None else None
-        return None if low is None or high is None else (low, high)
-
-    def end(self, side: int) -> _End | None:
-        """The end of the interval towards smaller (-1) or larger (1) coordinates; None where
-        the likelihood does not bound the parameter within the factor of ten."""
-        sd = math.sqrt(float(self.along[self.i]))
-        z0, first = np.asarray(self.at.z, np.float64), _squares(self.e.r)
-        t = self.reach * sd
-        furthest = self._furthest(side)
-        seen, guess = [(0.0, 0.0)], z0
-        tangent = self.along / self.along[self.i]
-        for k in range(_POINTS):
-            t = min(t, furthest)
-            guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
-            point = _follow(self.at, guess, np.arange(z0.size) == self.i)
-            root = math.sqrt(_lost(self.at, first, point.squares))
-            if k == 0 and 1.0 / _AS_EXPECTED < root / self.reach < _AS_EXPECTED:
-                return _End(self._value(z0[self.i] + side * t), True)
-            if math.isfinite(root):
-                seen.append((t, root))
-            if root < self.reach:
-                self.inside.append(_Inside(point.z, self._left(root)))
-                if t >= furthest:
-                    return self._at_limit(side)
-                # The direction in which the others went last is where they go on.
-                tangent = (point.z - z0) / (point.z[self.i] - z0[self.i])
-                guess, t = point.z, t * _OUTWARDS
-                above = [s for s, r in seen if r >= self.reach]
-                if above:
-                    t = 0.5 * (min(above) + point.z[self.i] * side - z0[self.i] * side)
-            elif root < _AS_EXPECTED * self.reach or k == _POINTS - 1:
-                break
-            else:
-                inside = max(s for s, r in seen if r < self.reach)
-                guess, tangent = z0, self.along / self.along[self.i]
-                t = max(0.5 * (t + inside), t * self.reach / root) if root < math.inf else 0.5 * t
-        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
-        # chance is one among many places where the noise may have put it.
-        z = guess + tangent * (z0[self.i] + side * furthest - guess[self.i])
-        point = _follow(self.at, z, np.arange(z0.size) == self.i)
-        if _lost(self.at, first, point.squares) < self.certain**2:
-            self.inside.append(_Inside(point.z, 0.0))
-            return self._at_limit(side)
-        return _End(self._value(z0[self.i] + side * self._crossing(seen)), False)
-
-    def _left(self, root: float) -> float:
-        """What part of an interval is left where so much of the likelihood is lost already."""
-        return math.sqrt(max(0.0, 1.0 - (root / self.reach) ** 2))
-
-    def _crossing(self, seen: list[tuple[float, float]]) -> float:
-        """Where the root of what is lost passes the reach: nearly a straight line."""
-        inside = max(s for s in seen if s[1] < self.reach)
-        beyond = [s for s in seen if s[1] >= self.reach and s[0] > inside[0]]
-        if not beyond:
-            return inside[0]
-        outside = min(beyond)
-        share = (self.reach - inside[1]) / (outside[1] - inside[1])
-        return inside[0] + share * (outside[0] - inside[0])
-
-    def _furthest(self, side: int) -> float:
-        """Distance in the coordinate to a factor of ten, or to a bound."""
-        free, value = self.problem.free[self.u.name], self.u.value
-        size = abs(value) / self.u.distance if self.u.distance else abs(value)
-        rising = float(self.e.slopes[self.i]) > 0
-        up = rising == (side > 0)
-        if self.u.symmetric:
-            # Away from zero a factor, as for all; towards it as far on its other side.
-            outwards = up == (value > 0)
-            far = math.log(FACTOR) * size
-            target = value + (far if up else -far)
-            if outwards and abs(value) > 0.3 * size:
-                target = value * FACTOR
-        else:
-            target = value * FACTOR if up == (value > 0) else value / FACTOR
-        low, high = transforms.limits(free)
-        width = high - low if math.isfinite(high - low) else abs(value)
-        target = min(max(target, low + 1e-6 * width), high - 1e-6 * width)
-        data, kind = self.at.data, self.at.layout.kinds[self.i]
-        limits = (data.sign[self.i], data.low[self.i], data.high[self.i])
-        z = float(transforms.to_coordinate(kind, jnp.asarray(target), *limits))
-        return abs(z - float(self.at.z[self.i]))
-
-    def _at_limit(self, side: int) -> _End | None:
-        """Beyond the furthest point: a bound that was stated bounds it, a factor of ten does
-        not."""
-        value = self._value(float(self.at.z[self.i]) + side * self._furthest(side))
-        if transforms.at_bound(self.problem.free[self.u.name], value):
-            return _End(value, False)
-        return None
-
-    def _value(self, z: float) -> float:
-        return float(value_of(self.at.layout, self.at.data, self.i, jnp.asarray(z)))
-
-
 def _open_at_rest(
     problem: Problem, at: Solution, e: Evaluation, lacking: set[str], reaches: np.ndarray
 ) -> list[np.ndarray]:
@@ -437,8 +241,8 @@ def _open_at_rest(
     z = np.asarray(at.z, np.float64)
     if not (np.abs(z[held]) > _REST).any():
         return []
-    point = _follow(at, np.where(held, 0.0, z), held)
-    lost = _lost(at, _squares(e.r), point.squares)
+    point = follow(at, np.where(held, 0.0, z), held)
+    lost = lost_of(at, squares_of(e.r), point.squares)
     # Autocorrelated residuals let chance gain more.
     wider = max(1.0, float(np.median(reaches[held])) / Z95)
     if lost > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
