@@ -246,14 +246,17 @@ def _equilibrium(
     # Newton's method takes it to the last digit, and gives it the derivatives of a root.
     xi = jax.lax.stop_gradient(solution.value)
 
-    def polish(z: Array, _: Any) -> tuple[Array, None]:
+    # One place has the model and its derivatives, so that it is compiled once: a step says what is
+    # left where it begins, and the last step says it of the root.
+    def polish(z: Array, _: Any) -> tuple[Array, tuple[Array, Array]]:
         # Here `params` is not held back: a Newton step from a root has the derivative of the root
         # by the parameters (implicit function), whatever way led there.
-        return z - jnp.linalg.solve(jax.jacfwd(fn)(z, params), fn(z, params)), None
+        slopes, left = jax.jacfwd(lambda z: (fn(z, params),) * 2, has_aux=True)(z)
+        return z - jnp.linalg.solve(slopes, left), (z, left)
 
-    xi, _ = jax.lax.scan(polish, xi, None, length=_POLISH)
-    state, inputs = point(scales * xi, params)
-    return Trim(state, inputs, jnp.max(jnp.abs(fn(xi, params))))
+    _, (roots, left) = jax.lax.scan(polish, xi, None, length=_POLISH + 1)
+    state, inputs = point(scales * roots[-1], params)
+    return Trim(state, inputs, jnp.max(jnp.abs(left[-1])))
 
 
 def _along_the_ground(condition: Condition) -> dict[str, Any]:
