@@ -25,6 +25,8 @@ endif
 	@rm -rf '$(OUT)'
 	@$(BIN)/heli-jax fit '$(CONFIG)' --out '$(OUT)'
 
+# Compiled modules are kept: a dozen tests start processes of their own, which would compile all anew.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: .venv/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
