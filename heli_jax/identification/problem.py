@@ -203,7 +203,7 @@ class Problem:
         """The vehicle with the free parameters at their starts."""
         return naming.replace(
             self.vehicle,
-            **{n: jnp.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
+            **{n: np.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
         )
 
     def __repr__(self) -> str:

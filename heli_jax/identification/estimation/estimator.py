@@ -224,6 +224,19 @@ class Estimator(abc.ABC):
             sd[i][name] = np.asarray(size, np.asarray(y).dtype)
         return z, Noise(tuple(sd), noise.log_variance_ratio)
 
+    def with_nuisances(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> Float[Array, " q"]:
+        """z at the end of a search, with the nuisances that neither rows nor noise hang on.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: as relaxed.
+            z: the unknowns.
+        """
+        return z
+
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
         """Whether the optimum moves with the noise, so that it has to be searched again.
 

@@ -20,13 +20,14 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
-from heli_jax.identification.estimation.frequency_gusts import machine_of, whitening_by
+from heli_jax.identification.estimation.frequency_gusts import whitening_by
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     as_instruments_have_it,
@@ -44,6 +45,7 @@ from heli_jax.identification.estimation.frequency_records import (
 )
 from heli_jax.identification.estimation.frequency_rows import rows_of_lines
 from heli_jax.identification.estimation.frequency_spectrum import (
+    log_determinants,
     smoothed,
     whitening_of,
     without_shared,
@@ -178,23 +180,24 @@ class FrequencyError(Estimator):
             noise: so far.
             z: the unknowns.
         """
-        errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
+        errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(machine_of(layout, data, z), errors)
+                whitening = whitening_by(machine, errors)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
         if not sound:
             return z, noise._replace(log_variance_ratio=np.asarray(np.nan))
-        # Biases and initial states are in none of these rows: the simulation in time has them.
-        z = in_time(layout, data, noise, z)
+        # A model that is not linear is linearised where its nuisances put it.
+        if not layout.model.linear:
+            z = in_time(layout, data, noise, z)
         # Records of one length have one spectrum.
-        by_id = {id(W): -2.0 * np.linalg.slogdet(W)[1] for W in whitening}
+        by_id = {id(W): -2.0 * log_determinants(W) for W in whitening}
         logs = np.concatenate([by_id[id(W)] for W in whitening])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
@@ -204,6 +207,19 @@ class FrequencyError(Estimator):
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
         by = np.asarray(float(data.flights[0].by_instrument is not None))
         return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
+
+    def with_nuisances(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> Float[Array, " q"]:
+        """Biases and initial states are in none of the rows: the simulation in time has them.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: as relaxed.
+            z: the unknowns.
+        """
+        return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Of complex normal errors at the lines used, in SI units of the outputs; NaN for an
@@ -221,7 +237,7 @@ class FrequencyError(Estimator):
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
         squares = float(np.sum(np.square(rows)))
         by_id = {id(W): W for W in noise.whitening}
-        by_id = {k: float(np.sum(np.linalg.slogdet(np.asarray(W))[1])) for k, W in by_id.items()}
+        by_id = {k: float(np.sum(log_determinants(np.asarray(W)))) for k, W in by_id.items()}
         logs = sum(by_id[id(W)] for W in noise.whitening)
         lines = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))

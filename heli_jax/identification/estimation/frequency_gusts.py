@@ -19,15 +19,20 @@ multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, fo
 estimated.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.frequency_lines import alike, machines_of
+from heli_jax.identification.estimation.frequency_lines import (
+    Machine,
+    alike,
+    first_machine,
+    machines_of,
+)
 from heli_jax.identification.estimation.frequency_spectrum import (
     averages,
     knots_of,
@@ -51,13 +56,6 @@ _UNSEEN = 1e-10
 """part of the largest effect of a state below which outputs do not show one"""
 
 
-class Machine(NamedTuple):
-    """What turns gusts into outputs."""
-
-    Ad: Float[Array, "n n"]
-    C: Float[Array, "p n"]
-
-
 @eqx.filter_jit
 def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
     """That of the first flight: records of one length share a spectrum.
@@ -68,10 +66,7 @@ def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
         z: the unknowns.
     """
     members = alike(layout, data)[0]
-    matrices = machines_of(layout, data, unpack(layout, data, z), members).matrices
-    if matrices.Ad.ndim == 3:
-        matrices = jax.tree.map(lambda v: v[0], matrices)
-    return Machine(matrices.Ad, matrices.C)
+    return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
 
 
 def whitening_by(
@@ -87,8 +82,8 @@ def whitening_by(
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
     before = _before(machine, scaled, size)
-    left = smoothed([np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], PART, least=LEAST)
-    counts = {len(e): sum(len(v) == len(e) for v in errors) for e in errors}
+    left = smoothed([(before[len(e)] @ e[:, :, None])[:, :, 0] for e in scaled], PART, least=LEAST)
+    counts = tuple(Counter(len(e) for e in errors).items())
     p, made = errors[0].shape[1], {}
     for e, W in zip(errors, whitening_of(left), strict=True):
         K = len(e)
@@ -186,24 +181,29 @@ def _described(
     # To begin with as much as the output that shows least of a state leaves room for.
     room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
     room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
-    q = np.tile(room[:, None] / len(shapes), (1, len(shapes)))
-    r = np.maximum(0.3 * np.median(own, axis=0), _NOTHING)
-    ends = np.conj(np.swapaxes(cells.H, 1, 2))
+    c, p, n = cells.H.shape
+    # An output's own noise comes by a way that leads to it alone, and is white: the first shape.
+    powers = np.zeros((len(shapes), n + p))
+    powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
+    powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
+    # By cell and way h h^H, its numbers in a row: sums over ways, and what of a matrix comes by
+    # each, are then products of real matrices.
+    h = np.concatenate([np.swapaxes(cells.H, 1, 2), np.tile(np.eye(p), (c, 1, 1))], axis=1)
+    ways = (h[:, :, :, None] * np.conj(h[:, :, None, :])).reshape(c, n + p, -1).view(float)
+    by_way, by_shape = np.swapaxes(ways, 1, 2).copy(), shapes * cells.lines
+    matrices = np.empty((c, 2, p, p), complex)
     # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
     # a third more in the interval of If.
     for _ in range(_STEPS):
         # Without the root that would make sure that each step gains: half as many are enough.
-        inverse = np.linalg.inv(_spectrum(cells.H, q @ shapes, r))
-        seen = inverse @ cells.power @ inverse
-        # By gust what of it the errors show, and what they should.
-        shown, due = (
-            np.real(np.sum(ends * np.swapaxes(M @ cells.H, 1, 2), axis=2)) * cells.lines[:, None]
-            for M in (seen, inverse)
-        )
-        q = q * _part((shapes @ shown).T, (shapes @ due).T)
-        of_r = [np.real(np.einsum("cii,c->i", M, cells.lines)) for M in (seen, inverse)]
-        r = np.maximum(r * _part(*of_r), _NOTHING)
-    return q, r
+        S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
+        inverse = np.linalg.inv(S)
+        # By way what of it the errors show, and what they should.
+        matrices[:, 0], matrices[:, 1] = inverse @ cells.power @ inverse, inverse
+        of_ways = matrices.view(float).reshape(c, 2, -1) @ by_way
+        shown, due = np.moveaxis((by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p), 1, 0)
+        powers = np.maximum(powers * _part(shown, due), least)
+    return powers[:, :n].T, powers[0, n:]
 
 
 def _part(shown: np.ndarray, due: np.ndarray) -> np.ndarray:

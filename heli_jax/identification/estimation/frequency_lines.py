@@ -40,6 +40,13 @@ class Matrices(NamedTuple):
     D: Float[Array, "... p m"]
 
 
+class Machine(NamedTuple):
+    """What turns gusts into outputs."""
+
+    Ad: Float[Array, "n n"]
+    C: Float[Array, "p n"]
+
+
 class Signals(NamedTuple):
     """What drives a machine, in time or at the lines."""
 
@@ -325,14 +332,15 @@ def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> 
 
 
 def _times(M: Complex[Array, "K a b"], v: Complex[Array, "K b"]) -> Complex[Array, "K a"]:
-    return jnp.einsum("kab,kb->ka", M, v)
+    # A sum: products of a small matrix and a vector each would call a routine for every line.
+    return jnp.sum(M * v[:, None, :], axis=2)
 
 
 @eqx.filter_jit
 def errors_of_lines(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> list[Complex[Array, "K p"]]:
-    """By record the errors, its ends taken off, not whitened.
+) -> tuple[list[Complex[Array, "K p"]], Machine]:
+    """By record the errors, its ends taken off, not whitened; and the machine of the first flight.
 
     Args:
         layout: what the unknowns are.
@@ -340,7 +348,7 @@ def errors_of_lines(
         noise: with the whitening of each record.
         z: the unknowns.
     """
-    u, errors = unpack(layout, data, z), {}
+    u, errors, first = unpack(layout, data, z), {}, None
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
@@ -356,11 +364,23 @@ def errors_of_lines(
                 made.append(e.beyond - e.X @ m.C.T.astype(at.z.dtype))
             return made
 
+        first = first_machine(machines.matrices) if first is None else first
         each = (machines.signals, y)
         made = by_flight(data, members, ready, of_some, machines.matrices, each)
         for k, i in enumerate(members):
             errors[i] = [v[k] for v in made]
-    return [one for i in range(len(data.flights)) for one in errors[i]]
+    assert first is not None
+    return [one for i in range(len(data.flights)) for one in errors[i]], first
+
+
+def first_machine(m: Matrices) -> Machine:
+    """That of the first flight of a group: records of one length share a spectrum.
+
+    Args:
+        m: of all of them, or with a leading axis.
+    """
+    Ad, C = (v[0] if v.ndim == 3 else v for v in (m.Ad, m.C))
+    return Machine(Ad, C)
 
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:

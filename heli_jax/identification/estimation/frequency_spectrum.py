@@ -4,7 +4,7 @@ Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012)
 """
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -33,23 +33,27 @@ def smoothed(
     """
     # Records of one length have one spectrum and one kernel: their powers are added first.
     powers: dict[int, np.ndarray] = {}
+    p = lines[0].shape[1]
+    # The half that lies below the diagonal: a spectrum is Hermitian.
+    below = np.tril_indices(p)
     for v in lines:
-        product = v[:, :, None] * np.conj(v[:, None, :])
+        product = v[:, below[0]] * np.conj(v[:, below[1]])
         powers[len(v)] = powers[len(v)] + product if len(v) in powers else product
     counts = {K: sum(len(v) == K for v in lines) for K in powers}
     spectra = {}
     for K in powers:
-        knots, between = knots_of(K, part, least)
+        _, between = knots_of(K, part, least)
         total, weight = 0.0, 0.0
         for other, power in powers.items():
             kernel = _kernel(K, other, part, least)
             # Of a session in single precision too: the view below is of double numbers.
-            flat = np.ascontiguousarray(power.reshape(other, -1), dtype=complex)
+            flat = np.ascontiguousarray(power, dtype=complex)
             total = total + (kernel @ flat.view(float)).view(complex)
             weight = weight + counts[other] * kernel.sum(axis=1)
-        at_knots = (total / np.asarray(weight)[:, None]).reshape(len(knots), *power.shape[1:])
-        low, share = between
-        S = at_knots[low] + share[:, None, None] * (at_knots[low + 1] - at_knots[low])
+        at_knots, (low, share) = total / np.asarray(weight)[:, None], between
+        half = at_knots[low] + share[:, None] * (at_knots[low + 1] - at_knots[low])
+        S = np.empty((K, p, p), complex)
+        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(half), half
         floor = _ROUNDING * np.mean(np.real(np.einsum("kii->ki", S)), axis=0)
         spectra[K] = S + np.diag(floor)[None]
     return [spectra[len(v)] for v in lines]
@@ -87,19 +91,20 @@ def _kernel(K: int, other: int, part: float, least: float) -> Float[np.ndarray, 
     return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
 
 
+@functools.lru_cache(maxsize=32)
 def averages(
-    K: int, counts: Mapping[int, int], part: float = PART, least: float = LEAST
+    K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
 ) -> Float[np.ndarray, " K"]:
     """Independent lines in a smoothed spectrum of K lines: (sum w)^2 / sum w^2.
 
     Args:
         K: lines of the record.
-        counts: how many records there are, by their lines.
+        counts: lines of a record and how many there are of them, for each length.
         part: sd of the Gaussian as a part of the frequency.
         least: the same in lines, at least.
     """
     at, _ = knots_of(K, part, least)
-    kernels = [(n, _kernel(K, other, part, least)) for other, n in counts.items()]
+    kernels = [(n, _kernel(K, other, part, least)) for other, n in counts]
     total = sum(n * w.sum(axis=1) for n, w in kernels)
     squares = sum(n * np.sum(w**2, axis=1) for n, w in kernels)
     return np.interp(np.arange(K), at, total**2 / squares)
@@ -119,3 +124,12 @@ def whitening_of(
     made = {id(S): S for S in spectra}
     made = {key: np.linalg.inv(np.linalg.cholesky(S)) for key, S in made.items()}
     return tuple(made[id(S)] for S in spectra)
+
+
+def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
+    """log |det W| of what makes noise white: products of triangles, whose diagonals say it.
+
+    Args:
+        W: lower triangular.
+    """
+    return np.sum(np.log(np.abs(np.diagonal(W, axis1=1, axis2=2))), axis=1)

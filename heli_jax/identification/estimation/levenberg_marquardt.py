@@ -235,6 +235,7 @@ def residual_and_jacobian(
     return differentiate(layout, data, noise, z)
 
 
+@jax.jit
 def _optimum(residual_norm: Array, state: State, z: Array, count: np.ndarray | int) -> Optimum:
     rows = state.solver.f_info.residual
     cost = (jnp.sum(jnp.square(rows), axis=-1) - state.ahead) * residual_norm**2
@@ -292,7 +293,8 @@ def optimise(
     optimum = run.optimum._replace(steps=np.asarray(steps))
     if nearing is None:
         return optimum
-    return optimum._replace(moved=np.sum((np.asarray(run.J) @ np.asarray(at - z0)) ** 2))
+    way = np.asarray(at) - np.asarray(z0)
+    return optimum._replace(moved=np.sum((np.asarray(run.J) @ way) ** 2))
 
 
 class _Limits(NamedTuple):
@@ -343,7 +345,7 @@ def _run(
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
     constants = constants_of(layout, z0, scaling(r0, J0, trusted))
     if nearing is not None:
-        unchecked, damping = (jnp.asarray(v, z0.dtype) for v in nearing)
+        unchecked, damping = (np.asarray(v, z0.dtype) for v in nearing)
         constants = constants._replace(unchecked=unchecked, damping=damping)
     stages.at_most(max_steps)
     if held is not None:

@@ -129,6 +129,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None, :], nearing=nearing)
         trace.append((int(best.steps), float(best.cost)))
+    best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
     return RelaxedOptimum(best, noise, tuple(trace))
 
 
@@ -138,7 +139,9 @@ def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " 
     # A model that is not linear is linearised where they put it.
     if layout.estimator.nuisances_in_rows or not layout.model.linear:
         return z
-    return z.at[layout.first_nuisance :].set(0.0)
+    without = np.array(z)
+    without[layout.first_nuisance :] = 0.0
+    return jnp.asarray(without)
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:

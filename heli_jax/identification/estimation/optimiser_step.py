@@ -174,27 +174,45 @@ SINGLE = Compiled(*(jax.jit(f) for f in _ARITHMETIC))
 BATCHED = Compiled(*(jax.jit(jax.vmap(f)) for f in _ARITHMETIC))
 
 
+class _Kinds(NamedTuple):
+    """What the optimiser has to know of each unknown, (q,)."""
+
+    tikhonov: Float[np.ndarray, " q"]
+    """one over the sd of the tie to the start, where a coordinate has a size of its own"""
+    linear: Bool[np.ndarray, " q"]
+    """those without one"""
+    mask: Bool[np.ndarray, " q"]
+    """as `Constants.convergence_mask`"""
+    reach: Float[np.ndarray, " q"]
+
+
 def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
+    return _constants(z0, units, _kinds_of(layout, z0.dtype))
+
+
+@jax.jit
+def _constants(z0: Array, units: Scaling, kinds: _Kinds) -> Constants:
+    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
+    usable = units.unit > 0
+    # The norms of the columns at the start, that is one over the sd of each unknown alone.
+    norms = COLUMN * units.residual_norm / jnp.where(usable, units.unit, 1.0)
+    ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
+    tikhonov = jnp.where(kinds.linear, ties, kinds.tikhonov)
+    mask, reach = jnp.asarray(kinds.mask), jnp.asarray(kinds.reach)
+    one, none = jnp.ones((), z0.dtype), jnp.zeros((), z0.dtype)
+    return Constants(z0, units, tikhonov, mask, reach, jnp.asarray(True), one, none)
+
+
+def _kinds_of(layout: Layout, dtype: np.dtype) -> _Kinds:
     at = np.arange(layout.size)
     # Nuisances have weak priors of their own; time shift and disturbance have limits.
     logarithmic = np.where(at < len(layout.free), 1.0 / _TIKHONOV_SD, 0.0)
-    tikhonov = jnp.asarray(logarithmic, z0.dtype)
     # Not the noise's: a disturbance that is hardly there may wander on where it changes nothing
     # else, since no likelihood has a maximum there.
     mask = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
-    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
-    linear = without_size(layout)
-    if linear.any():
-        usable = units.unit > 0
-        # The norms of the columns at the start, that is one over the sd of each unknown alone.
-        norms = COLUMN * units.residual_norm / jnp.where(usable, units.unit, 1.0)
-        ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
-        tikhonov = jnp.where(linear, ties, tikhonov)
     # Of several disturbances one may vanish, where its logarithm runs off: each by itself.
     noises = (at >= len(layout.of_interest)) & (
         at < len(layout.of_interest) + len(layout.disturbance)
     )
     reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
-    reach = jnp.asarray(reach, z0.dtype)
-    one, none = jnp.ones((), z0.dtype), jnp.zeros((), z0.dtype)
-    return Constants(z0, units, tikhonov, jnp.asarray(mask), reach, jnp.asarray(True), one, none)
+    return _Kinds(logarithmic.astype(dtype), without_size(layout), mask, reach.astype(dtype))

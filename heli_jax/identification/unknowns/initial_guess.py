@@ -48,7 +48,7 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray)
     """Enter the model's own initial state (of a whole helicopter its hover), or for one that is not
     linear the nearest that shows the measured outputs at the first sample of the window."""
     at, names = layout.first_nuisance, naming.names(layout.model.State)
-    values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
+    values = {n: np.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for i, flight in enumerate(data.flights):
         count, m = layout.windows[i]
         # What is known of this flight alone stands over what is free in all of them.

@@ -146,10 +146,10 @@ class Layout(eqx.Module):
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        states, flights = len(self.states), zip(self.windows, self.outputs, strict=True)
-        return self.first_nuisance + sum(
-            count * states + self.constants(outputs) for (count, _), outputs in flights
-        )
+        windows, flights = sum(count for count, _ in self.windows), len(self.outputs)
+        biases = sum(map(len, self.outputs)) if self.bias else 0
+        of_flights = windows * len(self.states) + biases + flights * len(self.offsets)
+        return self.first_nuisance + of_flights
 
     def constants(self, outputs: tuple[str, ...]) -> int:
         """The biases and input offsets of a flight with these outputs."""

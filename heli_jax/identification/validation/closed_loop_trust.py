@@ -31,6 +31,7 @@ Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole a
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -289,7 +290,7 @@ def _lines(at: Solution) -> _Lines:
             lines = np.fft.rfft(v - v.mean(axis=0), axis=0) / np.sqrt(len(v))
             made.append(lines[1 : 1 + record.lines])
     moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
-    errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
+    errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
     W = [np.asarray(w) for w in noise.whitening]
     by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
     names = list(naming.asdict(data.flights[0].inputs))

@@ -14,6 +14,7 @@ Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System 
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
@@ -173,7 +174,7 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
         at: where a fit by frequency error ended.
     """
     layout, data, noise, z = at
-    errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
+    errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
     sums: dict[str, np.ndarray] = {}
     sizes: dict[int, np.ndarray] = {}
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
