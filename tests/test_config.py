@@ -148,3 +148,18 @@ def test_true_is_no_number(key):
     # YAML writes it without quotes, and Python counts with it as with 1.
     with pytest.raises(InputError, match=r"expected a number, got true$"):
         configuration.load(ROOT / "configs" / "bench-roll.yaml", {key: True})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "got"),
+    [
+        ("fit.starts", "3", "'3'"),
+        ("fit.free.Ixx.start", "1e-4", "'1e-4'"),
+        ("flights.0.rate", "100", "'100'"),
+        ("frequency.band", [0.1, "6"], "'6'"),
+    ],
+)
+def test_text_is_no_number(key, value, got):
+    # The JSON schema refuses it too, so that an editor and a fit say the same.
+    with pytest.raises(InputError, match=rf"a number without quotes, got the text {got}$"):
+        configuration.load(ROOT / "configs" / "bench-roll.yaml", {key: value})

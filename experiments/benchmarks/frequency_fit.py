@@ -114,4 +114,4 @@ def main(runs: int) -> None:
 if __name__ == "__main__":
     from script import Size, asked
 
-    main(asked(__doc__, "two minutes", Size("runs", 5, 1, "fits of each")).runs)
+    main(asked(__doc__, "two minutes", Size("runs", 5, 2, "fits of each")).runs)

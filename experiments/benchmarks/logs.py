@@ -184,8 +184,11 @@ def main() -> None:
     parser.add_argument("--megabytes", type=float, default=50, help="of DataFlash and blackbox")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--only", nargs="+", default=["csv", "parquet", "bin", "bbl"])
+    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.quick:
+        options.minutes, options.megabytes, options.runs = 0.2, 1.0, 1
     if options.child:
         child(options.child[0], Path(options.child[1]))
         return

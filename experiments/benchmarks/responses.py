@@ -109,5 +109,5 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
     from script import Size, asked
 
-    minutes = Size("minutes", 10.0, 1.0, "of the record")
+    minutes = Size("minutes", 10.0, 2.0, "of the record")
     main(asked(__doc__, "some minutes", minutes).minutes)

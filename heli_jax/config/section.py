@@ -1,6 +1,7 @@
 """What every section of a configuration is: frozen, without unknown keys, and of numbers that are
 numbers."""
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidatorFunctionWrapHandler, field_validator
@@ -15,9 +16,27 @@ class Section(BaseModel):
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _true_is_no_number(cls, value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
-        # Python counts with True as with 1, and pydantic makes 1.0 of it.
+    def _a_number_is_written_as_one(cls, value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+        # Python counts with True as with 1, and pydantic makes 1.0 of it and of "1": the JSON
+        # schema, by which an editor checks the file, takes neither.
         made = handler(value)
-        if isinstance(value, bool) and isinstance(made, int | float) and made is not value:
-            raise ValueError(f"expected a number, got {str(value).lower()}")
+        for written, number in _numbers(value, made):
+            if isinstance(written, bool) and number is not written:
+                raise ValueError(f"expected a number, got {str(written).lower()}")
+            if isinstance(written, str):
+                kind = "true or false" if isinstance(number, bool) else "a number"
+                raise ValueError(f"expected {kind} without quotes, got the text {written!r:.60}")
         return made
+
+
+# Any: whatever stands in the file.
+def _numbers(written: Any, made: Any) -> Iterator[tuple[Any, int | float]]:
+    """What a field holds of numbers, each beside what is written for it."""
+    if isinstance(made, int | float):
+        yield written, made
+    elif isinstance(made, Mapping) and isinstance(written, Mapping):
+        for name in made.keys() & written.keys():
+            yield from _numbers(written[name], made[name])
+    elif isinstance(made, list | tuple) and isinstance(written, list | tuple):
+        for each in zip(written, made, strict=False):
+            yield from _numbers(*each)

@@ -12,6 +12,7 @@ from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
+from heli_jax.report.compared_combinations import combinations
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
@@ -58,8 +59,9 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Each parameter's estimate and sd by run, and the differences from the first; in ASCII but
-        for ±, so that a number can be pasted into a vehicle file."""
+        """Each parameter's estimate and sd by run, and those of each combination that a run
+        determines, with the differences from the first; in ASCII but for ±, so that a number can be
+        pasted into a vehicle file."""
         return self._estimates(rounded, str)
 
     @property
@@ -82,8 +84,9 @@ class ComparedRuns(NamedTuple):
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows = []
-        for name in _in_order(run.estimates for run in self.runs):
-            estimates = [run.estimates.get(name) for run in self.runs]
+        of_runs = self._by_run()
+        for name in _in_order(of_runs):
+            estimates = [of_run.get(name) for of_run in of_runs]
             units = {e.unit for e in estimates if e is not None}
             cells = [
                 _measured(e, pair, shown_unit if len(units) > 1 else None, arrived=_arrived(run))
@@ -96,6 +99,11 @@ class ComparedRuns(NamedTuple):
             apart = [_difference(there[0], other) for other in there[1:]]
             rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
+
+    def _by_run(self) -> list[dict[str, Estimate]]:
+        """Each run's estimates, then the combinations that one of the runs determines."""
+        pairs = zip(self.runs, combinations(self.runs), strict=True)
+        return [{**run.estimates, **of_run} for run, of_run in pairs]
 
     @property
     def agreement(self) -> Table:
@@ -149,11 +157,11 @@ class ComparedRuns(NamedTuple):
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Long: a row for each run and parameter; NaN where the data do not determine it or
-        the fit did not converge."""
+        """Long: a row for each run and parameter, and for each combination that a run determines;
+        NaN where the data do not determine it or the fit did not converge."""
         from heli_jax.exports import runs_frame
 
-        estimates = [_usable(run) for run in self.runs]
+        estimates = self._usable()
         return runs_frame(dict(zip(self.labels, estimates, strict=True)))
 
     def to_csv(self) -> str:
@@ -162,8 +170,8 @@ class ComparedRuns(NamedTuple):
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["run", "parameter", "value", "sd", "lower95", "upper95", "unit"])
-        for label, run in zip(self.labels, self.runs, strict=True):
-            for name, e in _usable(run).items():
+        for label, estimates in zip(self.labels, self._usable(), strict=True):
+            for name, e in estimates.items():
                 known = e.sd is not None
                 numbers = (e.value, e.sd, e.lower95, e.upper95) if known else ("",) * 4
                 writer.writerow([label, name, *numbers, e.unit])
@@ -183,6 +191,14 @@ class ComparedRuns(NamedTuple):
             r"\end{tabular}",
         ]
         return "\n".join(lines) + "\n"
+
+    def _usable(self) -> list[dict[str, Estimate]]:
+        """By run what `_by_run` has, without intervals where the optimiser stopped on its way."""
+        none = {"sd": None, "lower95": None, "upper95": None}
+        return [
+            of_run if _arrived(run) else {name: e._replace(**none) for name, e in of_run.items()}
+            for run, of_run in zip(self.runs, self._by_run(), strict=True)
+        ]
 
     def _summary(self) -> Summary:
         head, rows = self.estimates
@@ -240,14 +256,6 @@ def method_of(run: SavedFit) -> str:
 
 def _arrived(run: SavedFit) -> bool:
     return run.status != "not-converged"
-
-
-def _usable(run: SavedFit) -> dict[str, Estimate]:
-    """The estimates, without intervals where the optimiser stopped on its way."""
-    if _arrived(run):
-        return run.estimates
-    none = {"sd": None, "lower95": None, "upper95": None}
-    return {name: e._replace(**none) for name, e in run.estimates.items()}
 
 
 def _measured(

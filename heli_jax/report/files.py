@@ -86,6 +86,7 @@ def fit_json(
                 **content.fixed(problem),
                 **{n: content.parameter(e, fit.status) for n, e in fit.estimates.items()},
             },
+            "constants": content.constants(fit, problem),
             "nuisance": {n: content.parameter(e, fit.status) for n, e in fit.nuisance.items()},
             "noise_sd": fit.noise,
             **content.metrics(fit),

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import numpy as np
+
+from heli_jax import naming
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
@@ -209,6 +212,14 @@ def fixed(problem: Problem) -> dict[str, Any]:
         n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True}
         for n in sorted(names)
     }
+
+
+def constants(fit: Fit, problem: Problem) -> dict[str, float]:
+    """The vehicle's numbers that the fit took as known [SI]: those that no flight replaces."""
+    others = {*fit.estimates, *fit.nuisance, *fixed(problem)}
+    params = {n: np.asarray(v) for n, v in naming.asdict(fit.params).items() if n not in others}
+    # A model of a user's own may have parameters that are no single numbers.
+    return {n: float(v) for n, v in params.items() if v.size == 1 and v.dtype.kind in "fiu"}
 
 
 def combinations(verdict: Verdict) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ _FILES = ("config.yaml", "summary.json", "figures/")
 _DIGITS = 4
 _KINDS = {
     "slices": ("{} against each axis", "dots, and the median with a 5 to 95 % band"),
-    "maps": ("{} over pairs of axes", "its median in each cell"),
+    "maps": ("{} over pairs of axes", "colours: median of the elements in each cell"),
 }
 """by what a figure's file begins with: its title, and what it draws"""
 _OTHERS = {

@@ -112,6 +112,14 @@ def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
         assert window.value("document.querySelectorAll('figure.drawn > img').length") >= 2
         hidden = "[...document.querySelectorAll('figure.drawn > img')].every(i => !i.offsetWidth)"
         assert window.value(hidden)
+    # Where a table is wider than the page, which scrolls it, the page says so until its end.
+    window.open(report)
+    table = "document.querySelector('[aria-label=Estimates]')"
+    more = f"{table}.classList.contains('more')"
+    window.until(f"{more} === ({table}.scrollWidth > {table}.clientWidth + 2)")
+    assert window.value(more) == (width == 400)
+    window.value(f"{table}.scrollLeft = 9999")
+    window.until(f"!{more}")
 
 
 def test_zoom_and_hover_move_all_time_histories_together(window, report):

@@ -68,6 +68,12 @@
     bar.append(said);
     table.parentElement.after(bar);
   }
+  // On a telephone a table or an image may be wider than the page: it is said where more of it is.
+  const wides = document.querySelectorAll(".wide, figure");
+  const look = e => e.classList.toggle("more", e.scrollWidth - e.clientWidth - e.scrollLeft > 2);
+  for (const e of wides) e.addEventListener("scroll", () => look(e), { passive: true });
+  const sizes = new ResizeObserver(entries => entries.forEach(entry => look(entry.target)));
+  for (const e of wides) sizes.observe(e);
   window.heliTables = { csv, tex };
 
   let closed = [];

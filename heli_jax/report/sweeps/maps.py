@@ -68,7 +68,7 @@ def draw_maps(table: Table, result: str) -> Figure | None:
     if mesh is not None:
         _colour_bar(figure, panels, mesh, z, medians)
     head(panels[0], z.title(), table, [
-        "median of each cell", *marked(table), *not_finite(table, z),
+        "colour: median of the elements in each cell", *marked(table), *not_finite(table, z),
         *first(len(pairs), len(every), "pairs of axes"),
     ])  # fmt: skip
     return figure

@@ -23,6 +23,8 @@ _WORDS = {
 _NO_RESULT = "the parameters that it hangs on are not determined, or no optimum was reached."
 _HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
 """what the terminal shows"""
+_AS_READ = {"s": ("ms", 1e3)}
+"""by SI unit the one that is shown, and how many make it: delays are milliseconds"""
 
 
 def handling(entries: Sequence[Handling]) -> Table:
@@ -36,7 +38,7 @@ def handling(entries: Sequence[Handling]) -> Table:
     for entry in entries:
         for name in NUMBERS[entry.pair.kind]:
             cells = (_cell(getattr(entry, s), name) for s in sources)
-            rows.append((entry.pair.words, _WORDS[name], *cells, UNITS[name]))
+            rows.append((entry.pair.words, _WORDS[name], *cells, _unit(name)[0]))
     return Table(("response", "", *sources, "unit"), rows)
 
 
@@ -50,11 +52,16 @@ def _cell(of: HandlingQualities | str | None, name: str) -> str:
         return NOT_DETERMINED
     # Pilots' criteria count in rad/s, rotors and filters in Hz.
     hz = f", {number(value.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
-    return _shown(value) + hz
+    return _shown(value, _unit(name)[1]) + hz
 
 
-def _shown(n: Number) -> str:
-    return f"{number(n.value, 3)} ({number(n.lower95, 3)} to {number(n.upper95, 3)})"
+def _unit(name: str) -> tuple[str, float]:
+    return _AS_READ.get(UNITS[name], (UNITS[name], 1.0))
+
+
+def _shown(n: Number, times: float) -> str:
+    value, low, high = (number(times * v, 3) for v in (n.value, n.lower95, n.upper95))
+    return f"{value} ({low} to {high})"
 
 
 def handling_sentences(entries: Sequence[Handling]) -> list[str]:
@@ -83,6 +90,6 @@ def handling_lines(entries: Sequence[Handling]) -> list[str]:
         for name in _HEADLINES:
             if name in NUMBERS[entry.pair.kind]:
                 cells = ", ".join(f"{s} {_cell(getattr(entry, s), name)}" for s in sources)
-                parts.append(f"{_WORDS[name]} [{UNITS[name]}] {cells}")
+                parts.append(f"{_WORDS[name]} [{_unit(name)[0]}] {cells}")
         lines.append(f"{entry.pair.words}: {'; '.join(parts)}")
     return lines
