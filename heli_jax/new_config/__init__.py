@@ -18,6 +18,7 @@ from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
+from heli_jax.new_config.unread import unread_notes
 from heli_jax.numerics.white_noise import wanders, without_noise
 from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
@@ -111,6 +112,11 @@ def write_config(
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
         notes.append(f"{words}: name the stick's, which no rate or angle is")
+    if signals is not None:
+        absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
+        absent = [n for n in absent if n not in signals.wandering]
+        called = {n: _called_output(n) for n in absent} | {n: _called_input(n) for n in lacking}
+        notes += unread_notes((*lacking, *absent), called, read.unread)
     if others:
         assert isinstance(chosen.name, dict)
         notes.append(
@@ -258,9 +264,8 @@ def _signals(model: Any, log: Log) -> text.Signals:
     taken += excitations.values()
     outputs: dict[str, Guess] = {}
     for name in naming.names(model.Outputs):
-        signal = model_outputs().get(name, name)
-        known, unit = called["outputs"].get(signal, []), naming.unit(model.Outputs, name) or "1"
-        output = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
+        unit = naming.unit(model.Outputs, name) or "1"
+        output = _found(log, _outputs(log, _called_output(name), unit), unit, taken)
         if output is not None:
             outputs[name] = output
     # What an output follows is the better reason where one input makes it move.
@@ -297,6 +302,22 @@ def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, 
         for angle, rate in _only_turn(model).items()
         if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
     }
+
+
+def _called_output(name: str) -> list[str]:
+    """What people call an output of a model, words by blanks."""
+    return [_own(name), *_names()["outputs"].get(model_outputs().get(name, name), [])]
+
+
+def _called_input(name: str) -> list[str]:
+    """What people call an input of a model, words by blanks."""
+    own, called = model_inputs().get(name), _names()
+    if own is None:
+        return [_own(name)]
+    if name == "Omega":
+        return [_own(name), *called["rotor_speed"]]
+    stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+    return [_own(name), *called["inputs"][stick]]
 
 
 def _own(name: str) -> str:
