@@ -61,7 +61,7 @@ class ClockParts(NamedTuple):
         """
         seconds = np.zeros(next(iter(columns.values())).size)
         # The finest first, of which digits would be lost beside a large one.
-        for name, scale in reversed(self.scales.items()):
+        for name, scale in reversed(list(self.scales.items())):
             seconds = seconds + scale * columns[name]
         if self.date:
             return seconds + _DAY * _days([columns[name] for name in self.date])

@@ -159,7 +159,7 @@ def _of_spans(cells: Sequence[str]) -> Dates | int:
     seconds = np.empty(len(cells))
     for i, cell in enumerate(cells):
         match = _SPAN.fullmatch(cell)
-        time = _seconds(*match.groups()[1:], None) if match else None
+        time = _seconds(match[2], match[3], match[4], None) if match else None
         if match is None or time is None:
             return i
         seconds[i] = _DAY * int(match[1]) + time

@@ -55,6 +55,7 @@ def test_parts_of_a_clock_are_one_over_minutes_and_midnight(tmp_path, names, for
     flight = read_flight(path, time=clock, inputs=one[0], outputs=one[1])
     assert flight.dt == pytest.approx(DT)
     np.testing.assert_allclose(flight.outputs["p"], P, atol=1e-6)
+    assert flight.source is not None
     assert any("taken" in note for note in flight.source.notes)
 
 
