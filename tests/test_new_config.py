@@ -537,6 +537,8 @@ def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
     # P beside p: the one that is called as in the model.
     text = (tmp_path / "c.yaml").read_text()
     assert "p: {signal: p, unit: rad/s}" in text
+    # What no line makes free is another machine's.
+    assert "    # tau_f: {start: 0.04631}" in text
     log.write_text("\n".join(["time,aileron,p,p,roll,mode", *rows]) + "\n")
     written = write_config(log, tmp_path / "d.yaml", model="linear:roll-flybarless")
     assert "p may be the column 'p', which is the name of several columns" in " ".join(

@@ -92,7 +92,8 @@ def write_config(
         preset=preset,
         signals=signals,
         vehicle=place,
-        free=_free(chosen, constants, paths),
+        free=(free := _free(chosen, constants, paths)),
+        held={} if place is not None else _held(chosen, free),
         rate=_rate(read, used, signals),
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=tuple(_only_turn(chosen.model).values()),
@@ -443,3 +444,14 @@ def _free(
     values = {n: c.value for n, c in own.items()} | dict(constants)
     # Gravity is known, whatever a model's file calls free.
     return {n: values.get(n, EDIT) for n in listed.get(file, known) if n not in _GRAVITY}
+
+
+def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters of a linear model that stay at another machine's values, but for those of what
+    is left out, which are zero."""
+    if not chosen.linear:
+        return {}
+    assert isinstance(chosen.name, dict)
+    own = linear_models.linear_model(chosen.name["linear"]).vehicle().constants
+    values = {name: constant.value for name, constant in own.items()}
+    return {n: v for n, v in values.items() if v and n not in free and n not in _GRAVITY}
