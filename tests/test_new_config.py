@@ -22,6 +22,7 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
+from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 
 T = np.arange(0.0, 20.0, 0.02)
@@ -544,3 +545,21 @@ def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
     assert "p may be the column 'p', which is the name of several columns" in " ".join(
         written.notes
     )
+
+
+def test_a_latitude_is_no_lateral_stick() -> None:
+    t = 0.1 * np.arange(100)
+
+    def log(**values: np.ndarray) -> dict[str, Series]:
+        return {name.replace("__", "."): Series(t, x) for name, x in values.items()}
+
+    stick = 0.3 * np.sin(t)
+    places = log(AHR2__Lat=stick, AHR2__Lng=stick, gps_lat=51.4 + 1e-3 * stick, lat=stick)
+    assert [name for name in places if is_place(name, places)] == [
+        "AHR2.Lat",
+        "AHR2.Lng",
+        "gps_lat",
+    ]
+    sticks = log(lat=stick, lon=0.2 + stick, rc__lat=1500 + 5 * stick, rc__lon=1500 + 0 * stick)
+    assert not [name for name in sticks if is_place(name, sticks)]
+    assert is_place("lat", log(lat=514234567 + 900 * stick))

@@ -17,6 +17,7 @@ from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
+from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.unread import unread_notes
 from heli_jax.numerics.white_noise import wanders, without_noise
@@ -207,7 +208,8 @@ def _by_name(stated: str) -> Any:
 
 def _by_what_moves(log: Log, path: str) -> str:
     """The linear model of the axis whose stick moves most, of those whose motion is logged."""
-    names, called = tuple(log.series), _names()
+    called = _names()
+    names = tuple(n for n in log.series if not is_place(n, log.series))
     moving = {}
     for stick, (model, measured) in _AXES.items():
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
@@ -248,7 +250,7 @@ def _signals(model: Any, log: Log) -> text.Signals:
     inputs: dict[str, Guess | None] = {}
     numbered: dict[str, list[str]] = {}
     excitations: dict[str, str] = {}
-    sticks = [n for n in log.series if not guess.is_excitation(n)]
+    sticks = [n for n in log.series if not (guess.is_excitation(n) or is_place(n, log.series))]
     for name in naming.names(model.Inputs):
         own = model_inputs().get(name)
         known = called["rotor_speed"] if name == "Omega" else []
@@ -397,7 +399,7 @@ def _by_correlation(
             for n, s in log.series.items()
             if n not in {*taken, *measured}
             and guess.may_move(n, s, si)
-            and not guess.is_excitation(n)
+            and not (guess.is_excitation(n) or is_place(n, log.series))
             and np.nanstd(s.values) > 0
         }
         best = guess.by_motion(log.series[known[-1]], left)
