@@ -21,6 +21,7 @@ milli- = 1e-3 = m-
 micro- = 1e-6 = u- = µ-
 nano- = 1e-9 = n-
 centi- = 1e-2 = c-
+hecto- = 100 = h-
 kilo- = 1e3 = k-
 mega- = 1e6 = M-
 meter = [length] = m = metre
@@ -51,6 +52,7 @@ mile = 1609.344 * meter = mi
 knot = nautical_mile / hour = kt = kn
 joule = newton * meter = J
 ampere = [current] = A
+kelvin = [temperature] = K
 volt = watt / ampere = V
 ohm = volt / ampere
 henry = volt * second / ampere = H
@@ -120,8 +122,17 @@ def _is_known(name: str) -> bool:
     return bool(meanings)
 
 
+_FROM_ANOTHER_ZERO = {
+    **dict.fromkeys(("degC", "°C", "Celsius", "celsius"), "offset: -273.15, unit: K"),
+    **dict.fromkeys(("degF", "°F", "Fahrenheit"), "offset: -459.67, scale: 0.5556, unit: K"),
+}
+
+
 def _unknown(unit: str, text: str) -> str:
     """What to say of a unit that cannot be read: the name that is wrong, and what is near it."""
+    if text in _FROM_ANOTHER_ZERO:
+        remedy = _FROM_ANOTHER_ZERO[text]
+        return f"unit {text!r} counts from another zero than K; of a signal state {remedy}"
     wrong, place = text[:60], ""
     if len(text) <= 60 and _UNIT.fullmatch(text):
         names = _unknown_names(text.replace("%", "percent").replace("°", "degree"))
@@ -220,6 +231,7 @@ _SI = [
     "J",
     "N*m/A",
     "N*m*s/rad",
+    "K",
 ]
 
 
@@ -254,11 +266,14 @@ _COMMON_KINDS = {
     "1/s^2": {"s": -2},
 }
 """exponents of base units, as of `base_of`"""
-_BASE = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad", "[current]": "A"}
+_BASE = {
+    **{"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad", "[current]": "A"},
+    "[temperature]": "K",
+}
 
 
 def base_of(unit: str) -> dict[str, int]:
-    """The exponents of kg, m, s, rad and A in a unit of any kind, those that are not zero.
+    """The exponents of kg, m, s, rad, A and K in a unit of any kind, those that are not zero.
 
     Raises:
         ValueError: the unit is unknown.
@@ -281,7 +296,7 @@ def is_unit(unit: str) -> bool:
 
 
 def as_text(exponents: Mapping[str, int]) -> str:
-    """The SI unit with these exponents of kg, m, s, rad and A: `kg m^2/s^2`."""
+    """The SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2/s^2`."""
 
     def power(unit: str, n: int) -> str:
         return unit if n == 1 else f"{unit}^{n}"
@@ -320,6 +335,7 @@ _KINDS = {
     "kg m^2": "a moment of inertia",
     "A": "a current",
     "V": "a voltage",
+    "K": "a temperature",
     "1": "a plain number",
 }
 

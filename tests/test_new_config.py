@@ -10,7 +10,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
-from heli_jax.new_config import _names, guess
+from heli_jax.new_config import _names, guess, write_config
 from heli_jax.new_config.guess import (
     Series,
     by_motion,
@@ -22,6 +22,7 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
+from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 
 T = np.arange(0.0, 20.0, 0.02)
@@ -519,3 +520,46 @@ def test_counts_of_a_converter_are_no_degrees() -> None:
     heading = Series(T, np.rint(200 + 90 * np.sin(3 * T)))
     assert guess.scaled("heading", heading, "rad").unit == "deg"
     assert guess.scaled("headspeed", counts, "rad/s").scale == 1.0
+
+
+def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
+    tmp_path: Path,
+) -> None:
+    t = 0.01 * np.arange(400)
+    u, p = np.sign(np.sin(3 * t)), np.cos(3 * t)
+    cells = zip(t, u, p, strict=True)
+    rows = [f"{a:.2f},{b:.4f},{c:.4f},{7 * c:.4f},{c:.4f} deg,{b}" for a, b, c in cells]
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join(["time,aileron,p,P,roll,mode", *rows]) + "\n")
+    written = write_config(log, tmp_path / "c.yaml", model="linear:roll-flybarless")
+    said = " ".join(written.notes)
+    assert "phi may be the column 'roll', which holds no numbers alone" in said
+    assert "mode" not in said
+    # P beside p: the one that is called as in the model.
+    text = (tmp_path / "c.yaml").read_text()
+    assert "p: {signal: p, unit: rad/s}" in text
+    # What no line makes free is another machine's.
+    assert "    # tau_f: {start: 0.04631}" in text
+    log.write_text("\n".join(["time,aileron,p,p,roll,mode", *rows]) + "\n")
+    written = write_config(log, tmp_path / "d.yaml", model="linear:roll-flybarless")
+    assert "p may be the column 'p', which is the name of several columns" in " ".join(
+        written.notes
+    )
+
+
+def test_a_latitude_is_no_lateral_stick() -> None:
+    t = 0.1 * np.arange(100)
+
+    def log(**values: np.ndarray) -> dict[str, Series]:
+        return {name.replace("__", "."): Series(t, x) for name, x in values.items()}
+
+    stick = 0.3 * np.sin(t)
+    places = log(AHR2__Lat=stick, AHR2__Lng=stick, gps_lat=51.4 + 1e-3 * stick, lat=stick)
+    assert [name for name in places if is_place(name, places)] == [
+        "AHR2.Lat",
+        "AHR2.Lng",
+        "gps_lat",
+    ]
+    sticks = log(lat=stick, lon=0.2 + stick, rc__lat=1500 + 5 * stick, rc__lon=1500 + 0 * stick)
+    assert not [name for name in sticks if is_place(name, sticks)]
+    assert is_place("lat", log(lat=514234567 + 900 * stick))

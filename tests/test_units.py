@@ -254,3 +254,11 @@ def test_the_kinds_that_need_no_pint_are_those_it_has(monkeypatch):
         assert units.is_unit(unit)
         # In the same order, in which `as_text` writes them.
         assert list(units.base_of(unit).items()) == list(kind.items())
+
+
+def test_temperatures_from_one_zero_are_known_and_others_say_what_to_state() -> None:
+    assert units.factor("mK", "K") == pytest.approx(1e-3)
+    assert units.si_of("K") == "K"
+    assert units.base_of("J/K") == {"kg": 1, "m": 2, "s": -2, "K": -1}
+    with pytest.raises(ValueError, match=r"another zero than K; .* offset: -273.15"):
+        units.factor("degC", "K")

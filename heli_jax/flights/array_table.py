@@ -13,6 +13,7 @@ import numpy as np
 
 from heli_jax.flights import hdf5_texts, mat_file, packed
 from heli_jax.flights.mat_labels import labelled
+from heli_jax.flights.mat_references import References
 from heli_jax.flights.named_columns import NamedColumns, as_lists
 from heli_jax.flights.table import (
     Survey,
@@ -225,6 +226,7 @@ class DataSets:
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._notes: list[str] = []
+        self.references = References()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -258,14 +260,20 @@ class DataSets:
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
         """All of them."""
         notes = packed.notes_of(self._scaled, self._missing, self._left_out)
-        named = NamedColumns(self._stored, self._texts)
+        paths = {name: self.references.path(name) for name in self._stored}
+        whole = labelled(
+            {paths[name]: values for name, values in self._stored.items()}, self.references.texts
+        )
+        stated = {paths[name]: unit for name, unit in self._units.items()} | whole.units
+        named = NamedColumns(whole.arrays, self._texts)
         arrays, units = {}, {}
-        for name, values in self._stored.items():
+        for name, values in whole.arrays.items():
             for i, (part, vector) in enumerate(_vectors(name, values)):
                 called = named.name(name, i) or part
                 arrays[called] = vector
-                units[called] = named.unit(name, i) or self._units[name]
-        return ArrayTable(path, kind, data, arrays, units, (*notes, *self._notes, *named.notes))
+                units[called] = named.unit(name, i) or stated.get(name, "")
+        said = (*notes, *self._notes, *whole.notes, *named.notes)
+        return ArrayTable(path, kind, data, arrays, units, said)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -303,7 +311,12 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
             if (texts := hdf5_texts.list_of(item)) is not None:
                 read.add_texts(dotted, texts)
                 return
-            if not holds_numbers(item.dtype, item.ndim) or hdf5_texts.is_text(item):
+            if kind == "mat 7.3":
+                read.references.add(dotted, item)
+            if hdf5_texts.is_text(item):
+                read.references.add_letters(dotted, item)
+                return
+            if not holds_numbers(item.dtype, item.ndim):
                 return
             if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
                 return

@@ -9,12 +9,14 @@ from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.runs import restarts
 from heli_jax.flights.table import Survey, Table, shown
-from heli_jax.flights.time_units import likely_unit, split_unit
+from heli_jax.flights.time_units import LETTERS, likely_unit, split_unit, time_unit
 
 TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 _STAMP = ("header", "stamp")
-_ARRIVALS = ("%time", "__time", "rosbagTimestamp", "Time")
-"""as tools for logs of ROS call the column of arrival"""
+_SAMPLED = "timestamp_sample"
+"""of a topic of PX4, beside `timestamp`, when it was published"""
+_ARRIVALS = ("%time", "__time", "rosbagTimestamp", "Time", "timestamp")
+"""as tools for logs of ROS and of PX4 call the column of arrival"""
 _COUNTERS = {
     *(
         "frame",
@@ -95,8 +97,9 @@ def arrival_notes(clock: str, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_of_sample(name: str) -> bool:
-    """Whether a path ends in the stamp of a message's header: field.header.stamp."""
-    return tuple(re.split(r"[./]", name.casefold())[-2:]) == _STAMP
+    """Whether a path ends in the stamp of a sample: field.header.stamp, timestamp_sample."""
+    *_, last = path = tuple(re.split(r"[./]", name.casefold()))
+    return path[-2:] == _STAMP or last == _SAMPLED
 
 
 def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:
@@ -144,8 +147,15 @@ def _by_name(name: str) -> bool:
     return is_numbered or bool(_COUNTERS & set(words_in(name)))
 
 
+def _unit_alone(name: str) -> str:
+    """The unit of time that is all of a name, as `ms` and `minutes`; empty of seconds, which clocks
+    of any unit are called."""
+    unit = time_unit(name) or ""
+    return "" if unit == "s" or name.casefold() in LETTERS else unit
+
+
 def _with_unit(table: Table, name: str, stamps: np.ndarray) -> tuple[Signal, bool]:
-    stated = table.time_unit(name) or split_unit(name)[1]
+    stated = table.time_unit(name) or split_unit(name)[1] or _unit_alone(name)
     if stated:
         return Signal(name, stated, "s"), False
     return Signal(name, likely_unit(stamps), "s"), True

@@ -23,6 +23,8 @@ _DATE = re.compile(rf"(?P<date>{_DAYS})(?:T|,?\s+){_CLOCK}{_ZONE}")
 _DATE_MINUTES = re.compile(rf"(?P<date>{_DAYS})(?:T|,?\s+)(\d{{1,2}}):(\d\d){_ZONE}")
 _DATE_ALONE = re.compile(_DAYS)
 _TIME_OF_DAY = re.compile(_CLOCK)
+_SPAN = re.compile(r"(\d{1,5}) ?(?:days?|d),? +(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,12})?)")
+"""0 days 00:00:01.25, as pandas and Python write what has passed"""
 _MINUTES = re.compile(r"(\d{1,3}):(\d\d[.,]\d{1,12})")
 _COUNT = re.compile(r"([+-]?\d*[.,]?\d+(?:[eE][+-]?\d+)?)\s*([A-Za-zµμ]+)")
 _MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
@@ -42,7 +44,7 @@ def is_date(cell: str) -> bool:
     """Whether a cell is a date with a time of day, a time of day, or a time with its unit."""
     if len(cell) > _LONGEST:
         return False
-    known = (_DATE, _DATE_MINUTES, _TIME_OF_DAY, _MINUTES)
+    known = (_DATE, _DATE_MINUTES, _TIME_OF_DAY, _MINUTES, _SPAN)
     return any(form.fullmatch(cell) for form in known) or _unit_of_count(cell) is not None
 
 
@@ -80,6 +82,8 @@ def seconds_of_dates(
         read = functools.partial(_of_clocks, days=beside)
     elif _MINUTES.fullmatch(first):
         read = _of_minutes
+    elif _SPAN.fullmatch(first):
+        read = _of_spans
     else:
         read = _of_counts
     dates = read([cells[i] or "" for i in filled])
@@ -149,6 +153,17 @@ def _of_minutes(cells: Sequence[str]) -> Dates | int:
             return i
         seconds[i] = 60.0 * int(match[1]) + float(match[2].replace(",", "."))
     return Dates(_going_on(seconds, _HOUR), "times are taken as minutes and seconds, MM:SS.s")
+
+
+def _of_spans(cells: Sequence[str]) -> Dates | int:
+    seconds = np.empty(len(cells))
+    for i, cell in enumerate(cells):
+        match = _SPAN.fullmatch(cell)
+        time = _seconds(match[2], match[3], match[4], None) if match else None
+        if match is None or time is None:
+            return i
+        seconds[i] = _DAY * int(match[1]) + time
+    return Dates(seconds)
 
 
 def _of_counts(cells: Sequence[str]) -> Dates | int:

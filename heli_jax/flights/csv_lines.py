@@ -10,7 +10,7 @@ from heli_jax.flights.csv_dates import is_date, is_day
 from heli_jax.flights.csv_fortran import parted
 from heli_jax.flights.csv_text import Line
 
-_NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
+_NUMBER = re.compile(r"[+\u2212-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
 """with any decimal sign, and with marks between thousands"""
 
 

@@ -67,6 +67,12 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     return at & (far | (other_sign & _is_one_of(_DECIMAL, numbers)))
 
 
+def infinite(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Which values (N,) of an output are infinite where the log's numbers (N,) are no marks, `inf`
+    being one as 1e10 is."""
+    return np.isinf(values) & ~at_marks(numbers)
+
+
 def is_absurd(numbers: np.ndarray) -> np.ndarray:
     """Which of the numbers (N,) of a log nothing measures, whatever their unit."""
     with np.errstate(invalid="ignore"):

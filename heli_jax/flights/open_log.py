@@ -146,7 +146,8 @@ def _reader(path: Path) -> _Reader:
     # What such a file begins with is the user's own text, which may look like the mark of any
     # other; but an autopilot's log may have been given the name of a table.
     if ending in (".csv", ".tsv"):
-        return marked if marked is not None and head.startswith(_AUTOPILOTS) else open_csv
+        of_autopilot = head.startswith(_AUTOPILOTS) or _is_exported(head)
+        return marked if marked is not None and of_autopilot else open_csv
     # Arrays go by their ending, since MATLAB 7.3, NetCDF 4 and HDF5 files hold the same mark.
     if marked is not None and ending not in _ARRAYS:
         return marked
@@ -194,6 +195,11 @@ def _by_content(head: bytes) -> _Reader | None:
     if dataflash_text.is_dataflash_text(head):
         return _one(dataflash_text.open_dataflash_text)
     return None
+
+
+def _is_exported(head: bytes) -> bool:
+    """Whether a text begins with the formats of a DataFlash log, as no table does."""
+    return head.lstrip().startswith(b"FMT,") and dataflash_text.is_dataflash_text(head)
 
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:

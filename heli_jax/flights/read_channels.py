@@ -13,7 +13,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import Marked
+from heli_jax.flights.marks import Marked, infinite
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -149,9 +149,11 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
             clocks[topic] = topic_clock(log.path, topic, elapsed, request.options.window)
         clock = clocks[topic]
         with np.errstate(over="ignore"):  # what overflows is refused below
-            values = signal.to_si(values[clock.rows])
+            numbers = values[clock.rows]
+            values = signal.to_si(numbers)
         # An output may be missing here and there; a stick is somewhere all the time.
-        bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
+        bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
+        bad = np.flatnonzero(bad)
         if bad.size:
             at = f"channel {shown(signal.name)}"
             problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"

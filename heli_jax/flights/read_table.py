@@ -29,7 +29,7 @@ from heli_jax.flights.holds import Decision
 from heli_jax.flights.joined import joined_log
 from heli_jax.flights.known_inputs import rows_of_known_inputs
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import Marked
+from heli_jax.flights.marks import Marked, infinite
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -296,9 +296,11 @@ def _to_si(
     samples = {}
     for (key, kind), signal in request.signals.items():
         with np.errstate(over="ignore"):  # what overflows is refused below, with its line
-            values = signal.to_si(numbers[signal.name][rows])
+            logged = numbers[signal.name][rows]
+            values = signal.to_si(logged)
         # An output may be missing here and there; a stick is somewhere all the time.
-        bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
+        bad = infinite(values, logged) if kind == "output" else ~np.isfinite(values)
+        bad = np.flatnonzero(bad)
         if bad.size:
             row = rows.start + int(bad[0])
             problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"

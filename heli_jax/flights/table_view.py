@@ -1,31 +1,13 @@
-"""A table with fewer rows, or with a clock that its file has in two columns."""
+"""A table with fewer rows, or with a clock that its file has in several columns."""
 
 import dataclasses
-import re
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights.clock_parts import ClockParts, CompactClock, clock_parts
 from heli_jax.flights.table import Survey, Table, shown
-from heli_jax.flights.time_units import SECONDS, time_unit
-
-_PARTS = re.compile(r"(.*?)([A-Za-z]+)")
-_CLOCKS = ("time", "timestamp", "zeit")
-
-
-class _Clock(NamedTuple):
-    """A clock of whole seconds in one column and of what is left of them in another."""
-
-    name: str
-    whole: str
-    rest: str
-    scale: float
-    """[s] of the second column's unit"""
-
-    def joined(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        return columns[self.whole] + self.scale * columns[self.rest]
 
 
 class TableView:
@@ -35,7 +17,7 @@ class TableView:
         self,
         table: Table,
         rows: np.ndarray | None = None,
-        clock: _Clock | None = None,
+        clock: ClockParts | CompactClock | None = None,
         note: str = "",
     ) -> None:
         """
@@ -64,11 +46,11 @@ class TableView:
         clock = self._clock
         needed = [n for n in names if clock is None or n != clock.name]
         if clock is not None and clock.name in names:
-            needed += [clock.whole, clock.rest]
+            needed += clock.columns
         columns = self.table.numbers(list(dict.fromkeys(needed)))
         self.notes = self._all_notes()
         if clock is not None and clock.name in names:
-            columns[clock.name] = clock.joined(columns)
+            columns[clock.name] = clock.seconds(columns)
         return {n: columns[n] if self._rows is None else columns[n][self._rows] for n in names}
 
     def survey(self) -> list[Survey]:
@@ -77,7 +59,7 @@ class TableView:
         self.notes = self._all_notes()
         if self._clock is not None:
             values = {s.name: s.values for s in surveys if s.values is not None}
-            times = self._clock.joined(values)
+            times = self._clock.seconds({n: values[n] for n in self._clock.columns})
             surveys = [Survey(self._clock.name, times, times.size), *surveys]
         return surveys if self._rows is None else [_of_rows(s, self._rows) for s in surveys]
 
@@ -179,46 +161,24 @@ def numbers_once(
 
 
 def with_joined_clock(table: Table) -> Table:
-    """A table with a clock in front of its columns, where two of them make one: `secs` and `nsecs`
-    of ROS, or a time of day in whole seconds beside milliseconds.
+    """A table with a clock in front of its columns, where several of them make one: `secs` and
+    `nsecs` of ROS, a time of day in whole seconds beside milliseconds, or hours, minutes, seconds.
 
     Args:
         table: of rows.
     """
-    clock = _two_columns(table.names)
+    clock = clock_parts(table.names)
     if clock is None:
         return table
     try:
-        columns = table.numbers([clock.whole, clock.rest])
+        columns = table.numbers(clock.columns)
     # What is wrong with them is told to whom asks for them.
     except InputError:
         return table
-    whole, rest = columns[clock.whole], columns[clock.rest]
-    with np.errstate(invalid="ignore"):
-        parts = whole.size > 1 and bool(
-            np.all(whole == np.rint(whole))
-            and np.all((rest >= 0) & (rest * clock.scale < 1.0))
-            and np.any(np.diff(whole) == 0)
-        )
-    if not parts:
+    if not clock.fits(columns):
         return table
-    note = f"{shown(clock.whole)} and {shown(clock.rest)} are taken as one clock"
+    *first, last = map(shown, clock.columns)
+    note = f"{', '.join(first)} and {last} are taken as one clock"
+    if not first:
+        note = f"{last} is taken for hours, minutes and seconds in one number, HHMMSS"
     return TableView(table, clock=clock, note=note)
-
-
-def _two_columns(names: Sequence[str]) -> _Clock | None:
-    """Columns whose names are those of seconds and of a part of them, but for these alike."""
-    seconds, parts = {}, []
-    for name in names:
-        match = _PARTS.fullmatch(name)
-        unit = time_unit(match[2]) if match else None
-        if unit == "s" and match:
-            seconds[match[1].casefold()] = name
-        elif name.casefold() in _CLOCKS:
-            seconds.setdefault("", name)
-        elif unit in ("ms", "us", "ns") and match:
-            parts.append((match[1].casefold(), name, SECONDS[unit]))
-    for stem, name, scale in parts:
-        if stem in seconds:
-            return _Clock(f"{seconds[stem]}+{name}", seconds[stem], name, scale)
-    return None

@@ -17,7 +17,9 @@ from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
+from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
+from heli_jax.new_config.unread import unread_notes
 from heli_jax.numerics.white_noise import wanders, without_noise
 from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
@@ -91,7 +93,8 @@ def write_config(
         preset=preset,
         signals=signals,
         vehicle=place,
-        free=_free(chosen, constants, paths),
+        free=(free := _free(chosen, constants, paths)),
+        held={} if place is not None else _held(chosen, free),
         rate=_rate(read, used, signals),
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=tuple(_only_turn(chosen.model).values()),
@@ -111,6 +114,11 @@ def write_config(
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
         notes.append(f"{words}: name the stick's, which no rate or angle is")
+    if signals is not None:
+        absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
+        absent = [n for n in absent if n not in signals.wandering]
+        called = {n: _called_output(n) for n in absent} | {n: _called_input(n) for n in lacking}
+        notes += unread_notes((*lacking, *absent), called, read.unread)
     if others:
         assert isinstance(chosen.name, dict)
         notes.append(
@@ -200,7 +208,8 @@ def _by_name(stated: str) -> Any:
 
 def _by_what_moves(log: Log, path: str) -> str:
     """The linear model of the axis whose stick moves most, of those whose motion is logged."""
-    names, called = tuple(log.series), _names()
+    called = _names()
+    names = tuple(n for n in log.series if not is_place(n, log.series))
     moving = {}
     for stick, (model, measured) in _AXES.items():
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
@@ -241,7 +250,7 @@ def _signals(model: Any, log: Log) -> text.Signals:
     inputs: dict[str, Guess | None] = {}
     numbered: dict[str, list[str]] = {}
     excitations: dict[str, str] = {}
-    sticks = [n for n in log.series if not guess.is_excitation(n)]
+    sticks = [n for n in log.series if not (guess.is_excitation(n) or is_place(n, log.series))]
     for name in naming.names(model.Inputs):
         own = model_inputs().get(name)
         known = called["rotor_speed"] if name == "Omega" else []
@@ -258,9 +267,8 @@ def _signals(model: Any, log: Log) -> text.Signals:
     taken += excitations.values()
     outputs: dict[str, Guess] = {}
     for name in naming.names(model.Outputs):
-        signal = model_outputs().get(name, name)
-        known, unit = called["outputs"].get(signal, []), naming.unit(model.Outputs, name) or "1"
-        output = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
+        unit = naming.unit(model.Outputs, name) or "1"
+        output = _found(log, _outputs(log, _called_output(name), unit), unit, taken)
         if output is not None:
             outputs[name] = output
     # What an output follows is the better reason where one input makes it move.
@@ -297,6 +305,22 @@ def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, 
         for angle, rate in _only_turn(model).items()
         if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
     }
+
+
+def _called_output(name: str) -> list[str]:
+    """What people call an output of a model, words by blanks."""
+    return [_own(name), *_names()["outputs"].get(model_outputs().get(name, name), [])]
+
+
+def _called_input(name: str) -> list[str]:
+    """What people call an input of a model, words by blanks."""
+    own, called = model_inputs().get(name), _names()
+    if own is None:
+        return [_own(name)]
+    if name == "Omega":
+        return [_own(name), *called["rotor_speed"]]
+    stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+    return [_own(name), *called["inputs"][stick]]
 
 
 def _own(name: str) -> str:
@@ -375,7 +399,7 @@ def _by_correlation(
             for n, s in log.series.items()
             if n not in {*taken, *measured}
             and guess.may_move(n, s, si)
-            and not guess.is_excitation(n)
+            and not (guess.is_excitation(n) or is_place(n, log.series))
             and np.nanstd(s.values) > 0
         }
         best = guess.by_motion(log.series[known[-1]], left)
@@ -422,3 +446,14 @@ def _free(
     values = {n: c.value for n, c in own.items()} | dict(constants)
     # Gravity is known, whatever a model's file calls free.
     return {n: values.get(n, EDIT) for n in listed.get(file, known) if n not in _GRAVITY}
+
+
+def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters of a linear model that stay at another machine's values, but for those of what
+    is left out, which are zero."""
+    if not chosen.linear:
+        return {}
+    assert isinstance(chosen.name, dict)
+    own = linear_models.linear_model(chosen.name["linear"]).vehicle().constants
+    values = {name: constant.value for name, constant in own.items()}
+    return {n: v for n, v in values.items() if v and n not in free and n not in _GRAVITY}

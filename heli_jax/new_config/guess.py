@@ -112,6 +112,8 @@ def by_name(
         # those with words behind them that change nothing: ch1_aileron_us.
         core = _without_fillers(words)
         if words in forms:
+            # P beside p: of letters that differ in size alone the one as the model has it.
+            place = -1 if name in called else place
             scored.append((0, forms.index(words), place, name))
         elif any(len(f) < len(words) and words[-len(f) :] == f for f in forms):
             scored.append((1, 0, place, name))

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +40,8 @@ class Log(NamedTuple):
     several: bool
     notes: Sequence[str] = ()
     """what of the log is not looked at"""
+    unread: Mapping[str, str] = MappingProxyType({})
+    """columns of a table that cannot be asked for, and why, in words"""
 
 
 def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
@@ -123,7 +126,19 @@ def _read_table(table: Table, rate: float | None) -> Log:
         listed = ", ".join(map(shown, others[:6]))
         words = shown(clock) if clock != ROWS else "the others"
         notes += (f"left out, since they are not as long as {words}: {listed}",)
-    return Log(table.path, table.format, series, time, None, False, notes)
+    return Log(table.path, table.format, series, time, None, False, notes, _unread(table, info))
+
+
+def _unread(table: Table, info: LogInfo) -> dict[str, str]:
+    """The columns that hold no numbers, or are there twice, and which it is, in words."""
+    reasons = {}
+    for c in info.columns:
+        if table.names.count(c.name) > 1:
+            reasons[c.name] = "is the name of several columns"
+        elif c.kind == "text" and c.count:
+            first = c.strays or f"{c.count} cells of text, such as {table.cell_text(c.name, 0)}"
+            reasons[c.name] = f"holds no numbers alone: {first}"
+    return reasons
 
 
 def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:

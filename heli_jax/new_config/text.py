@@ -67,6 +67,7 @@ def configuration(
     signals: Signals | None,
     vehicle: str | None,
     free: Mapping[str, float | str | None],
+    held: Mapping[str, float],
     rate: float | None = None,
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
@@ -82,6 +83,7 @@ def configuration(
         signals: by the model's names.
         vehicle: the vehicle file, as the configuration names it.
         free: starts by parameter; None at the vehicle's value.
+        held: parameters that stay at the values of the model's own file.
         rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
             those of several topics.
         others: models that fit the signals too, each with what it is for.
@@ -120,6 +122,7 @@ def configuration(
         "  free:                          # what is found, and where the search begins",
     ]
     lines += [_free(name, start) for name, start in free.items()]
+    lines += [_held(name, value) for name, value in held.items()]
     lines += [
         "  # nuisance: {time_shift: true} # where the stick was logged late or early",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
@@ -132,6 +135,11 @@ def _free(name: str, start: float | str | None) -> str:
     if start is None:
         return f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
     return f"    {name}: {{start: {_number(start)}}}"
+
+
+def _held(name: str, value: float) -> str:
+    line = f"    # {name}: {{start: {_number(value)}}}".ljust(33)
+    return f"{line}# stays at this, another machine's; found without the first #"
 
 
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:

@@ -34,7 +34,8 @@ def notes(flight):
 
 
 @pytest.mark.parametrize(
-    "mark", ["", "NaN", "nan", "NA", "N/A", "null", "None", "-", "#N/A", " - "]
+    "mark",
+    ["", "NaN", "nan", "NA", "N/A", "null", "None", "-", "#N/A", " - ", "1.#QNAN", "-1.#IND", "?"],
 )
 def test_marks_for_nothing_are_missing_samples(tmp_path, mark):
     rows = ROWS.copy()
@@ -47,6 +48,37 @@ def test_marks_for_nothing_are_missing_samples(tmp_path, mark):
     rows[100] = f"1.00,{mark},0"
     with pytest.raises(InputError, match="line 102, column 'u'"):
         read(written(tmp_path, ["t,u,p", *rows]))
+
+
+@pytest.mark.parametrize(
+    ("above", "units"),
+    [
+        # Half of the units are of quantities that no model has.
+        (["t,u,p,T,T2,baro,mag", "s,-,rad/s,degC,K,hPa,uT"], ("s", "-", "rad/s", "degC")),
+        (["t,u,p,T,T2,baro,mag", "SEC,PCT,DEG/SEC,NONE,NONE,PSI,ND"], ("SEC", "pct", "deg/sec")),
+    ],
+)
+def test_a_row_of_units_is_none_of_names_whatever_it_holds(tmp_path, above, units):
+    path = written(tmp_path, [*above, *(f"{row},20,293,1013,44" for row in ROWS)])
+    table = open_csv(path)
+    assert table.names == tuple(above[0].split(","))
+    assert tuple(table.units.values())[: len(units)] == units
+    np.testing.assert_allclose(read(path).outputs["p"], P, atol=1e-6)
+
+
+def test_infinite_samples_of_an_output_are_missing_and_a_true_minus_is_one(tmp_path):
+    rows = [
+        f"{t:.2f},{u:.6f},{p:.6f}".replace("-", "\u2212") for t, u, p in zip(T, U, P, strict=True)
+    ]
+    rows[50] = f"0.50,{U[50]:.6f},inf".replace("-", "\u2212")
+    flight = read(written(tmp_path, ["t,u,p", *rows]))
+    assert np.flatnonzero(np.isnan(flight.outputs["p"])).tolist() == [50]
+    np.testing.assert_allclose(np.delete(flight.outputs["p"], 50), np.delete(P, 50), atol=1e-6)
+    assert "1 sample of inf" in notes(flight)
+    np.testing.assert_allclose(flight.inputs["u"], U, atol=1e-6)
+    every = [f"{t:.2f},{u:.6f},inf" for t, u in zip(T, U, strict=True)]
+    with pytest.raises(InputError, match="line 2, column 'p': got 'inf'"):
+        read(written(tmp_path, ["t,u,p", *every]))
 
 
 def test_columns_that_are_left_out_are_named_with_their_text(tmp_path):

@@ -129,3 +129,31 @@ def test_coordinates_of_netcdf_name_columns(tmp_path: Path) -> None:
     file = xarray.Dataset({"y": two}, coords={"time": T, "ch": ["p", "phi"]})
     file.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     check(tmp_path / "a.nc", "y.", ["p", "phi"])
+
+
+def test_structures_of_matlab_7_3_have_the_paths_and_labels_of_older_ones(tmp_path: Path) -> None:
+    t = 0.01 * np.arange(50)
+    arrays = {"aileron": np.sin(t), "p (rad/s)": np.cos(t)}
+    with h5py.File(tmp_path / "log.mat", "w", userblock_size=512) as file:
+        fields: dict[str, list] = {"values": [], "label": []}
+        for i, (label, values) in enumerate(arrays.items()):
+            item = file.create_dataset(f"#refs#/b{i}", data=values[None, :])
+            letters = np.array([ord(c) for c in label], np.uint16)[:, None]
+            text = file.create_dataset(f"#refs#/a{i}", data=letters)
+            text.attrs["MATLAB_class"] = np.bytes_("char")
+            fields["values"].append(item.ref)
+            fields["label"].append(text.ref)
+        for field, references in fields.items():
+            item = file.create_dataset(f"out/signals/{field}", (2, 1), dtype=h5py.ref_dtype)
+            item[:, 0] = references
+        file["out/time"] = t[None, :]
+        cell = file.create_dataset("C", (2, 1), dtype=h5py.ref_dtype)
+        cell.attrs["MATLAB_class"] = np.bytes_("cell")
+        for i in range(2):
+            cell[i, 0] = file.create_dataset(f"#refs#/c{i}", data=i + t[None, :]).ref
+    log = open_table(tmp_path / "log.mat")
+    names = {"out.signals.aileron", "out.signals.p (rad/s)", "out.time", "C[0]", "C[1]"}
+    assert set(log.names) == names
+    got = log.numbers(["out.signals.p (rad/s)", "C[1]"])
+    np.testing.assert_array_equal(got["out.signals.p (rad/s)"], np.cos(t))
+    np.testing.assert_array_equal(got["C[1]"], 1 + t)

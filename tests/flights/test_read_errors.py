@@ -92,8 +92,8 @@ BAD_TEXT = {
     "underscore": (with_cell(4, 2, "1_0"), ["line 6", "'phi'", "'1_0'"]),
     "empty cell": (with_cell(5, 1, ""), ["line 7", "'stick'", "got nothing"]),
     "nan": (with_cell(5, 1, "NaN"), ["line 7", "'stick'", "'NaN'"]),
-    "infinite": (with_cell(5, 2, "-inf"), ["line 7", "'phi'", "'-inf'"]),
-    "huge": (with_cell(5, 2, "1e400"), ["line 7", "'phi'", "'1e400'"]),
+    "infinite": (with_cell(5, 1, "-inf"), ["line 7", "'stick'", "'-inf'"]),
+    "huge": (with_cell(5, 1, "1e400"), ["line 7", "'stick'", "'1e400'"]),
     "blank lines between": (
         WHOLE.replace("0.060,", "\n   \n0.060,").replace("0.100,2,", "0.100,zwei,"),
         ["line 9", "'stick'", "'zwei'"],
@@ -268,7 +268,7 @@ BAD_PARQUET = {
     "text": ({"phi": ["a"] * 20}, ["'phi'", "string"]),
     "null": ({"stick": [*range(9), None, *range(10)]}, ["row 10", "'stick'", "nothing"]),
     "nan": ({"stick": [*range(9), math.nan, *range(10)]}, ["row 10", "'stick'", "nan"]),
-    "inf": ({"phi": [*range(9), math.inf, *range(10)]}, ["row 10", "'phi'", "inf"]),
+    "inf": ({"stick": [*range(9), math.inf, *range(10)]}, ["row 10", "'stick'", "inf"]),
     "list": ({"phi": [[1.0]] * 20}, ["'phi'", "list"]),
     "time stands": ({"t": [*range(9), 8, *range(10, 20)]}, ["row 10", "'t'", "stands still"]),
 }

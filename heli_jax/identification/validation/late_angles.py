@@ -19,7 +19,8 @@ from heli_jax.identification.validation.metrics import autocorrelation
 from heli_jax.identification.validation.signal_signs import (
     PARTS,
     WITHIN,
-    angle_and_integral,
+    integral,
+    over_gaps,
     rates_and_angles,
 )
 
@@ -118,16 +119,23 @@ def lateness(
         rate: [rad/s], likewise.
         dt: [s].
     """
-    both = angle_and_integral(angle, rate, dt)
-    if both is None:
+    if min(np.count_nonzero(np.isfinite(x)) for x in (angle, rate)) < 2:
         return None
     every = max(1, int(_STEP / dt))
-    turned, integral = both[0][::every], both[1][::every]
+    whole, seen = over_gaps(angle, dt)
+    # Headings jump by a turn where they pass south.
+    turned, seen = np.unwrap(whole)[::every], seen[::every]
+    rates, rate_seen = over_gaps(rate, dt)
+    turn, lost = integral(rates, dt)[::every], np.cumsum(~rate_seen)[::every]
     dt *= every
     steps = max(1, round(WITHIN / dt))
     if turned.size < (PARTS + 1) * steps:
         return None
-    coarse = _coarse(turned[steps:] - turned[:-steps], integral[steps:] - integral[:-steps], dt)
+    angle_changes = np.where(seen[steps:] & seen[:-steps], turned[steps:] - turned[:-steps], np.nan)
+    turns = np.where(lost[steps:] == lost[:-steps], turn[steps:] - turn[:-steps], np.nan)
+    if min(np.count_nonzero(np.isfinite(x)) for x in (angle_changes, turns)) < PARTS * steps:
+        return None
+    coarse = _coarse(angle_changes, turns, dt)
     if coarse is None:
         return None
     late, other = coarse
@@ -135,17 +143,22 @@ def lateness(
     spare = int(np.ceil(_USUAL / dt))
     begin = max(0, round(late / dt)) + spare
     end = turned.size - steps - 1 - max(0, round(-late / dt)) - spare
-    if end - begin < (PARTS - 2) * steps:
+    rows = np.arange(begin, max(begin, end))
+    # One sample more to either side, as far as the delay is followed.
+    moved_back = rows - round(late / dt)
+    rows = rows[
+        np.isfinite(angle_changes[rows]) & (lost[moved_back + steps + 1] == lost[moved_back - 1])
+    ]
+    if rows.size < (PARTS - 2) * steps:
         return None
-    rows = np.arange(begin, end)
-    changes = turned[rows + steps] - turned[rows]
+    changes = angle_changes[rows]
 
     def moved(late: float) -> np.ndarray:
         """The integral's changes and their slope (K, 2), so much later."""
         at = rows - late / dt
-        ends = [np.interp(at + k, np.arange(integral.size), integral) for k in (0.0, steps)]
-        slopes = np.gradient(integral, dt)
-        rising = [np.interp(at + k, np.arange(integral.size), slopes) for k in (0.0, steps)]
+        ends = [np.interp(at + k, np.arange(turn.size), turn) for k in (0.0, steps)]
+        slopes = np.gradient(turn, dt)
+        rising = [np.interp(at + k, np.arange(turn.size), slopes) for k in (0.0, steps)]
         return np.stack([ends[1] - ends[0], rising[1] - rising[0]], axis=1)
 
     def left(late: float) -> float:
@@ -190,10 +203,10 @@ def _coarse(y: np.ndarray, x: np.ndarray, dt: float) -> tuple[float, float | Non
     if best == near:
         return late, None
     # Few long swings go together at some delay whatever they are (Bartlett, 1935).
-    lags = max(1, y.size // 5)
+    lags, pairs = max(1, y.size // 5), np.count_nonzero(np.isfinite(y))
     window = 1.0 - np.arange(lags + 1) / (lags + 1)
     both = window * autocorrelation(y, lags) * autocorrelation(x, lags)
-    chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / y.size))
+    chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / pairs))
     return None if r[best] < _SURE * chance else (late, None)
 
 

@@ -244,10 +244,27 @@ def filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
         signal: (N,), NaN where missing.
         dt: [s].
     """
-    seen = np.flatnonzero(np.isfinite(signal))
-    if seen.size < 2 or np.max(np.diff(np.r_[0, seen, signal.size - 1])) * dt > _GAP:
+    if np.count_nonzero(np.isfinite(signal)) < 2:
         return None
-    return np.interp(np.arange(signal.size), seen, signal[seen])
+    values, known = over_gaps(signal, dt)
+    return values if known.all() else None
+
+
+def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """A signal with straight lines over its gaps, and which samples (N,) are in no long one.
+
+    Args:
+        signal: (N,), NaN where missing, two samples or more known.
+        dt: [s].
+    """
+    seen = np.flatnonzero(np.isfinite(signal))
+    rows = np.arange(signal.size)
+    ends = np.r_[0, seen, signal.size - 1]
+    after = np.searchsorted(ends, rows, side="left")
+    # Of the samples before and behind a row, or of the ends of the record.
+    gap = ends[np.minimum(after, ends.size - 1)] - ends[np.maximum(after - 1, 0)]
+    known = np.isfinite(signal) | (gap * dt <= _GAP)
+    return np.interp(rows, seen, signal[seen]), known
 
 
 def against_start(
