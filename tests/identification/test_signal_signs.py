@@ -47,8 +47,8 @@ def test_an_angle_that_moves_as_its_rate_says_nothing():
     for seed in range(20):
         _, phi, p = moved(seed)
         assert said(phi, p) == []
-        # A bias, a sensor that is off by a tenth, and one in twenty samples of the angle.
-        assert said(phi + 1.0, 1.1 * p - 0.3) == []
+        # A bias, a gyro that is off by a hundredth, and one in five samples of the angle.
+        assert said(phi + 1.0, 1.01 * p - 0.3) == []
         assert said(np.where(np.arange(N) % 5 == 0, phi, np.nan), p) == []
         # Nothing can be told of signals that have nothing in common.
         assert said(phi, moved(seed + 100)[2]) == []
@@ -86,6 +86,7 @@ def test_a_rate_that_is_too_large_for_its_angle_is_said_with_its_interval():
         assert low <= 1.25 <= high
         assert low <= size <= high < low + 0.2
         assert "scale or the unit" in said(phi, 0.8 * p)[0]
+        assert "scale or the unit" in said(phi, 0.93 * p)[0]
 
 
 def test_an_output_that_moves_against_the_simulated_one_is_said():

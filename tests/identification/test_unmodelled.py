@@ -90,6 +90,21 @@ def through_play(u):
     return linear(np.array([[-4.0]]), np.array([[20.0]]), v)
 
 
+def to_one_side(u):
+    """p of a stick that does a tenth more to one side than to the other: even powers see it."""
+    return linear(np.array([[-4.0]]), np.array([[20.0]]), u + 0.05 * np.abs(u))
+
+
+def with_dry_friction(u):
+    """p of a bearing that brakes as hard at any speed, by steps of 1 ms."""
+    p, out = 0.0, np.zeros(N)
+    for k, x in enumerate(u):
+        out[k] = p
+        for _ in range(20):
+            p += 0.001 * (-4.0 * p + 20.0 * x - 0.1 * np.tanh(p / 0.02))
+    return out
+
+
 def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0, seen=slice(None)):
     rng = np.random.default_rng(seed)
     u = steps(rng)
@@ -142,6 +157,12 @@ def test_a_saturation_that_is_left_out_is_named(method):
 def test_play_of_a_linkage_is_no_plain_yes():
     # Powers of stick and response do not see it: the residual is whatever the stick came from.
     found = fitted(through_play, "output-error", noise=0.02)
+    assert "the response of p depends on amplitude" in found.adequacy.summary
+
+
+@pytest.mark.parametrize("made", [to_one_side, with_dry_friction])
+def test_a_stick_that_does_more_to_one_side_and_dry_friction_are_no_plain_yes(made):
+    found = fitted(made, "output-error", noise=0.02)
     assert "the response of p depends on amplitude" in found.adequacy.summary
 
 

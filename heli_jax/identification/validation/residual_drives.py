@@ -43,8 +43,10 @@ def drives(
     inputs = naming.asdict(at.data.flights[i].inputs)
     u = [_normal(np.asarray(inputs[n])) for n in moving]
     y = np.asarray(e.simulated[i][name])
-    shapes = [*u, _normal(y), _normal(np.gradient(y))]
-    curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
+    own = [_normal(y), _normal(np.gradient(y))]
+    curved = [w for v in (*u, *own) for w in (v**3, np.abs(v) * v, v**2)]
+    # Friction has a sign and no size.
+    curved += [np.sign(v) for v in own]
     # What play takes off hangs on where the stick came from, not on where it is: no power does.
     return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
 

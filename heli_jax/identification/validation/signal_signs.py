@@ -27,7 +27,11 @@ _ALIKE = 0.8
 _FACTOR = 1.3
 """by which these may differ: coupled rotation and sensors that are off by a fifth"""
 _SCALE = 1.12
-"""by which they may differ for certain, by the interval of their factor: a sensor off by a tenth"""
+"""by which they may differ for certain, by the interval of their factor: a sensor off by a tenth,
+and of pitch and heading the cosine of the bank"""
+_ROLL, _ROLL_SCALE = frozenset({"phi", "roll"}), 1.04
+"""the same of the bank, whose rate is p but for what the tangent of the pitch angle lets in: that
+goes with another motion, and changes no factor by more than a hundredth or two"""
 _QUANTILE = 2.26
 """of Student's t with as many degrees of freedom as parts but one, for 95 %"""
 _GAP = 0.3
@@ -125,14 +129,15 @@ def _of_scale(
     sd = _log_sd(*changes)
     low = float(np.exp(-_QUANTILE * sd)) / largest
     high = float(np.exp(_QUANTILE * sd)) / smallest
-    if low <= _SCALE and high >= 1.0 / _SCALE:
+    most = _ROLL_SCALE if angle in _ROLL else _SCALE
+    if low <= most and high >= 1.0 / most:
         return []
     size = 1.0 / float(np.sqrt(smallest * largest))
     words = (
         f"{label}: {rate} is {size:.3g} times the rate of {angle} (95 % {low:.3g} to {high:.3g}): "
         "the scale or the unit of one of the two is off, and a fit puts it into the machine."
     )
-    criterion = f"the integrated rate's change over that of the angle, 1 within {_SCALE:g}"
+    criterion = f"the integrated rate's change over that of the angle, 1 within {most:g}"
     return [Finding("signs and units", "doubt", words, size, criterion)]
 
 

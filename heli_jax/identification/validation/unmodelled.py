@@ -3,11 +3,11 @@ that changes over the record.
 
 Of every output the residual in time is tested against the inputs through a bank of filters, beyond
 what the sensitivities explain (`score_test`): the simulation and its residual are there by any
-method. Then against cubes and signed squares of inputs, of the simulated output and of its rate,
-beyond what the input through the same filter explains: a saturation, a rate limit and a deadband
-answer large and small inputs differently, and no linear model does. Then against the sensitivities
-times the time, and of single flights: a rotor that slows down, a mass that changes and a stick
-of another scale leave what no constant takes up.
+method. Then against powers of inputs, of the simulated output and of its rate, and the sign of
+these two, beyond what the input through the same filter explains: a saturation, a rate limit, a
+deadband, friction and a machine that is not alike to both sides do not answer in proportion. Then
+against the sensitivities times the time, and of single flights: a rotor that slows down, a mass
+that changes and a stick of another scale leave what no constant takes up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -106,7 +106,8 @@ class Unmodelled(NamedTuple):
         if self.by_amplitude:
             said = (
                 f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
-                "rate limit, a deadband, play or another nonlinearity is missing."
+                "rate limit, a deadband, play, friction, another slope to one side or another "
+                "nonlinearity is missing."
             )
         elif self.over_time:
             said = (
