@@ -35,19 +35,28 @@ def hoisted(
     # The variables of params come first among the inputs, so that zip ends where they do.
     known = dict(zip(jaxpr.invars, leaves, strict=False))
     known |= dict(zip(jaxpr.constvars, closed.consts, strict=True))
-    later = []
+    later, repeated = [], []
     # An equation of what is known is computed now; what needs the others, or does more than
     # compute, waits.
     for equation in jaxpr.eqns:
         inputs = [v for v in equation.invars if not isinstance(v, Literal)]
-        if equation.effects or not all(v in known for v in inputs) or _spread(equation):
+        if equation.effects or not all(v in known for v in inputs) or _along(equation):
             later.append(equation)
             continue
+        if _repeats(equation):
+            repeated.append(equation)
         alone = jaxpr.replace(
             eqns=[equation], constvars=[], invars=inputs, outvars=equation.outvars,
         )  # fmt: skip
         computed = core.eval_jaxpr(alone, (), *(known[v] for v in inputs))
         known |= dict(zip(equation.outvars, computed, strict=True))
+    # A matrix that begins with zeros is made of them now; what waits makes them anew, for it can
+    # then tell that they are zeros.
+    asked = {v for e in later for v in e.invars if not isinstance(v, Literal)}
+    asked |= {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    again = [e for e in repeated if e.outvars[0] in asked]
+    known = {v: n for v, n in known.items() if all(v is not e.outvars[0] for e in again)}
+    later = again + later
     # Of all that was computed only what a later equation or the result asks for is handed on; the
     # dictionary keeps an order that does not change between runs, or nothing would be found in the
     # cache of compiled programs.
@@ -62,9 +71,14 @@ def hoisted(
     return [known[v] for v in kept], remaining
 
 
-def _spread(equation: Any) -> bool:
+def _along(equation: Any) -> bool:
     """Whether one number is repeated along a record, as one that is added to it: that costs nothing
     where it is read, and a record's memory where it is kept."""
+    return _repeats(equation) and equation.outvars[0].aval.ndim == 1
+
+
+def _repeats(equation: Any) -> bool:
+    """Whether it makes a long array of one number."""
     return (
         equation.primitive.name == "broadcast_in_dim"
         and equation.invars[0].aval.size == 1

@@ -46,6 +46,10 @@ _BLOCK = 4
 # save: roll model, AVX2, busy machine, a whole sweep 7.5 and 8.0 us a vehicle with 2, 7.9 with 3,
 # 8.4 with 4 (one or two runs each).
 _FUSED_BLOCK = 2
+# States and inputs beyond which a step is one sample: hybrid-flybarless has 15 of them, and 3000
+# samples of a vehicle took 119 us with 1 and 187 with 2, by XLA 116 and 140 beside them (processor
+# time, AVX2, busy machine, medians of four). Between 5 and 15 nothing was measured.
+_FUSED_BLOCK_FITS = 8
 
 
 class ElementResults(NamedTuple):
@@ -93,6 +97,8 @@ def steps_of(
     params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     update, start, data = _streaming(plan, numbers)
+    size = len(naming.names(plan.model.State)) + len(naming.names(plan.model.Inputs))
+    block = _FUSED_BLOCK if size <= _FUSED_BLOCK_FITS else 1
     return in_steps(
         plan.model,
         params,
@@ -101,7 +107,7 @@ def steps_of(
         start,
         data=data,
         limits=True,
-        options=_streamed_options(plan, numbers, state, _FUSED_BLOCK),
+        options=_streamed_options(plan, numbers, state, block),
     )
 
 

@@ -70,3 +70,19 @@ def test_literals_constants_and_outputs_of_parameters_alone():
     assert found == {"alone": 6.0, "same": 2.0, "number": 1.0, "both": 18.0}
     slope = jax.grad(lambda a: rest(hoisted(function, {"a": a}, 0.0)[0], jnp.asarray(2.0))["both"])
     assert slope(jnp.asarray(3.0)) == 6.0
+
+
+def test_a_large_matrix_of_parameters_is_made_once():
+    def function(p, u, x):
+        late = jnp.full((9, 9), 2.0) * x
+        return jnp.zeros((9, 9)).at[:2, :2].set(p) @ jnp.ones(9), late, u + jnp.full(100, p[0, 0])
+
+    p, u = jnp.arange(4.0).reshape(2, 2), jnp.arange(100.0)
+    values, rest = hoisted(function, p, u, jnp.asarray(0.0))
+    left = str(jax.make_jaxpr(rest)(values, u, jnp.asarray(0.0)))
+    # What waits repeats its number, and so does what is added to a record: neither is kept.
+    assert "scatter" not in left
+    assert "dot_general" not in left
+    assert sorted(np.shape(v) for v in values) == [(), (9,)]
+    for got, expected in zip(rest(values, u, 3.0), function(p, u, 3.0), strict=True):
+        np.testing.assert_array_equal(got, expected)
