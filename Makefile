@@ -25,13 +25,15 @@ endif
 	@rm -rf '$(OUT)'
 	@$(BIN)/heli-jax fit '$(CONFIG)' --out '$(OUT)'
 
+# Types are checked beside the tests: pyright alone leaves a core idle for three minutes.
 # Compiled modules are kept: a dozen tests start processes of their own, which would compile all anew.
 test: export PYTHONDONTWRITEBYTECODE :=
 test: .venv/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	@$(BIN)/pyright & types=$$!; \
+	$(BIN)/python -m pytest -n 2 --dist worksteal; tests=$$?; \
+	wait $$types && exit $$tests
 
 docs: .venv/.installed
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
