@@ -18,6 +18,7 @@ from heli_jax import (
     terminal,
 )
 from heli_jax.errors import InputError
+from heli_jax.stages import Note
 
 if TYPE_CHECKING:
     from heli_jax.identification.result import Fit
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         options.interrupts = seen
         try:
-            options.say = terminal.silent if options.quiet else terminal.say
+            options.say = terminal.say_notes if options.quiet else terminal.say
             with terminal.progress_shown(options.quiet):
                 return options.run(options)
         except KeyboardInterrupt:
@@ -318,7 +319,7 @@ def _simulate(options: argparse.Namespace) -> int:
     else:
         simulated = generate.follow(experiment)
     for note in simulated.notes:
-        options.say(f"{options.config}: {note}")
+        options.say(Note(f"{options.config}: {note}"))
     simulation_output.write_table(out, simulated.columns)
     if out is not None:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
@@ -404,7 +405,7 @@ def _convert(options: argparse.Namespace) -> int:
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)
     for note in converted.notes:
-        options.say(f"{options.log}: {note}")
+        options.say(Note(f"{options.log}: {note}"))
     columns = converted.columns
     options.say(
         f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}"

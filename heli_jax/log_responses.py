@@ -19,6 +19,7 @@ from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.numbers import number, plain_words
+from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
@@ -54,7 +55,7 @@ def responses_of_log(
     flights = read_flights(experiment)
     for note in (n for f in flights for n in (f.source.notes if f.source else ())):
         if progress is not None:
-            progress(note)
+            progress(Note(note))
     _require_samples(flights, experiment.path)
     try:
         estimate = flight_responses(flights, settings)
@@ -124,7 +125,7 @@ def run_responses(
         config = as_yaml(resolved(_of_log(experiment, log)))
         write_responses(temporary, written, units, title, handling, config=config, png=png)
     for note in responses.notes:
-        say(note)
+        say(Note(note))
     print_responses(responses)
     for line in handling_lines(handling):
         tell(plain_words(line))

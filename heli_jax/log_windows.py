@@ -18,6 +18,7 @@ from heli_jax.identification.validation.chosen_windows import DETERMINES, ENOUGH
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
 from heli_jax.numerics.white_noise import noise_guess
+from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 
 _MOST = 40
@@ -60,7 +61,7 @@ def rank_log(
     for flight in problem.flights:
         for note in flight.source.notes if flight.source else ():
             if progress is not None:
-                progress(note)
+                progress(Note(note))
     try:
         # Before the work, and not after it: with many windows that takes a while.
         seconds = window_samples(problem, length) * problem.training[0].dt
@@ -73,7 +74,7 @@ def rank_log(
     for i, flight in enumerate(problem.training):
         if i not in ranked and progress is not None:
             words = f"is shorter than a window of {ranking.length:.3g} s, and left out"
-            progress(f"{flight.name}: {flight.duration:.4g} s {words}")
+            progress(Note(f"{flight.name}: {flight.duration:.4g} s {words}"))
     return ranking
 
 

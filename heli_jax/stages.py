@@ -15,6 +15,12 @@ COMPILATION = "compilation (of these)"
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
+class Note(str):
+    """What a reader assumed or doubts, among the words of progress: who hides these shows it."""
+
+    __slots__ = ()
+
+
 @dataclass
 class Stage:
     """A part of the work that is under way."""

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 
 from heli_jax import reading_progress, stage_display
+from heli_jax.stages import Note
 from heli_jax.terminal_table import tell
 
 
@@ -14,8 +15,10 @@ def say(text: str) -> None:
     tell(f"heli-jax: {text}", sys.stderr)
 
 
-def silent(_: str) -> None:
-    """Print nothing."""
+def say_notes(text: str) -> None:
+    """Print a line where it is a note: a doubt is no progress that may be hidden."""
+    if isinstance(text, Note):
+        say(text)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
@@ -32,11 +32,8 @@ from heli_jax.identification.validation.enough import judged_again
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
-from heli_jax.stages import recorded, stage
+from heli_jax.stages import Note, recorded, stage
 from heli_jax.yaml_file import as_yaml
-
-if TYPE_CHECKING:
-    pass
 
 # Words for people as the work goes on. A function and not a logger, which a notebook would have to
 # set up and the command line to capture.
@@ -271,7 +268,9 @@ def reading_notes(problem: Problem) -> list[str]:
     """What the reader of each log assumed or did, a sentence each that begins with the log; and
     where the starts come from, if they were found."""
     guess = problem.first_guess
-    return list(dict.fromkeys((*log_notes(problem), *(guess.sentences if guess else ()))))
+    return [
+        Note(n) for n in dict.fromkeys((*log_notes(problem), *(guess.sentences if guess else ())))
+    ]
 
 
 def log_notes(problem: Problem) -> list[str]:
@@ -306,7 +305,7 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
             forgetting=options.forgetting,
         )
     except ValueError as e:
-        progress(f"no baseline: {e}")
+        progress(Note(f"no baseline: {e}"))
     return estimate
 
 

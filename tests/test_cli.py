@@ -655,3 +655,13 @@ def test_a_real_record(tmp_path, capsys, flybar_free):
         assert "If" in result["verdict"]["text"]
     else:
         assert code == 0
+
+
+def test_quiet_hides_progress_and_no_doubt(tmp_path, bench_log, capsys):
+    log, out = tmp_path / "bench.csv", tmp_path / "converted.csv"
+    log.write_text(bench_log)
+    capsys.readouterr()
+    assert main(["convert", str(log), str(out), "--quiet"]) == 0
+    said = capsys.readouterr().err
+    assert "column 't' is taken for a clock in s" in said
+    assert "wrote" not in said

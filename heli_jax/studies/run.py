@@ -15,6 +15,7 @@ from heli_jax.config.experiment import from_content
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
 from heli_jax.numerics.cores import cores
+from heli_jax.stages import Note
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
 from heli_jax.studies.point import Outcome, Task, failure, fit_point
@@ -136,7 +137,7 @@ def _tasks(study: Study, reports: bool) -> list[Task]:
 def _say_changes(old: Mapping[str, str], say: Callable[[str], None]) -> None:
     changed = [f"{n} {old[n]} then, {v} now" for n, v in versions().items() if old.get(n, v) != v]
     if changed:
-        say(f"begun with other versions ({', '.join(changed)}): numbers may differ")
+        say(Note(f"begun with other versions ({', '.join(changed)}): numbers may differ"))
 
 
 def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) -> None:
@@ -153,10 +154,10 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
         # Fits of one log share what its reader has to say.
         for note in outcome.notes:
             if note not in said:
-                options.say(note)
+                options.say(Note(note))
         said.update(outcome.notes)
         if outcome.sentence is not None:
-            options.say(f"{place.name}: no fit: {outcome.sentence}")
+            options.say(Note(f"{place.name}: no fit: {outcome.sentence}"))
         done += 1
         # The first waited for imports and the compiler: counted, it would make what is left look
         # longer than it is.

@@ -14,6 +14,7 @@ from heli_jax import run_directory
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
+from heli_jax.stages import Note
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.design import Design, table
@@ -130,7 +131,7 @@ def run_sweep(
     # The notes are kept too: who opens the store a year later has not seen what was printed.
     notes = [*notes, *_notes(job)]
     for note in notes:
-        options.say(note)
+        options.say(Note(note))
     kept = {"seed": 0, **(attributes or {}), "versions": versions(), "notes": notes}
     if out is None:
         # The same store as on disk, so that a sweep in memory goes through the same code.
@@ -193,7 +194,7 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
         _same_cut(store, job, options, where)
         # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
         for note in _changes(store.attributes.get("versions", {}), versions()):
-            options.say(f"{where}: {note}")
+            options.say(Note(f"{where}: {note}"))
         timing = _compute(job, store, done, options)
         dataset = store.dataset()
         with stores.readable(where):
