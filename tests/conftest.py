@@ -15,10 +15,6 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 
-# For the processes that begin after this one, xdist's workers first: XLA's passes ask for small
-# pieces of memory and give them back by the thousand, more than glibc keeps at hand for a thread.
-os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=60000")
-
 import hypothesis
 import jax
 import jaxtyping
