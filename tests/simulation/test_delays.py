@@ -222,7 +222,11 @@ def test_the_filter_without_noise_predicts_the_simulation(run, machine):
     np.testing.assert_allclose(found.error["theta"], expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
+@pytest.mark.parametrize(
+    "machine",
+    [LINEAR, pytest.param(NONLINEAR, marks=pytest.mark.slow)],
+    ids=["linear", "nonlinear"],
+)
 def test_noise_is_drawn_beside_delays(run, machine):
     """The noise adds to a linear model's run what it adds without any input."""
     disturbed = with_disturbance(machine, "pitch")

@@ -130,9 +130,8 @@ def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
     assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
 
 
-@pytest.mark.parametrize(
-    ("variant", "substeps"), [("consistent", 4), pytest.param("paper", 8, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
 def test_rk4_is_dopri8(variant, substeps, xcell):
     model = models.helicopter(variant)
     found = trim(model, xcell)
