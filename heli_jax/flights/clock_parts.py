@@ -197,9 +197,9 @@ def clock_parts(names: Sequence[str]) -> ClockParts | CompactClock | None:
             part = _OTHER_WORDS.get(word) or _UNITS_OF_A_CLOCK.get(unit or "", "day")
             groups.setdefault(stem, {})[part] = name
     for stem, group in groups.items():
-        found = _of_group(group, [(name, unit) for s, name, unit in finer if s == stem])
-        if found is not None:
-            return found
+        clock = _of_group(group, [(name, unit) for s, name, unit in finer if s == stem])
+        if clock is not None:
+            return clock
     # A time of day in whole seconds beside milliseconds.
     for stem, name, unit in finer:
         if stem in times:

@@ -26,16 +26,16 @@ def combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
     stated = [_stated(run) for run in runs]
     exponents = {n: c["exponents"] for of in stated for n, c in of.items()}
     kinds = {n: c.get("kind", "product") for of in stated for n, c in of.items()}
-    found: list[dict[str, Estimate]] = []
+    by_run: list[dict[str, Estimate]] = []
     for run, of in zip(runs, stated, strict=True):
-        of_run = {}
+        estimates = {}
         for name, powers in exponents.items():
             if name in of:
-                of_run[name] = _estimate(*(of[name][key] for key in _NUMBERS))
+                estimates[name] = _estimate(*(of[name][key] for key in _NUMBERS))
             elif kinds[name] == "product" and (made := _from_parts(run, powers)) is not None:
-                of_run[name] = made
-        found.append(of_run)
-    return found
+                estimates[name] = made
+        by_run.append(estimates)
+    return by_run
 
 
 _NUMBERS = ("value", "sd", "lower95", "upper95")

@@ -20,8 +20,8 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.ends_by_likelihood import (
     Inside,
     Profile,
+    deviance_of,
     follow,
-    lost_of,
     squares_of,
 )
 from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
@@ -242,10 +242,10 @@ def _open_at_rest(
     if not (np.abs(z[held]) > _REST).any():
         return []
     point = follow(at, np.where(held, 0.0, z), held)
-    lost = lost_of(at, squares_of(e.r), point.squares)
+    deviance = deviance_of(at, squares_of(e.r), point.squares)
     # Autocorrelated residuals let chance gain more.
     wider = max(1.0, float(np.median(reaches[held])) / Z95)
-    if lost > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
+    if deviance > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
         return []
     e = evaluate(layout, at.data, at.noise, jnp.asarray(point.z, at.z.dtype))
     if not np.isfinite(e.J).all():

@@ -1,7 +1,7 @@
 """Where the likelihood along one parameter ends an interval: all others at their best.
 
 The slopes at an optimum say how far a parameter goes while little of the likelihood is lost. Here
-it is moved there, the others follow by Levenberg and Marquardt, and what is lost is computed.
+it is moved there, the others follow by Levenberg and Marquardt, and the deviance is computed.
 """
 
 import math
@@ -23,7 +23,7 @@ from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, value_of
 
 _AS_EXPECTED = 1.15
-"""factor by which the root of what is lost may differ from what the slopes say: the interval of the
+"""factor by which the root of the deviance may differ from what the slopes say: the interval of the
 slopes is then as wide as that of the likelihood within about as much"""
 _ENOUGH = 0.05
 """squares that a further step may promise where a search stops"""
@@ -107,7 +107,7 @@ def squares_of(r: np.ndarray) -> float:
         return float(r @ r)
 
 
-def lost_of(at: Solution, first: float, squares: float) -> float:
+def deviance_of(at: Solution, first: float, squares: float) -> float:
     """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
     if not math.isfinite(squares):
         return math.inf
@@ -115,8 +115,8 @@ def lost_of(at: Solution, first: float, squares: float) -> float:
     if squares <= 0.0:
         return 0.0
     n = measured_count(at.data)
-    lost = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
-    return max(0.0, float(lost))
+    deviance = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
+    return max(0.0, float(deviance))
 
 
 class End(NamedTuple):
@@ -139,9 +139,9 @@ class Profile(NamedTuple):
     along: np.ndarray
     """(q,) column of the covariance: how the others go with it to first order"""
     reach: float
-    """root of what may be lost within the interval"""
+    """root of the deviance at the ends of the interval"""
     certain: float
-    """root of what has to be lost at a factor of ten"""
+    """root of the deviance that has to be exceeded at a factor of ten"""
     inside: list[Inside]
     """what was visited and is as likely as what is within the interval"""
 
@@ -164,7 +164,7 @@ class Profile(NamedTuple):
             t = min(t, furthest)
             guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
             point = follow(self.at, guess, np.arange(z0.size) == self.i)
-            root = math.sqrt(lost_of(self.at, first, point.squares))
+            root = math.sqrt(deviance_of(self.at, first, point.squares))
             if k == 0 and 1.0 / _AS_EXPECTED < root / self.reach < _AS_EXPECTED:
                 return End(self._value(z0[self.i] + side * t), True)
             if math.isfinite(root):
@@ -189,7 +189,7 @@ class Profile(NamedTuple):
         # chance is one among many places where the noise may have put it.
         z = guess + tangent * (z0[self.i] + side * furthest - guess[self.i])
         point = follow(self.at, z, np.arange(z0.size) == self.i)
-        if lost_of(self.at, first, point.squares) < self.certain**2:
+        if deviance_of(self.at, first, point.squares) < self.certain**2:
             self.inside.append(Inside(point.z, 0.0))
             return self._at_limit(side)
         return End(self._value(z0[self.i] + side * self._crossing(seen)), False)
@@ -199,7 +199,7 @@ class Profile(NamedTuple):
         return math.sqrt(max(0.0, 1.0 - (root / self.reach) ** 2))
 
     def _crossing(self, seen: list[tuple[float, float]]) -> float:
-        """Where the root of what is lost passes the reach: nearly a straight line."""
+        """Where the root of the deviance passes the reach: nearly a straight line."""
         inside = max(s for s in seen if s[1] < self.reach)
         beyond = [s for s in seen if s[1] >= self.reach and s[0] > inside[0]]
         if not beyond:

@@ -35,11 +35,11 @@ def arx_residuals(
     products = past.products(rows, order)
     factor = np.linalg.cholesky(products + _RIDGE * m * np.eye(len(products)))
     along = scipy.linalg.solve_triangular(factor, past.along(at, order), lower=True)
-    lost = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
-    sizes = [one * past.z.shape[1] + 1 for one in _ORDERS if one <= order]
+    unexplained = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
+    sizes = [n * past.z.shape[1] + 1 for n in _ORDERS if n <= order]
     # What rounding leaves of a signal that its past foretells exactly may be below zero.
     criteria = [
-        m * np.sum(np.log(np.maximum(lost[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
+        m * np.sum(np.log(np.maximum(unexplained[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
         for k in sizes
     ]
     k = sizes[int(np.argmin(criteria))]
@@ -135,6 +135,6 @@ class Past:
             ends = [v[k][:, None, None] * v[None, : first - 1] for v in (enter, leave)]
             made[k + 1, :, 1:] = made[k, :, :-1] + ends[0] - ends[1]
         sums = np.stack([self._lag(x, k + 1).sum(axis=0) for k in range(first)]).reshape(-1)
-        own = made.reshape(first * z, first * z)
-        whole = np.concatenate([sums[:, None], own], axis=1)
+        products = made.reshape(first * z, first * z)
+        whole = np.concatenate([sums[:, None], products], axis=1)
         return np.concatenate([np.append(float(N - first), sums)[None], whole])

@@ -43,10 +43,10 @@ def drives(
     inputs = naming.asdict(at.data.flights[i].inputs)
     u = [_normal(np.asarray(inputs[n])) for n in moving]
     y = np.asarray(e.simulated[i][name])
-    own = [_normal(y), _normal(np.gradient(y))]
-    curved = [w for v in (*u, *own) for w in (v**3, np.abs(v) * v, v**2)]
+    response = [_normal(y), _normal(np.gradient(y))]
+    curved = [w for v in (*u, *response) for w in (v**3, np.abs(v) * v, v**2)]
     # Friction has a sign and no size.
-    curved += [np.sign(v) for v in own]
+    curved += [np.sign(v) for v in response]
     # What play takes off hangs on where the stick came from, not on where it is: no power does.
     return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
 
@@ -95,8 +95,8 @@ def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
         k: how many of the unknowns, the first, are parameters.
     """
     out = []
-    for i, one in enumerate(lines):
-        more = np.zeros((one.e.size, k * len(lines)), complex)
-        more[:, k * i : k * (i + 1)] = one.J[:, :k]
-        out.append(one._replace(drives=np.concatenate([one.drives, more], axis=1)))
+    for i, record in enumerate(lines):
+        more = np.zeros((record.e.size, k * len(lines)), complex)
+        more[:, k * i : k * (i + 1)] = record.J[:, :k]
+        out.append(record._replace(drives=np.concatenate([record.drives, more], axis=1)))
     return out
