@@ -4,7 +4,9 @@
 #include <math.h>
 #include <stddef.h>
 
-#define LANES 16
+#ifndef LANES
+#define LANES 16 /* vehicles in flight at once: -DLANES=8 */
+#endif
 #define STATES 18
 #define NEWTON 7
 #define REST 1e-8

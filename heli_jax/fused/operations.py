@@ -176,6 +176,29 @@ def _not(code: Code, a: Value, **_: Any) -> Value:
     return code.operation("xor", a, ones)
 
 
+def _shifted(name: str) -> Operation:
+    def made(code: Code, a: Value, by: Value, **_: Any) -> Value:
+        if a.dtype.kind not in "iu":
+            raise UnsupportedError("a shift of truth values")
+        bits = 8 * a.dtype.itemsize
+        # Further than the number is long LLVM has no result; JAX has what is then left of it.
+        within = code.compare("icmp ult", by, constant(bits, by.dtype))
+        shifted = code.operation(name, a, code.choose(within, by, constant(bits - 1, by.dtype)))
+        return shifted if name == "ashr" else code.choose(within, shifted, constant(0, a.dtype))
+
+    return made
+
+
+def _same_bits(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
+    """The same bits read as a number of another type."""
+    target = np.dtype(new_dtype)
+    if target.itemsize != a.dtype.itemsize or "b" in (target.kind, a.dtype.kind):
+        raise UnsupportedError(f"the bits of {a.dtype} as {target}")
+    if type_of(target) == type_of(a.dtype):
+        return a._replace(dtype=target)
+    return code.cast("bitcast", a, target)
+
+
 def _selected(code: Code, which: Value, *cases: Value, **_: Any) -> Value:
     if which.dtype.kind == "b":
         no, yes = cases
@@ -304,6 +327,10 @@ OPERATIONS: dict[str, Operation] = {
     "xor": _logic("xor"),
     "not": _not,
     "select_n": _selected,
+    "shift_left": _shifted("shl"),
+    "shift_right_logical": _shifted("lshr"),
+    "shift_right_arithmetic": _shifted("ashr"),
+    "bitcast_convert_type": _same_bits,
     "convert_element_type": converted,
 }
 """by the primitive's name; numbers of equal shape, element by element"""

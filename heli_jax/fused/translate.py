@@ -197,6 +197,8 @@ def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Ope
     rows = inputs[n_consts + n_carry :]
     keeps = len(body.jaxpr.outvars) > n_carry
     computed = any(not isinstance(v, Stored) and v.dtype == object for v in rows)
+    if length == 0 and not keeps:
+        return list(carry)
     if length == 0:
         raise UnsupportedError("a loop of no passes")
     if keeps or computed:

@@ -118,6 +118,23 @@ GROUPS = {
             lambda v: v * jax.lax.stop_gradient(v),
             jax.nn.softplus,
             lambda v: v % 0.7,
+            jax.scipy.special.erf,
+        )
+    ),
+    "bits": lambda x: (
+        jnp.copysign(1.5, x)
+        + jnp.where(jnp.signbit(x - 1.0), x, -x)
+        + 1e-9
+        * sum(
+            how(jnp.floor(99 * x).astype(kind), by.astype(kind)).astype(x.dtype)
+            for how in (
+                jax.lax.shift_left,
+                jax.lax.shift_right_logical,
+                jax.lax.shift_right_arithmetic,
+            )
+            for kind in (jnp.int32, jnp.uint32)
+            # Some bits of those that are there, and more.
+            for by in (jnp.floor(40 * jnp.abs(x)),)
         )
     ),
     "remainders": lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, -0.3) + jnp.remainder(x, -0.45),
@@ -285,6 +302,7 @@ def test_records_loops_and_small_arrays(dtype):
         reach = jnp.asarray([0.0, 0.5, 0.5, 1.0], x.dtype)
         total, _ = jax.lax.scan(lambda c, r: (c + 0.1 * r * jnp.sin(c + a), None), v[0], reach)
         inner = jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i, v[1])
+        inner = jax.lax.fori_loop(0, 0, lambda i, y: y + 1.0, inner)
         kept = jax.lax.scan(lambda c, _: (0.5 * c, c + a), x, None, length=3)[1]
         chosen = jax.lax.cond(x > 0, lambda y: y, lambda y: -2.0 * y, total)
         return 0.2 * (chosen + inner + late[k] + jnp.sum(kept) + jnp.max(v) + kept[::-1][0])
