@@ -126,6 +126,27 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("method", "hz", "behind", "said"),
+    [
+        ("filter-error", 20, False, True),
+        ("filter-error", 20, True, False),  # noise that the logger added is white
+        ("filter-error", 90, False, False),
+        ("output-error", 20, False, False),  # its intervals allow for it
+    ],
+)
+def test_noise_that_a_low_pass_coloured_is_a_caution(load, tmp_path, method, hz, behind, said):
+    noise = np.random.default_rng(3).normal(size=TIMES.size)
+    passed = noise if behind else scipy.signal.lfilter(*scipy.signal.butter(2, hz * 2 * DT), noise)
+    write_log(tmp_path / "flight.log", np.sin(TIMES) + 0.05 * passed, ())
+    fit = {"method": method, "free": {"Blat": {"start": 0.1}}}
+    noisy = load(flight(filter={"kind": "biquad", "hz": hz}), fit=fit, disturbance={"on": ["p"]})
+    (read,) = read_flights(noisy)
+    caution = "its noise went through the low-pass of 20 Hz too, and is not white at 200 Hz"
+    assert [caution in c for c in read.source.cautions] == ([True] if said else [])
+    assert not said or "state rate: 40 beside" in read.source.cautions[0]
+
+
 ROTORFLIGHT = {
     "gyro_lpf1_type": "1", "gyro_lpf1_static_hz": "150", "gyro_lpf1_dyn_hz": "0,200",
     "gyro_lpf2_type": "2", "gyro_lpf2_static_hz": "100", "gyro_decimation_hz": "250",

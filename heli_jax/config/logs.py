@@ -11,7 +11,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
 from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
-from heli_jax.config.measurement import filter_cautions
+from heli_jax.config.measurement import coloured_noise_cautions, filter_cautions
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
     AlsoConfig,
@@ -110,10 +110,16 @@ def _read_flight(
     first, *others = _treated(experiment, flights, f, where)
     cautions = (
         *filter_cautions(first.source, everything.outputs),
+        *(coloured_noise_cautions(first, everything.outputs) if _filter_error(experiment) else ()),
         *pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),
     )
     return (_with_notes(first, notes, cautions), *others)
+
+
+def _filter_error(experiment: Experiment) -> bool:
+    fit = experiment.config.fit
+    return fit is not None and fit.method == "filter-error"
 
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:

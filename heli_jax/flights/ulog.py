@@ -31,6 +31,8 @@ _TYPES = {
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
     "bool": "<i1", "char": "<i1",
 }  # fmt: skip
+_COMMANDS = ("actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint")
+"""how topics are called that hold what the autopilot commands"""
 # At most five digits of a length: what claims more is damage, and would be laid out field by field.
 _FIELD = re.compile(r"([A-Za-z_]\w*)(?:\[(\d{1,5})\])? ([A-Za-z_]\w*)")
 # Kinds of messages by letter. Newer firmware may add others, which are passed over by their length.
@@ -71,7 +73,8 @@ def open_ulog(path: Path) -> ChannelLog:
     """The flight of a ULog file.
 
     A topic's times are `timestamp_sample`, of the sample itself, where there is one; otherwise
-    `timestamp`, when it was published.
+    `timestamp`, when it was published. So are those of commands, which act from then on: their
+    `timestamp_sample` is that of the gyro's sample that they were computed from.
 
     Raises:
         InputError: it is no ULog file, or one that nothing can be read of.
@@ -272,7 +275,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
             rows = np.concatenate(parts)
         several = sum(other == name for other, _ in merged) > 1
         shown = f"{name}[{instance}]" if several or instance else name
-        clock = _clock(rows)
+        clock = _clock(name, rows)
         columns = {f"{shown}.{n}": rows[n] for n in rows.dtype.names or () if "_padding" not in n}
         units = {f"{shown}.{n}": "us" for n in ("timestamp", "timestamp_sample")}
         units = {n: unit for n, unit in units.items() if n in columns}
@@ -280,9 +283,9 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
     return tuple(topics)
 
 
-def _clock(rows: np.ndarray) -> str:
+def _clock(name: str, rows: np.ndarray) -> str:
     names = rows.dtype.names or ()
-    if "timestamp_sample" in names:
+    if "timestamp_sample" in names and not name.startswith(_COMMANDS):
         stamps = rows["timestamp_sample"]
         # Some modules leave the field at zero, or publish one sample twice.
         if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):

@@ -11,6 +11,7 @@ from scipy.signal import cont2discrete
 from heli_jax import cli, config, models, naming, units
 from heli_jax.errors import InputError
 from heli_jax.flights.derived import sources
+from heli_jax.flights.open_log import open_log
 from heli_jax.flights.preset import (
     fitting_presets,
     meanings,
@@ -98,7 +99,11 @@ def px4_log(path, **topics):
             QUATERNION,
             [(t, c, s, 0, 0) for t, c, s in zip(us, *half, strict=True)],
         ),
-        "actuator_controls_0": (CONTROL, [(t, t, STICK[k], 0, 0, 0.5) for k, t in enumerate(us)]),
+        # Of the gyro's sample that it answers, 2 ms before it acts.
+        "actuator_controls_0": (
+            CONTROL,
+            [(t, t - 2000, STICK[k], 0, 0, 0.5) for k, t in enumerate(us)],
+        ),
     } | topics
     made = [(name, 0, fields, data) for name, (fields, data) in rows.items()]
     path.write_bytes(writers.ulog(made, start=20_000_000))
@@ -134,6 +139,11 @@ def test_from_a_log_to_a_fit(tmp_path, configuration, write):
     source = run.problem.flights[0].source
     wanted = "euler(vehicle_attitude.q).roll" if write is px4_log else "ATT.Roll"
     assert source.outputs["phi"].name == wanted
+    if write is px4_log:
+        # A command acts when it is published, a rate was so when it was measured.
+        log = open_log(log)
+        assert log.topic_of("actuator_controls_0.control[0]").clock == "timestamp"
+        assert log.topic_of("vehicle_angular_velocity.xyz[0]").clock == "timestamp_sample"
     lat = source.inputs["lat"]
     assert lat.name == ("actuator_controls_0.control[0]" if write is px4_log else "ccpm.roll")
 
