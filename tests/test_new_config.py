@@ -321,6 +321,19 @@ def test_pulse_widths_by_the_unit_of_the_file_get_scale_and_offset(
     np.testing.assert_allclose(flight.outputs["p"], RATE, atol=1e-6)
 
 
+def test_pulses_rest_where_the_record_begins_unless_a_manoeuvre_goes_on_there() -> None:
+    moves = np.repeat([1300.0, 1650.0, 1420.0, 1580.0, 1500.0] * 4, 25)
+
+    def offset(first: float, samples: int) -> float:
+        values = np.concatenate([np.full(samples, first), moves])
+        return scaled("rc_ch1", Series(0.01 * np.arange(values.size), values), "1").offset
+
+    assert offset(1754.0, 30) == 1500.0
+    assert offset(1532.0, 30) == 1532.0
+    # Of a collective, say.
+    assert offset(1754.0, 300) == 1754.0
+
+
 def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) -> None:
     columns = {"t": T, "rc_aileron": np.round(700 * STICK), "rc_aileron(percent)": 100 * STICK}
     log, out = write(tmp_path / "run.csv", columns | {"p": RATE}), tmp_path / "run.yaml"
