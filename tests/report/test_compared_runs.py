@@ -91,6 +91,16 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert "share a log" in words
 
 
+@pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
+def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window, shared) -> None:
+    def run(name: str, part: list[float]) -> Path:
+        data = [{"flight": "flight 1", "hold_out": False, "sha256": "a", "window": part}]
+        return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, data=data)
+
+    compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
+    assert ("share a log" in " ".join(compared.notes)) == shared
+
+
 def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
     summary = "in size only (the residual of p still follows lat)"
     limited = {"adequacy": {"summary": summary}, "residuals": {"overconfident": True}}
