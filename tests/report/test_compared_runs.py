@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,17 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     words = " ".join(compared.notes)
     assert "a2 did not converge" in words
     assert "share a log" in words
+
+
+def test_on_a_narrow_terminal_each_piece_says_which_metric(tmp_path, monkeypatch, capsys) -> None:
+    runs = [write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}) for name in "abcdef"]
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    assert cli.main(["compare", *map(str, runs)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    shown = [line.split() for line in lines if " %" in line]
+    assert len(shown) == 4
+    assert all(row[:2] == ["p", "fitted"] and row[2] in ("VAF", "fit") for row in shown)
 
 
 @pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
