@@ -98,9 +98,9 @@ def test_on_a_narrow_terminal_each_piece_says_which_metric(tmp_path, monkeypatch
     monkeypatch.setenv("COLUMNS", "60")
     assert cli.main(["compare", *map(str, runs)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    shown = [line.split() for line in lines if " %" in line]
-    assert len(shown) == 4
-    assert all(row[:2] == ["p", "fitted"] and row[2] in ("VAF", "fit") for row in shown)
+    shown = [line.split() for line in lines if line.startswith(" p ")]
+    assert len(shown) == 6
+    assert all(row[:2] == ["p", "fitted"] and row[2] in ("VAF", "fit", "TIC") for row in shown)
 
 
 @pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
