@@ -1,5 +1,7 @@
 """`heli-jax new`: guesses of logs whose channels are known, and files that others then read."""
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -341,6 +343,27 @@ def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) ->
     lat = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals.inputs["lat"]
     assert (lat.signal, lat.scale) == ("rc_aileron(percent)", 1.0)
     assert "could be rc_aileron as well" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda rows: [*rows, "Mean,0.1,0.2", "Sum,1,2"], "'Mean' in line {last}; expected times"),
+        (
+            lambda rows: rows[:300] + [f"{float(r.split(',')[0]) - 2},0,0" for r in rows[300:]],
+            "line 302, column 't': the time runs backwards, .*; make two files of it, the second",
+        ),
+    ],
+)
+def test_a_clock_that_is_no_clock_throughout_is_refused_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable, words: str
+) -> None:
+    log = write(tmp_path / "run.csv", {"t": T, "aileron": STICK, "p": RATE})
+    head, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([head, *spoil(rows)]) + "\n")
+    assert cli.main(["new", str(log), "--out", str(tmp_path / "x.yaml")]) == 2
+    assert re.search(words.format(last=T.size + 2), capsys.readouterr().err)
+    assert not (tmp_path / "x.yaml").exists()
 
 
 def test_a_counter_of_rows_is_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
