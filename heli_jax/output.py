@@ -210,7 +210,8 @@ def _print_baseline(b: Baseline) -> None:
 def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
     """A row of the table of estimates; `stopped`: the optimiser did not arrive."""
     if stopped:
-        return (name, report_tables.where_it_stopped(e), "", "", e.unit, percent(e.prior_share, 0))
+        at = plain_words(report_tables.where_it_stopped(e))
+        return (name, at, "", "", e.unit, percent(e.prior_share, 0))
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
     if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:

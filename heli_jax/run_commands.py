@@ -79,8 +79,9 @@ def compare(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
         label, model, method, status, verdict, adequate = row
         tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
-    for table in (numbered.estimates, numbered.agreement):
-        print_table(table.head, list(table.rows))
+    print_table(numbered.estimates.head, list(numbered.estimates.rows))
+    # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
+    print_table(numbered.agreement.head, list(numbered.agreement.rows), keys=3)
     for note in numbered.notes:
         tell(f"! {note}")
     if place is None:

@@ -1,5 +1,7 @@
 """`heli-jax new`: guesses of logs whose channels are known, and files that others then read."""
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -321,6 +323,19 @@ def test_pulse_widths_by_the_unit_of_the_file_get_scale_and_offset(
     np.testing.assert_allclose(flight.outputs["p"], RATE, atol=1e-6)
 
 
+def test_pulses_rest_where_the_record_begins_unless_a_manoeuvre_goes_on_there() -> None:
+    moves = np.repeat([1300.0, 1650.0, 1420.0, 1580.0, 1500.0] * 4, 25)
+
+    def offset(first: float, samples: int) -> float:
+        values = np.concatenate([np.full(samples, first), moves])
+        return scaled("rc_ch1", Series(0.01 * np.arange(values.size), values), "1").offset
+
+    assert offset(1754.0, 30) == 1500.0
+    assert offset(1532.0, 30) == 1532.0
+    # Of a collective, say.
+    assert offset(1754.0, 300) == 1754.0
+
+
 def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) -> None:
     columns = {"t": T, "rc_aileron": np.round(700 * STICK), "rc_aileron(percent)": 100 * STICK}
     log, out = write(tmp_path / "run.csv", columns | {"p": RATE}), tmp_path / "run.yaml"
@@ -328,6 +343,27 @@ def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) ->
     lat = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals.inputs["lat"]
     assert (lat.signal, lat.scale) == ("rc_aileron(percent)", 1.0)
     assert "could be rc_aileron as well" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda rows: [*rows, "Mean,0.1,0.2", "Sum,1,2"], "'Mean' in line {last}; expected times"),
+        (
+            lambda rows: rows[:300] + [f"{float(r.split(',')[0]) - 2},0,0" for r in rows[300:]],
+            "line 302, column 't': the time runs backwards, .*; make two files of it, the second",
+        ),
+    ],
+)
+def test_a_clock_that_is_no_clock_throughout_is_refused_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable, words: str
+) -> None:
+    log = write(tmp_path / "run.csv", {"t": T, "aileron": STICK, "p": RATE})
+    head, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([head, *spoil(rows)]) + "\n")
+    assert cli.main(["new", str(log), "--out", str(tmp_path / "x.yaml")]) == 2
+    assert re.search(words.format(last=T.size + 2), capsys.readouterr().err)
+    assert not (tmp_path / "x.yaml").exists()
 
 
 def test_a_counter_of_rows_is_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

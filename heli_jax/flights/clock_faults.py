@@ -6,9 +6,9 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.grid import shared_stamps
+from heli_jax.flights.grid import not_increasing, shared_stamps
 from heli_jax.flights.runs import restarts
-from heli_jax.flights.table import Table, shown
+from heli_jax.flights.table import Table, column, shown, wrong
 from heli_jax.flights.time_units import split_unit
 
 _MANY = 0.1
@@ -33,6 +33,24 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[str, ...]:
         words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
         return (f"{words}: if that is right, state unit: {named} beside it",)
     return ()
+
+
+def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
+    """Refuse a clock of which a stamp is not later than the one before it.
+
+    Args:
+        table: of rows.
+        name: the column of times.
+        stamps: in any unit (N,).
+    """
+    back = not_increasing(stamps)
+    if back is None:
+        return
+    row, fault = back
+    after, now = table.cell_text(name, row - 1), table.cell_text(name, row)
+    problem = f"the time {fault}, got {now} after {after}, expected increasing times"
+    words = f"{problem}; {remedy(table, stamps, row)}"
+    raise wrong(table.path, words, table.place(row), column(name))
 
 
 def remedy(table: Table, stamps: np.ndarray, row: int) -> str:

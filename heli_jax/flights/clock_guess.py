@@ -57,10 +57,7 @@ def guess_clock(
             return _with_unit(table, name, values[name])
     # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
-        stem, _ = split_unit(name)
-        # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
-        last = re.split(r"[./]", stem)[-1].strip("%_ ").casefold()
-        if last in TIME_NAMES or table.time_unit(name):
+        if is_called_time(name) or table.time_unit(name):
             return _with_unit(table, name, values[name])
     increasing = [n for n in numeric if _increases(values[n])]
     # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
@@ -80,6 +77,13 @@ def guess_clock(
     for name in (*named, *others):
         return _with_unit(table, name, values[name])
     return None, False
+
+
+def is_called_time(name: str) -> bool:
+    """Whether a column's name is one of a clock."""
+    stem, _ = split_unit(name)
+    # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
+    return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
 
 
 def arrival_notes(clock: str, names: Sequence[str]) -> tuple[str, ...]:

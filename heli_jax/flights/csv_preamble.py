@@ -15,6 +15,7 @@ from heli_jax.flights.csv_cells import is_number, row_of_units
 from heli_jax.flights.csv_dates import is_date
 from heli_jax.flights.csv_lines import (
     Head,
+    are_names,
     are_units,
     cells_of,
     is_for_comments,
@@ -46,6 +47,7 @@ _SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 _RULE = re.compile(r"([*=#~_-])\1+.*\1\1")
 """a word between signs, such as ***End_of_Header***: for people, and no group of columns"""
 _UNIT_LABEL = re.compile(r".*(?:unit|einheit).*", re.IGNORECASE)
+_WHOLE = re.compile(r"\s*[+-]?[0-9]+\s*")
 _IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
 """of a body, in place of its name"""
 
@@ -59,7 +61,7 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
         blanks: whether blanks alone may stand between cells.
 
     Raises:
-        InputError: there are several tables.
+        InputError: there are several tables, or commas are decimal signs and delimiters both.
     """
     plain = header_line(data)
     if plain is None:
@@ -72,6 +74,7 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
             return None
         return Head(below, separator[1], (), below.number + 1)
     near = [line for line in lines_in(data, plain, _LOOKED_AT, _NEAR) if line.text.strip()]
+    _require_one_comma(path, near)
     if nameless := nameless_head(data, near, blanks):
         return nameless
     delimiter = find_delimiter(plain.text, near[1].text if len(near) > 1 else "")
@@ -80,6 +83,21 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
     lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
     unsure = Head(plain, delimiter, (), plain.number + 1, is_fitting=False)
     return _sought(path, lines, blanks) or nameless_head(data, lines, blanks, FEWEST) or unsure
+
+
+def _require_one_comma(path: str, lines: Sequence[Line]) -> None:
+    """Refuse rows of numbers that commas cut at their decimal signs too: twice as many cells as
+    names at most, whole numbers all of them."""
+    names, *rows = [cells_of(line.text, ",") for line in lines]
+    width = len(names)
+    is_cut = len(rows) >= FEWEST and all(
+        width + 1 < len(row) <= 2 * width and all(map(_WHOLE.fullmatch, row)) for row in rows
+    )
+    if is_cut and are_names(names) and '"' not in lines[1].text:
+        place = f"line {lines[1].number}"
+        problem = f"{len(rows[0])} whole numbers below {width} names: its commas are decimal signs"
+        remedy = "expected semicolons or tabs between cells, quotes around them, or decimal points"
+        raise wrong(path, f"{problem} and stand between cells too, {remedy}", place)
 
 
 def _is_header(lines: Sequence[Line], delimiter: str, blanks: bool) -> bool:

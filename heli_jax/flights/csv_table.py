@@ -109,10 +109,11 @@ def open_csv(path: Path) -> "CsvTable":
     body = Body(where, rows, delimiter, head.first_line, quotes)
     groups = [header_names(where, text, delimiter, number) for text in head.above]
     names = as_wide(qualified(names, groups), body)
+    body, empty = body.filled()
     body, cut = body.whole(len(names))
     notes = (*notes, head.note) if head.note else notes
     rate = rate_above(bytes(data[:after]).decode("utf-8", "replace"))
-    notes, units = (*notes, *cut), _units_below(body, names)
+    notes, units = (*notes, *empty, *cut), _units_below(body, names)
     if units is None:
         stated = dict(zip(names[1:], head.units, strict=False))
         return CsvTable(size, digest, names, body, head, notes, stated, rate)

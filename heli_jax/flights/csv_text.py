@@ -86,6 +86,24 @@ class Body:
             f"the last line is cut off ({cells} of {width} cells): it is left out",
         )
 
+    def filled(self) -> tuple["Body", tuple[str, ...]]:
+        """The body without the rows of empty cells behind the last that holds something, as
+        spreadsheets write them, and a note of it."""
+        size, of_nothing = _LAST, b" \t\r\n" + self.delimiter.encode()
+        while not (end := self._end(size)).rstrip(of_nothing) and size < self.size:
+            size *= 16
+        kept = end.rstrip(of_nothing)
+        # To the end of its line, which may be of empty cells.
+        _, at = _line_end(end, len(kept))
+        count = sum(self.delimiter in line for line in lines_of(end[at:].decode()))
+        if not kept or not count:
+            return self, ()
+        words = "row is" if count == 1 else f"{count} rows are"
+        # In memory from here on, as in `whole`.
+        return replace(self, rows=self.data[: at - len(end)]), (
+            f"the last {words} empty, and left out",
+        )
+
     def _end(self, size: int) -> bytes:
         """The last `size` bytes, or fewer."""
         if not isinstance(self.rows, OnDisk):

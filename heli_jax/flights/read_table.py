@@ -11,7 +11,7 @@ import numpy as np
 
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
-from heli_jax.flights.clock_faults import remedy, unit_notes
+from heli_jax.flights.clock_faults import require_increasing, unit_notes
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Signal, Source
@@ -20,7 +20,6 @@ from heli_jax.flights.grid import (
     SHORTEST_STEP,
     Grid,
     Uneven,
-    not_increasing,
     rounding_of,
     uniform_grid,
     without_overflow,
@@ -249,13 +248,7 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
         raise wrong(table.path, problem, table.place(row), place)
     stamps, notes = without_overflow(stamps)
-    back = not_increasing(stamps)
-    if back is not None:
-        row, fault = back
-        after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
-        problem = f"the time {fault}, got {now} after {after}, expected increasing times"
-        words = f"{problem}; {remedy(table, stamps, row)}"
-        raise wrong(table.path, words, table.place(row), place)
+    require_increasing(table, time.name, stamps)
     if said and not stated:
         require_likely(table.path, time.name, time.unit, stamps)
     return _Clock(stamps, scale, (*notes, *said), said)

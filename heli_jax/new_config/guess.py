@@ -33,6 +33,10 @@ _PULSES = (700.0, 2300.0)
 """us: what receivers and servos are sent"""
 _FULL_PULSE = 500.0
 """us from the middle to the end"""
+_MIDDLE, _TRIM = 1500.0, 150.0
+"""us: a stick's place at rest, and how far from it trims may move that"""
+_LONG = 0.2
+"""part of a record, for which nobody holds a stick away from where it rests"""
 _AXES = {"r": "roll", "p": "pitch", "y": "yaw"}
 _SETPOINTS = {letter + word for letter in _AXES for word in ("des", "out", "tar")}
 _ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
@@ -346,9 +350,13 @@ def _fits(unit: str, si: str) -> bool:
 
 
 def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
-    # Most records begin with the stick at rest; where this one does not, receivers' middle.
+    # Most records begin with the stick at rest; where this one does not, receivers' middle. One
+    # that begins within a manoeuvre, stick held, does not come back to that place for long.
     begin = values[: max(len(values) // 100, 5)]
-    rest = float(np.median(begin)) if np.ptp(begin) < 0.02 * np.ptp(values) else 1500.0
+    first, small = float(np.median(begin)), 0.02 * float(np.ptp(values))
+    is_still = np.ptp(begin) < small
+    is_middle = abs(first - _MIDDLE) < _TRIM or np.mean(np.abs(values - first) < small) > _LONG
+    rest = first if is_still and is_middle else _MIDDLE
     remark = f"GUESS: pulse widths, {rest:g} us at rest"
     if si == "1":
         remark = f"{remark}, {_FULL_PULSE:g} us to the stop"

@@ -11,7 +11,8 @@ import numpy as np
 
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_guess import arrival_notes
+from heli_jax.flights.clock_faults import require_increasing
+from heli_jax.flights.clock_guess import arrival_notes, is_called_time
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
@@ -93,12 +94,16 @@ def _read_table(table: Table, rate: float | None) -> Log:
     notes: tuple[str, ...] = ()
     time = info.time
     if time is None:
+        _require_whole_clock(table, info)
         # How many samples a second has only the user knows; a guess needs no more than their order.
         time = describe_table(table, None, None, _ASSUMED).time
         assert time is not None
         time = dataclasses.replace(time, counted=math.nan)
         notes = (f"{_without_time(info)}: how many samples a second has is yours to say",)
     if time.problem:
+        if time.column in table.names:
+            # With its line, and what to do.
+            require_increasing(table, time.column, table.numbers([time.column])[time.column])
         problem = "expected a column of increasing times, got none"
         raise wrong(table.path, f"{problem}: {time.problem}")
     if time.said:
@@ -127,6 +132,15 @@ def _read_table(table: Table, rate: float | None) -> Log:
         words = shown(clock) if clock != ROWS else "the others"
         notes += (f"left out, since they are not as long as {words}: {listed}",)
     return Log(table.path, table.format, series, time, None, False, notes, _unread(table, info))
+
+
+def _require_whole_clock(table: Table, info: LogInfo) -> None:
+    """Refuse a column that is called time and has a few cells of text, such as means and sums below
+    the samples: as rows of a stated rate they would be read as samples."""
+    for c in info.columns:
+        if c.strays and is_called_time(c.name):
+            problem = f"column {shown(c.name)}: {c.strays}; expected times, take such rows out"
+            raise wrong(table.path, f"{problem} (--time-rate counts every row as a sample)")
 
 
 def _unread(table: Table, info: LogInfo) -> dict[str, str]:

@@ -102,16 +102,23 @@ def _overlaps(
 ) -> Iterator[tuple[str, str, list[tuple[str, Signals]]]]:
     """Flights and outputs that more than one run has, with the runs' signals."""
     by_place: dict[tuple[str, str, str], list[tuple[str, Signals]]] = {}
+    names: dict[tuple[str, tuple[float, ...]], str] = {}
     for label, run in zip(compared.labels, compared.runs, strict=True):
         # What stopped on its way is no result, and simulates nothing that was found.
         if run.status == "not-converged":
             continue
         # Flights without a name are all called flight 1, whatever log they are of.
-        logs = {f.get("flight"): str(f.get("sha256")) for f in run.content["data"]}
+        logs = {f["flight"]: f for f in run.content["data"] if f.get("flight")}
         for signals in run.signals:
-            log = logs.get(signals.flight, "")
+            flight = logs.get(signals.flight, {})
+            log, name = str(flight.get("sha256", "")), signals.flight
+            # And one part of a log may have a name of its own in each run.
+            if log and flight.get("window"):
+                part = (log, tuple(round(float(t), 3) for t in flight["window"]))
+                called = names.setdefault(part, name)
+                name = called if called not in logs else name
             for output in signals.measured:
-                by_place.setdefault((log, signals.flight, output), []).append((label, signals))
+                by_place.setdefault((log, name, output), []).append((label, signals))
     for (_, name, output), by_run in by_place.items():
         if len(by_run) > 1:
             yield name, output, by_run

@@ -143,7 +143,7 @@ class ComparedRuns(NamedTuple):
         """What a reader should know of the differences."""
         notes, first = [_JOINT], self.runs[0]
         for label, run in zip(self.labels[1:], self.runs[1:], strict=True):
-            if _logs(run) & _logs(first):
+            if _share_a_log(first, run):
                 notes.append(_SAME.format(first=self.labels[0], second=label))
         for label, run in zip(self.labels, self.runs, strict=True):
             if run.status == "not-converged":
@@ -291,10 +291,25 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     return text(getattr(m, key, None))
 
 
-def _logs(run: SavedFit) -> set[str]:
-    """Fingerprints of the logs that were fitted."""
-    fitted = (flight for flight in run.content["data"] if not flight.get("hold_out"))
-    return {flight["sha256"] for flight in fitted if flight.get("sha256")}
+def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
+    """Whether both were fitted to the same samples of a log, or some of them."""
+    return any(
+        a["sha256"] == b["sha256"] and _overlap(a.get("window"), b.get("window"))
+        for a in _logged(first)
+        for b in _logged(second)
+    )
+
+
+def _logged(run: SavedFit) -> list[dict[str, Any]]:
+    """The flights that were fitted and are from a log."""
+    fitted = [flight for flight in run.content["data"] if not flight.get("hold_out")]
+    return [flight for flight in fitted if flight.get("sha256")]
+
+
+def _overlap(a: list[float] | None, b: list[float] | None) -> bool:
+    """Whether two windows of a log have more than an end in common; where one was not written
+    they may."""
+    return a is None or b is None or min(a[1], b[1]) > max(a[0], b[0])
 
 
 def _latex(text: str) -> str:

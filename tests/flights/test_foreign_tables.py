@@ -228,6 +228,21 @@ def test_a_last_line_that_is_cut_off_is_left_out_and_told(tmp_path, monkeypatch,
     assert len(whole.numbers(["t"])["t"]) == 101
 
 
+@pytest.mark.parametrize("large", [False, True])
+def test_empty_rows_that_a_spreadsheet_writes_at_the_end_are_left_out(tmp_path, monkeypatch, large):
+    if large:
+        monkeypatch.setattr("heli_jax.flights.csv_on_disk._LARGE", 1)
+        monkeypatch.setattr("heli_jax.flights.csv_text._LAST", 8)
+    # Cells behind the last column are empty too, and so are some of the last sample.
+    rows = [f"{0.01 * k:.2f};{k % 7};{0.5 if k < 99 else ''};;" for k in range(100)]
+    path = written(tmp_path, ["t;a;b;;", *rows, *30 * [";;;;"]])
+    table = open_csv(path)
+    assert table.notes == ("the last 30 rows are empty, and left out",)
+    columns = table.numbers(["t", "b"])
+    np.testing.assert_allclose(columns["t"], 0.01 * np.arange(100))
+    assert np.isnan(columns["b"]).sum() == 1
+
+
 def test_the_stamp_of_a_sample_goes_before_that_of_its_arrival(tmp_path):
     stamps = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(40)
     late = stamps + np.random.default_rng(0).integers(1_000_000, 9_000_000, 40).cumsum()

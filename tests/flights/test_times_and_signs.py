@@ -141,6 +141,13 @@ def test_points_among_decimal_commas_that_end_no_thousands_are_refused(tmp_path)
     assert columns == {"Time": "number", "u": "text", "p": "number"}
 
 
+def test_commas_that_are_decimal_signs_and_delimiters_both_are_refused(tmp_path):
+    lines = [",".join(map(comma, row)) for row in zip(T + 1, U + 1, P + 2, strict=True)]
+    path = written(tmp_path, ["Time,u,p", *lines])
+    with pytest.raises(InputError, match="line 2: 6 whole numbers below 3 names: its commas are"):
+        open_csv(path)
+
+
 @pytest.mark.parametrize(
     ("step", "rows", "unit"),
     [

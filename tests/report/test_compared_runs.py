@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,27 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     words = " ".join(compared.notes)
     assert "a2 did not converge" in words
     assert "share a log" in words
+
+
+def test_on_a_narrow_terminal_each_piece_says_which_metric(tmp_path, monkeypatch, capsys) -> None:
+    runs = [write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}) for name in "abcdef"]
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    assert cli.main(["compare", *map(str, runs)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    shown = [line.split() for line in lines if line.startswith(" p ")]
+    assert len(shown) == 6
+    assert all(row[:2] == ["p", "fitted"] and row[2] in ("VAF", "fit", "TIC") for row in shown)
+
+
+@pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
+def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window, shared) -> None:
+    def run(name: str, part: list[float]) -> Path:
+        data = [{"flight": "flight 1", "hold_out": False, "sha256": "a", "window": part}]
+        return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, data=data)
+
+    compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
+    assert ("share a log" in " ".join(compared.notes)) == shared
 
 
 def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:

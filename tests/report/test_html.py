@@ -174,6 +174,13 @@ def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     text = words((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert "✗ not converged:" in text
     assert "One start" in text
+    # Of numbers that are no result there are no intervals to speak of.
+    coloured = dict.fromkeys(fit.whiteness, Whiteness(False, 1e-9, 100, 0.4, 0.9))
+    small = dict(fit.estimates, If=fit.estimates["If"]._replace(value=-1.234e-4))
+    text = words(page(sound, tmp_path, status=fit.status, whiteness=coloured, estimates=small)[0])
+    assert "The residuals are not white." in text
+    assert "too narrow" not in text
+    assert "−1.23·10⁻⁴ (no result)" in text
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from heli_jax.report.embedded import Logged, Numbers
 from heli_jax.report.files import write_signals
 from heli_jax.report.saved_fit import load_fit
 from heli_jax.report.tables import estimates
-from tests.report.test_compared_runs import write_run
+from tests.report.test_compared_runs import METRICS, write_run
 
 
 def part(name, start, n=300):
@@ -109,6 +109,21 @@ def test_a_pulse_width_is_shown_as_logged_beside_si():
     numbers.add_chart(chart, {"x_roll": Logged("aileron_pwm", -1.0 / 6e-9, 1496.0)})
     panels = numbers.content()["charts"][0]["panels"]
     assert panels[-1]["logged"] == ["m", "aileron_pwm", -1.0 / 6e-9, 1496.0]
+
+
+@pytest.mark.parametrize(("window", "drawn"), [([18.0, 32.0], True), ([18.0, 30.0], False)])
+def test_one_part_of_a_log_is_overlaid_whatever_the_runs_call_it(tmp_path, window, drawn):
+    held = part("flight 1", 7.0, 200)
+    flights = [("a", "flight 1", [18.0, 32.0]), ("b", "doublets", window)]
+    for run, name, seconds in flights:
+        data = [{"flight": name, "hold_out": False, "sha256": "a", "window": seconds}]
+        agreed = {"roll": METRICS}
+        folder = write_run(tmp_path / run, {"Ixx": (2.0e-5, 1e-6)}, data=data, metrics=agreed)
+        write_signals(folder / "signals.csv", (held._replace(flight=name),))
+    compared_page.write_page(tmp_path / "out.html", compare_runs([tmp_path / n for n in "ab"]))
+    html = (tmp_path / "out.html").read_text()
+    assert ("Simulated over measured" in html) == drawn
+    assert ("No responses are overlaid" in html) != drawn
 
 
 def test_runs_side_by_side_have_files_configurations_and_bode_diagrams(tmp_path):

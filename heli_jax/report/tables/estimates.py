@@ -8,7 +8,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
-from heli_jax.numbers import NOTHING, measured, number, percent, relative, terse
+from heli_jax.numbers import NOTHING, measured, number, percent, relative
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
 from heli_jax.report.unit_symbols import pretty
 
@@ -50,7 +50,7 @@ def prior_note(problem: Problem, fit: Fit) -> str:
 
 def where_it_stopped(e: Estimate) -> str:
     """The cell of an estimate of a fit that did not converge: a number that is no result."""
-    return f"{terse(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
+    return f"{number(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
 
 
 def _estimate(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:

@@ -54,7 +54,9 @@ def _adequate(fit: Fit) -> str:
 
 
 def _coloured(fit: Fit) -> str:
-    if fit.overconfident:
+    if fit.status == "not-converged":
+        intervals = "Of a fit that stopped before an optimum no intervals are given."
+    elif fit.overconfident:
         intervals = "The intervals given are not corrected for them and are too narrow."
     elif fit.coloured:
         intervals = "The intervals given are corrected for their autocorrelation."
