@@ -7,17 +7,23 @@ efficient estimate and an inefficient one of the same parameter differ by less t
 one's own interval where both are consistent: their difference has the variance of the one less that
 of the other (Hausman, 1978). So where they lie further apart the intervals do not hold.
 
-Filter error is the efficient one where the disturbance acts as its model says. Where it does not,
-frequency error, which takes its spectrum from the record, stays consistent.
+Filter error is the efficient one where the disturbance acts as its model says. Where it does not
+(it acts elsewhere, has another spectrum, a vane measures the gust with the motion), frequency
+error, which takes its spectrum from the record, stays consistent.
 
 Source: J. A. Hausman, Specification tests in econometrics, Econometrica 46 (1978).
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.fit import fit
+from heli_jax.identification.identifiability.through_inputs import through_inputs
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, SecondMethod
@@ -28,7 +34,13 @@ _WELL_EXPLAINED = 0.95
 """VAF of every output from which on a disturbance is too small to make an optimum of its own"""
 _APART = 3.3
 """standard deviations that chance takes two estimates apart in one of 1000: of output error, and of
-the consistent estimate beside filter error"""
+the difference between the consistent estimate and filter error's"""
+_HAS_A_SAY = 1.05
+"""factor between standard deviations by the inputs alone and by all, above which a wrong
+disturbance moves estimates by their standard deviation"""
+_LEAST = 0.25
+"""part of the consistent estimate's variance that its difference from the efficient one has at
+least: both variances are estimates, and neither method attains its bound"""
 _NORMAL = 1.96
 """standard deviations to the end of a 95 % interval"""
 _OF_OUTPUT_ERROR = (
@@ -37,10 +49,9 @@ _OF_OUTPUT_ERROR = (
     "with a disturbance."
 )
 _OF_FILTER = (
-    "That excludes filter error's values, which the answer to the inputs does not ask for either: "
-    "the disturbance acts elsewhere than is stated, or has another spectrum, and the parameters "
-    "make up for it. Fit with method: frequency-error, or another disturbance (on, poles; "
-    "fit.compare: true lays them side by side)."
+    "That excludes filter error's values: the disturbance acts elsewhere than is stated, has "
+    "another spectrum or reaches a sensor, and the parameters make up for it. Fit with method: "
+    "frequency-error, or another disturbance (on, poles; fit.compare: true lays them side by side)."
 )
 
 
@@ -56,7 +67,8 @@ def with_second_method(
 
     Asked of linear models whose inputs do not follow the response: of output error where
     disturbances colour its residuals and take a good part of an output, of filter error where the
-    answer to the inputs, by itself, asks for other values.
+    answer to the inputs, by itself, asks for other values, or where the disturbance narrows an
+    interval by a twentieth.
 
     Args:
         problem: what was fitted.
@@ -108,11 +120,17 @@ def _is_disturbed(first: Fit) -> bool:
     return first.coloured and bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
 
 
-def _inputs_ask_for_others(first: Fit) -> bool:
-    """Whether filter error's estimates are others than the inputs ask for."""
+def _may_be_misled(first: Fit) -> bool:
+    """Whether filter error's estimates are others than the inputs ask for, or the disturbance has
+    a say in one of them: a wrong one then misleads."""
     if first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
-    return not by_the_inputs(first.reached)
+    at = first.reached
+    inputs = through_inputs(at, e := evaluate(*at))
+    k = len(at.layout.free)
+    if inputs is not None and np.any(deviations(inputs.J)[:k] > _HAS_A_SAY * deviations(e.J)[:k]):
+        return True
+    return not by_the_inputs(at)
 
 
 def _interval(b: Estimate) -> tuple[float, float, float] | None:
@@ -135,15 +153,17 @@ def _apart(a: Estimate, b: Estimate) -> bool:
 
 
 def _excluded(a: Estimate, b: Estimate) -> bool:
-    """Whether filter error's estimate is one that the other's own error excludes."""
-    interval = _interval(b)
+    """Whether filter error's estimate is one that the other's excludes: their difference has the
+    variance of the other less that of filter error."""
+    interval, own = _interval(b), _interval(a)
     # What it does not determine itself it has nothing against.
-    if not a.sd or interval is None:
+    if not a.sd or not b.sd or interval is None or own is None:
         return False
     value, low, high = interval
-    return abs(a.value - value) > _APART / _NORMAL * (
-        value - low if a.value < value else high - value
-    )
+    if own[1] <= value <= own[2]:
+        return False
+    sd = (value - low if a.value < value else high - value) / _NORMAL
+    return abs(a.value - value) > _APART * sd * math.sqrt(max(_LEAST, 1.0 - (a.sd / b.sd) ** 2))
 
 
 def sentence(second: SecondMethod, why: str) -> str:
@@ -176,6 +196,6 @@ _QUESTIONS = {
         _is_disturbed, "the residuals are coloured", _apart, _OF_OUTPUT_ERROR
     ),
     "filter-error": _Question(
-        _inputs_ask_for_others, "the inputs ask for other values", _excluded, _OF_FILTER
+        _may_be_misled, "the disturbance may have misled it", _excluded, _OF_FILTER
     ),
 }

@@ -11,6 +11,7 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.fit import first_guess
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.through_inputs import through_inputs
+from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.unknowns.layout import Solution
 
 TRUTH = {"Lb": 95.0, "tau": 0.06, "Blat": 0.11, "kappa": 3.0, "zeta": 0.4}
@@ -80,6 +81,8 @@ def verdicts(problem):
     e = evaluate(at.layout, at.data, at.noise, at.z)
     inputs = through_inputs(at, e)
     assert inputs is not None
+    # Rounding of what no input tells would be scaled to the size of what they tell.
+    assert not inputs.J[:, [at.layout.disturbance_at(n) for n in ("sigma_w", "tau_w")]].any()
     return verdict_of(problem, at.layout, e), verdict_of(problem, at.layout, inputs)
 
 
@@ -111,3 +114,47 @@ def test_the_colour_of_innovations_that_are_not_white_determines_nothing(tmp_pat
     assert found.verdict.combinations == ()
     assert "switch off" not in found.verdict.text
     assert "does not count, since they are not white" in found.verdict.text
+
+
+HEAVE = {"Zw": -0.6, "Zcol": -14.0}
+
+
+def heave(seed, gust, felt, amplitude):
+    """90 s of pulses of the collective in gusts of a second, that a vane feels or not."""
+    rng, n, fine, dt = np.random.default_rng(seed), 4500, 10, 0.02
+    h = dt / fine
+    col = amplitude * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
+    forget = np.exp(-h)
+    push = gust * np.sqrt(1 - forget**2) * rng.standard_normal(n * fine)
+    wind = scipy.signal.lfilter([1.0], [1.0, -forget], push)
+    Zw, Zcol = HEAVE.values()
+    w = scipy.signal.lfilter(
+        [0.0, h], [1.0, -1.0 - h * Zw], Zcol * np.repeat(col, fine) - Zw * wind
+    )
+    measured = (w - felt * wind)[::fine] + 0.1 * rng.standard_normal(n)
+    return Flight(dt=dt, inputs={"col": col}, outputs={"w": measured}, hold={"col": "zero-order"})
+
+
+def heave_problem(flight):
+    machine = linear_model("heave")
+    model = with_disturbance(machine.model, "heave")
+    params = model.Params(**machine.vehicle().params._asdict(), sigma_w=1.0, tau_w=1.0)
+    free = {"Zw": Free(-1.5), "Zcol": Free(-5.0)}
+    plain = Problem(
+        machine.model, machine.vehicle().params, [flight], free, method="frequency-error"
+    )
+    return Problem(model, params, [flight], free, method="filter-error"), plain
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("felt", [False, True])
+def test_a_vane_that_feels_the_gust_is_told(felt):
+    # What it measures is the motion less the gust, which no push on the motion says.
+    for seed in range(3):
+        problem, plain = heave_problem(heave(seed, 1.0, felt, 0.15))
+        found = with_second_method(problem, fit(problem), undisturbed=lambda plain=plain: plain)
+        Zw = found.estimates["Zw"]
+        assert Zw.sd is not None
+        if not felt:
+            assert Zw.value == pytest.approx(HEAVE["Zw"], abs=3.0 * Zw.sd)
+        assert ("Zw" in found.untrusted) == felt

@@ -10,11 +10,11 @@ On the record that the model itself simulates the innovations are zero, and so i
 the Jacobian of the innovations there is that of the response, weighed as the filter weighs it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
@@ -24,6 +24,9 @@ from heli_jax.identification.unknowns.layout import FlightData, Layout, Solution
 
 _LEFT = 10.0
 """of a signal's variance, from which on the error of its simulation says that it left the record"""
+MOSTLY = 1.5
+"""factor between standard deviations by the inputs alone and by all, above which a disturbance
+tells more than the inputs do"""
 _NOISE_ONLY = 1e-6
 """part of a parameter's effect on the innovations below which its effect on the response is none"""
 
@@ -59,7 +62,10 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     J[at.layout.estimator.row_signals(at.layout, at.data).size : len(J) - priors] = 0.0
     if not np.isfinite(J).all():
         return None
-    return e._replace(J=np.vstack([*_of_noise_alone(at.layout, J, e.J), J]))
+    # Rounding of a column that is none, as that of a disturbance's size, would be scaled to one.
+    noise_only = np.linalg.norm(J, axis=0) < _NOISE_ONLY * np.linalg.norm(e.J, axis=0)
+    J[:, noise_only] = 0.0
+    return e._replace(J=np.vstack([*_of_noise_alone(at.layout, noise_only, e.J), J]))
 
 
 def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightData:
@@ -73,15 +79,14 @@ def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightDa
 
 
 def _of_noise_alone(
-    layout: Layout, by_inputs: Float[np.ndarray, "n q"], J: Float[np.ndarray, "n q"]
+    layout: Layout, noise_only: Bool[np.ndarray, " q"], J: Float[np.ndarray, "n q"]
 ) -> list[Float[np.ndarray, " q"]]:
     """Rows with what the innovations tell of free parameters that no response has."""
     sds = deviations(J)
     return [
         np.eye(layout.size)[i] / sds[i]
         for i in range(len(layout.free))
-        if np.linalg.norm(by_inputs[:, i]) < _NOISE_ONLY * np.linalg.norm(J[:, i])
-        and np.isfinite(sds[i])
+        if noise_only[i] and np.isfinite(sds[i])
     ]
 
 
@@ -97,16 +102,51 @@ def not_by_inputs(verdict: Verdict, by_inputs: Verdict) -> tuple[str, ...]:
     return tuple(n for n in verdict.names if n in alone and n not in lacking)
 
 
-def resting_on_disturbance(names: Sequence[str]) -> str:
-    """That parameters rest on the model of the disturbance, whose innovations are white."""
+def mostly_by_disturbance(verdict: Verdict, by_inputs: Verdict) -> dict[str, tuple[float, float]]:
+    """By parameter of which the disturbance tells more than the inputs do, and which both
+    determine, the standard deviation by all and by the inputs alone.
+
+    Args:
+        verdict: of all that the innovations tell.
+        by_inputs: of what the responses tell.
+    """
+    lacking = {v for of in (verdict, by_inputs) for v in (*of.undetermined, *of.without_effect)}
+    sds = zip(verdict.names, deviations_of(verdict), deviations_of(by_inputs), strict=True)
+    return {n: (a, b) for n, a, b in sds if n not in lacking and b > MOSTLY * a}
+
+
+def by_inputs_alone(sds: Mapping[str, tuple[float, float]]) -> str:
+    """Why parameters have wider intervals than all that the innovations tell would give.
+
+    Args:
+        sds: of `mostly_by_disturbance`, with one parameter at least.
+    """
+    narrower = max(b / a for a, b in sds.values())
     return (
-        f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: "
-        f"{'it rests' if len(names) == 1 else 'they rest'} on the model of the disturbance."
+        f"How the disturbance goes through the machine would tell more of {listed(tuple(sds))} "
+        f"than the inputs do (intervals {narrower:.2g} times as narrow), but only as far as the "
+        "model of the disturbance is right: the intervals are those of the inputs alone."
     )
 
 
-def not_counted(names: Sequence[str]) -> str:
-    """That what a disturbance tells of parameters does not count."""
+def deviations_of(verdict: Verdict) -> np.ndarray:
+    """Of the parameters (k,), in their coordinates."""
+    return np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+
+
+def not_counted(names: Sequence[str], *, white: bool) -> str:
+    """That what a disturbance tells of parameters does not count.
+
+    Args:
+        names: of these, one at least.
+        white: whether the innovations are white.
+    """
+    if white:
+        return (
+            f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: "
+            f"{'it would rest' if len(names) == 1 else 'they would rest'} on the model of the "
+            "disturbance, which does not count."
+        )
     return (
         f"What the colour of the innovations tells of {listed(tuple(names))} does not count, since "
         "they are not white: disturbance or noise are not what the model says."

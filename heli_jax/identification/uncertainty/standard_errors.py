@@ -18,9 +18,12 @@ from heli_jax.identification.identifiability.beyond_slopes import (
 )
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.through_inputs import (
+    MOSTLY,
+    by_inputs_alone,
+    deviations_of,
+    mostly_by_disturbance,
     not_by_inputs,
     not_counted,
-    resting_on_disturbance,
     through_inputs,
 )
 from heli_jax.identification.identifiability.valley import Valley
@@ -38,9 +41,6 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import (
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
 
-_MORE = 1.5
-"""factor on the standard deviation of a parameter from which on most of what is known of it comes
-from the colour of the innovations"""
 _LARGEST = 700.0
 """log of the largest end of an interval: exp overflows at 709"""
 
@@ -112,8 +112,8 @@ def _with_process_noise(
     *,
     white: bool,
 ) -> StandardErrors:
-    """Cramér-Rao's bound of a filter's innovations, or where these are not white that of the
-    responses in them alone.
+    """Cramér-Rao's bound of a filter's innovations, or where these are not white, or a disturbance
+    tells more of a parameter than the inputs do, that of the responses in them alone.
 
     Args:
         problem: what was fitted.
@@ -128,21 +128,23 @@ def _with_process_noise(
     slopes = around._replace(combined=False)
     by_all = verdict_of(problem, layout, e, around=slopes)
     by_inputs = verdict_of(problem, layout, inputs, around=slopes)
-    resting = not_by_inputs(by_all, by_inputs)
+    resting, mostly = not_by_inputs(by_all, by_inputs), mostly_by_disturbance(by_all, by_inputs)
+    # The disturbance is a model as well, and one that nobody has flown for: it adds to what the
+    # inputs tell, and does not speak in their place.
+    counts = white and not resting and not mostly
     errors = _by_slopes(problem, at, e, by_all, around, white=white)
     asked = errors.verdict
-    if not white:
+    if not counts:
         lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
         asked = replace(asked, undetermined=tuple(lacking))
     beyond = beyond_slopes(problem, at, e, asked, errors.wider * errors.quantiles)
-    if white:
+    if counts:
         if beyond is not AS_SLOPES:
             around = around._replace(**beyond._asdict())
             errors = _by_slopes(problem, at, e, by_all, around, white=True)
-        said = [resting_on_disturbance(resting)] if resting else []
-        return _saying(said, errors)._replace(limits=beyond.limits)
+        return errors._replace(limits=beyond.limits)
     # The likelihood has the colour in it: its ends are those of parameters that rest on responses.
-    wider = _deviations(by_inputs) > _MORE * _deviations(by_all)
+    wider = deviations_of(by_inputs) > MOSTLY * deviations_of(by_all)
     limits = {n: v for n, v in beyond.limits.items() if not wider[by_all.names.index(n)]}
     around = around._replace(**beyond._replace(limits=limits)._asdict())
     said = []
@@ -150,8 +152,10 @@ def _with_process_noise(
         # The colour has put the optimum where it is along directions that no input shows: slopes
         # there name combinations that do not hold where the machine is.
         around = around._replace(combined=False)
-        said = [not_counted(resting or by_inputs.undetermined)]
-    errors = _by_slopes(problem, at, inputs, by_all, around, white=False)
+        said = [not_counted(resting or by_inputs.undetermined, white=white)]
+    if white and mostly:
+        said.append(by_inputs_alone(mostly))
+    errors = _by_slopes(problem, at, inputs, by_all, around, white=white)
     return _saying(said, errors)._replace(limits=limits, by=inputs)
 
 
@@ -159,10 +163,6 @@ def _saying(sentences: list[str], errors: StandardErrors) -> StandardErrors:
     """With further sentences at the end of the verdict."""
     verdict = replace(errors.verdict, sentences=(*errors.verdict.sentences, *sentences))
     return errors._replace(verdict=verdict)
-
-
-def _deviations(verdict: Verdict) -> np.ndarray:
-    return np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
 
 
 def _by_slopes(
