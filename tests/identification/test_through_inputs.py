@@ -126,7 +126,7 @@ def heave(seed, gust, felt, amplitude):
     col = amplitude * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
     forget = np.exp(-h)
     push = gust * np.sqrt(1 - forget**2) * rng.standard_normal(n * fine)
-    wind = scipy.signal.lfilter([1.0], [1.0, -forget], push)
+    wind = np.asarray(scipy.signal.lfilter([1.0], [1.0, -forget], push))
     Zw, Zcol = HEAVE.values()
     w = scipy.signal.lfilter(
         [0.0, h], [1.0, -1.0 - h * Zw], Zcol * np.repeat(col, fine) - Zw * wind
