@@ -12,7 +12,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
-from heli_jax.new_config import _names, guess, write_config
+from heli_jax.new_config import guess, tables, write_config
 from heli_jax.new_config.guess import (
     Series,
     by_motion,
@@ -219,7 +219,7 @@ def test_a_whole_name_goes_before_one_that_holds_it_and_commands_are_no_measurem
     ],
 )
 def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
-    found = [k for k, words in _names()["outputs"].items() if by_name(words, [name])]
+    found = [k for k, words in tables.names()["outputs"].items() if by_name(words, [name])]
     assert found == [called]
 
 
@@ -243,7 +243,7 @@ def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
     ],
 )
 def test_names_of_sticks_as_people_write_them(name: str, stick: str) -> None:
-    names = _names()
+    names = tables.names()
     found = [
         k for k, words in names["inputs"].items() if by_name(words, [name], names["commands"][k])
     ]
@@ -486,7 +486,7 @@ def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
     ],
 )
 def test_german_names_and_those_of_autopilots(name: str, kind: str, signal: str) -> None:
-    listed = _names()[kind]
+    listed = tables.names()[kind]
     assert [s for s, called in listed.items() if by_name(called, [name])] == [signal]
 
 
@@ -522,7 +522,7 @@ def test_small_units_at_the_end_of_a_name(name: str, stem: str, unit: str) -> No
     ],
 )
 def test_channels_by_their_numbers(name: str, stick: str | None) -> None:
-    listed = _names()["numbered"]
+    listed = tables.names()["numbered"]
     assert [s for s, called in listed.items() if by_number(called, [name])] == [stick] * bool(stick)
 
 

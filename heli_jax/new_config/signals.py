@@ -1,0 +1,192 @@
+"""Which channels of a log may be the inputs and outputs of a model."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.model import axes_of
+from heli_jax.flights.channel_names import names_a_stick
+from heli_jax.flights.preset import model_inputs, model_outputs
+from heli_jax.new_config import guess, tables, text
+from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.logs import Log
+from heli_jax.new_config.places import is_place
+from heli_jax.numerics.white_noise import wanders, without_noise
+
+_STICKS_TOO = {"roll", "pitch", "yaw"}
+"""names of motions that sticks have as well"""
+
+
+def signals_of(model: Any, log: Log) -> text.Signals:
+    """Channels for inputs and outputs of the model, and which of the log's are left."""
+    called, taken = tables.names(), []
+    inputs: dict[str, Guess | None] = {}
+    numbered: dict[str, list[str]] = {}
+    excitations: dict[str, str] = {}
+    sticks = [n for n in log.series if not (guess.is_excitation(n) or is_place(n, log.series))]
+    for name in naming.names(model.Inputs):
+        own = model_inputs().get(name)
+        known = called["rotor_speed"] if name == "Omega" else []
+        commands: list[str] = []
+        if own is not None and name != "Omega":
+            stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+            known, commands = called["inputs"][stick], called["commands"][stick]
+            numbered[name] = guess.by_number(called["numbered"][stick], sticks)
+        unit, known = naming.unit(model.Inputs, name) or "1", [words_of(name), *known]
+        allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
+        inputs[name] = _found(log, guess.by_name(known, allowed, commands), unit, taken)
+        for channel in that_move(log, guess.excitations(known, tuple(log.series)))[:1]:
+            excitations[name] = channel
+    taken += excitations.values()
+    outputs: dict[str, Guess] = {}
+    for name in naming.names(model.Outputs):
+        unit = naming.unit(model.Outputs, name) or "1"
+        output = _found(log, outputs_called(log, names_of_output(name), unit), unit, taken)
+        if output is not None:
+            outputs[name] = output
+    # What an output follows is the better reason where one input makes it move.
+    if len(inputs) > 1:
+        _by_number(model, log, inputs, numbered, taken)
+    _by_correlation(model, log, inputs, outputs, taken)
+    _by_number(model, log, inputs, numbered, taken)
+    speed = guess.by_name(called["rotor_speed"], tuple(log.series))
+    known = {}
+    if speed and "Omega" in naming.names(model.Params):
+        known = {"Omega": (speed[0], guess.rotor_speed(speed[0], log.series[speed[0]]))}
+        taken.append(speed[0])
+    rest = tuple(n for n in log.series if n not in taken)
+    measured = [log.series[g.channel].values for g in outputs.values()]
+    smooth = bool(measured) and all(map(without_noise, measured))
+    wandering = {} if smooth else _wandering(model, log, outputs)
+    outputs = {n: g for n, g in outputs.items() if n not in wandering}
+    ranges = {n: (np.nanmin(x := log.series[n].values), np.nanmax(x)) for n in rest}
+    return text.Signals(inputs, outputs, known, rest, excitations, wandering, smooth, ranges)
+
+
+def only_turn(model: Any) -> dict[str, str]:
+    """By angle the rate, of a model whose outputs are one axis's rate and angle alone: there the
+    angle says nothing that the rate does not."""
+    pairs = {a.angle: a.rate for a in axes_of(model) if a.angle is not None}
+    outputs = set(naming.names(model.Outputs))
+    return {angle: rate for angle, rate in pairs.items() if {angle, rate} == outputs}
+
+
+def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, Guess]:
+    """Angles beside their rate whose error is that of an integrated rate, as an autopilot's."""
+    return {
+        angle: outputs[angle]
+        for angle, rate in only_turn(model).items()
+        if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
+    }
+
+
+def names_of_output(name: str) -> list[str]:
+    """What people call an output of a model, words by blanks."""
+    return [words_of(name), *tables.names()["outputs"].get(model_outputs().get(name, name), [])]
+
+
+def names_of_input(name: str) -> list[str]:
+    """What people call an input of a model, words by blanks."""
+    own, called = model_inputs().get(name), tables.names()
+    if own is None:
+        return [words_of(name)]
+    if name == "Omega":
+        return [words_of(name), *called["rotor_speed"]]
+    stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+    return [words_of(name), *called["inputs"][stick]]
+
+
+def words_of(name: str) -> str:
+    """What the model calls a signal, as words."""
+    return " ".join(guess.words_of(name))
+
+
+def outputs_called(log: Log, called: Sequence[str], si: str) -> list[str]:
+    """Channels that may be an output, the likeliest first."""
+    # Among all names, since what stands beside a name may say what it means.
+    spelled = guess.spelled_out(tuple(log.series))
+    names = {
+        spelled.get(n, n): n
+        for n, s in log.series.items()
+        if guess.may_be(spelled.get(n, n), s, called, si)
+    }
+    return [names[n] for n in guess.by_name(called, list(names))]
+
+
+def that_move(log: Log, names: Sequence[str]) -> list[str]:
+    """Of the channels those that move."""
+    return [n for n in names if np.nanstd(log.series[n].values) > 0]
+
+
+def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:
+    candidates = [n for n in names if n not in taken]
+    # What never moves is a trim, or a channel that is not connected; better than none.
+    candidates = that_move(log, candidates) or candidates
+    if not candidates:
+        return None
+    chosen = guess.of_known_unit(candidates, log.series, si)
+    taken.append(chosen)
+    scaled = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    others = [n for n in candidates if n != chosen]
+    if not others:
+        return scaled
+    remark = f"could be {', '.join(others[:3])} as well"
+    return scaled._replace(remarks=(*scaled.remarks, remark))
+
+
+def _full_travel(log: Log) -> float | None:
+    return guess.full_travel({n: s for n, s in log.series.items() if names_a_stick(n)})
+
+
+def _by_number(
+    model: Any,
+    log: Log,
+    inputs: dict[str, Guess | None],
+    numbered: Mapping[str, list[str]],
+    taken: list[str],
+) -> None:
+    """Inputs whose channels have numbers for names, in the usual order."""
+    for name, input in inputs.items():
+        si = naming.unit(model.Inputs, name) or "1"
+        names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
+        made = None if input is not None else _found(log, names, si, taken)
+        if made is not None:
+            why = "GUESS: by its number, in the order roll, pitch, throttle, yaw"
+            inputs[name] = made._replace(remarks=(why, *made.remarks))
+
+
+def _by_correlation(
+    model: Any,
+    log: Log,
+    inputs: dict[str, Guess | None],
+    outputs: Mapping[str, Guess | None],
+    taken: list[str],
+) -> None:
+    """Inputs whose names tell nothing, by what an output follows."""
+    known = [g.channel for g in outputs.values() if g is not None]
+    # What is named as a motion moves with the stick, and more like the output than the stick does.
+    motions = {c for names in tables.names()["outputs"].values() for c in names} - _STICKS_TOO
+    moving = guess.by_name(sorted(motions), tuple(log.series))
+    measured = {n for n in moving if not names_a_stick(n)}
+    for name, input in inputs.items():
+        if input is not None or not known:
+            continue
+        si = naming.unit(model.Inputs, name) or "1"
+        left = {
+            n: s
+            for n, s in log.series.items()
+            if n not in {*taken, *measured}
+            and guess.may_move(n, s, si)
+            and not (guess.is_excitation(n) or is_place(n, log.series))
+            and np.nanstd(s.values) > 0
+        }
+        best = guess.by_motion(log.series[known[-1]], left)
+        if best is None:
+            continue
+        channel, related = best
+        made = guess.scaled(channel, log.series[channel], si, _full_travel(log))
+        why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
+        inputs[name] = made._replace(remarks=(why, *made.remarks))
+        taken.append(channel)
