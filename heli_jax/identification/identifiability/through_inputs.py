@@ -134,6 +134,14 @@ def deviations_of(verdict: Verdict) -> np.ndarray:
     return np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
 
 
+def resting_on_disturbance(names: Sequence[str]) -> str:
+    """That parameters rest on the model of the disturbance, whose innovations are white."""
+    return (
+        f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: "
+        f"{'it rests' if len(names) == 1 else 'they rest'} on the model of the disturbance."
+    )
+
+
 def not_counted(names: Sequence[str], *, white: bool) -> str:
     """That what a disturbance tells of parameters does not count.
 

@@ -24,6 +24,7 @@ from heli_jax.identification.identifiability.through_inputs import (
     mostly_by_disturbance,
     not_by_inputs,
     not_counted,
+    resting_on_disturbance,
     through_inputs,
 )
 from heli_jax.identification.identifiability.valley import Valley
@@ -112,8 +113,8 @@ def _with_process_noise(
     *,
     white: bool,
 ) -> StandardErrors:
-    """Cramér-Rao's bound of a filter's innovations, or where these are not white, or a disturbance
-    tells more of a parameter than the inputs do, that of the responses in them alone.
+    """Cramér-Rao's bound of a filter's innovations; where these are not white, or the spectrum of a
+    disturbance tells more of a parameter than the inputs do, that of the responses in them alone.
 
     Args:
         problem: what was fitted.
@@ -129,9 +130,11 @@ def _with_process_noise(
     by_all = verdict_of(problem, layout, e, around=slopes)
     by_inputs = verdict_of(problem, layout, inputs, around=slopes)
     resting, mostly = not_by_inputs(by_all, by_inputs), mostly_by_disturbance(by_all, by_inputs)
-    # The disturbance is a model as well, and one that nobody has flown for: it adds to what the
-    # inputs tell, and does not speak in their place.
-    counts = white and not resting and not mostly
+    # Of several outputs one that is pushed moves the others, which is an answer to a motion that
+    # was measured. Of one the disturbance has its spectrum alone, as far as its model is right:
+    # that adds to what the inputs tell, and does not speak in their place.
+    spectrum_alone = all(len(outputs) == 1 for outputs in layout.outputs)
+    counts = white and not (spectrum_alone and (resting or mostly))
     errors = _by_slopes(problem, at, e, by_all, around, white=white)
     asked = errors.verdict
     if not counts:
@@ -142,7 +145,8 @@ def _with_process_noise(
         if beyond is not AS_SLOPES:
             around = around._replace(**beyond._asdict())
             errors = _by_slopes(problem, at, e, by_all, around, white=True)
-        return errors._replace(limits=beyond.limits)
+        said = [resting_on_disturbance(resting)] if resting else []
+        return _saying(said, errors)._replace(limits=beyond.limits)
     # The likelihood has the colour in it: its ends are those of parameters that rest on responses.
     wider = deviations_of(by_inputs) > MOSTLY * deviations_of(by_all)
     limits = {n: v for n, v in beyond.limits.items() if not wider[by_all.names.index(n)]}
