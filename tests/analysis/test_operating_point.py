@@ -50,6 +50,7 @@ def signals(outputs, inputs=STILL):
 NO_NUISANCE = SimpleNamespace(nuisance={})
 
 
+@pytest.mark.slow
 def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering):
     # At zero throttle, where the rotor stands still, it is nothing at all.
     model = models.helicopter("consistent")

@@ -275,6 +275,7 @@ def test_autorotation_sinks_as_measured(full, xcell):
     assert -s["dz"] == pytest.approx(wanted, rel=0.1)
 
 
+@pytest.mark.slow
 def test_autorotation_in_forward_flight_is_that_of_momentum_theory(full, xcell):
     """Past the wake's ring the measured curve is momentum theory: the power balance with it."""
     model, _ = full

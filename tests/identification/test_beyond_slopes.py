@@ -1,6 +1,7 @@
 """Intervals by the likelihood where the slopes at an optimum of chance say too much."""
 
 import numpy as np
+import pytest
 import scipy.linalg
 import scipy.optimize
 
@@ -55,6 +56,7 @@ def test_what_steps_determine_keeps_its_gaussian_intervals():
         assert low < truth < high
 
 
+@pytest.mark.slow
 def test_a_wide_interval_ends_where_the_likelihood_of_all_together_has_fallen():
     u = steps(8.0, 4)
     asked = problem(u, 0.12, 4)

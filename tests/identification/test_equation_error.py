@@ -283,6 +283,7 @@ def config(tmp_path):
     return tmp_path / "fit.yaml"
 
 
+@pytest.mark.slow
 def test_a_configuration_without_starts_is_fitted(config, capsys):
     from heli_jax.output import print_fit
 

@@ -102,6 +102,7 @@ def test_prior_on_a_makes_it_well_posed(bench_run):
     assert found.verdict.rank_without_priors == 2
 
 
+@pytest.mark.slow
 def test_check_says_the_same_without_a_fit(bench_run):
     verdict = check(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], THREE)).verdict
     assert not verdict.identifiable

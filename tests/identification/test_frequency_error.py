@@ -223,6 +223,7 @@ def test_an_output_that_is_sparse_throughout_is_refused():
         problem_of(sparse)
 
 
+@pytest.mark.slow
 def test_a_fit_in_time_begins_at_the_estimate_in_frequency():
     """A stand that swings 60 times in the record, every start four times too small: by itself the
     simulation loses count."""

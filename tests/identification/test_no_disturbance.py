@@ -113,6 +113,7 @@ def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
     assert any("begun anew" in note for note in settled.notes)
 
 
+@pytest.mark.slow
 def test_a_search_that_ran_to_white_noise_is_begun_again_from_other_correlation_times():
     flight = gusty(n=600, gust=1.0, noise=0.01)
     model = with_disturbance(replace(ROLL, axes=(Axis("roll", rate="p", angle="phi"),)), "roll")

@@ -71,6 +71,7 @@ def estimate(model, flight):
     return {n: (e.value, e.sd or 0.0) for n, e in found.items()}
 
 
+@pytest.mark.slow
 def test_noise_of_what_is_integrated_does_not_attenuate_its_scale(flight):
     found = estimate(MODEL, flight)
     for name, true in (("scale", SCALE), ("bias", BIAS)):

@@ -90,6 +90,7 @@ def test_a_servo_that_is_left_out_is_named():
     assert all(row.optimum == 1 for row in found.starts)
 
 
+@pytest.mark.slow
 def test_the_starts_differ_in_the_delays_alone():
     model = models.with_delays(ROLL.model, ["lat"], ["phi"])
     start = params(model, delay_lat=0.02, delay_phi=0.1)

@@ -166,6 +166,7 @@ def test_a_stick_that_does_more_to_one_side_and_dry_friction_are_no_plain_yes(ma
     assert "the response of p depends on amplitude" in found.adequacy.summary
 
 
+@pytest.mark.slow
 def test_a_flight_with_a_stick_of_another_scale_is_named():
     rng, flights = np.random.default_rng(5), []
     for name, scale in (("one", 1.0), ("two", 1.1), ("three", 1.0)):

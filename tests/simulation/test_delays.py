@@ -168,7 +168,11 @@ def test_in_blocks_and_reduced_it_is_the_same_run(run, hold):
         assert float(value) == pytest.approx(np.sum(stepwise[0] * stepwise[1]), rel=1e-10)
 
 
-@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize(
+    "hold",
+    # Mixed is held and linear at once.
+    ["mixed", *(pytest.param(hold, marks=pytest.mark.slow) for hold in ("held", "linear"))],
+)
 @pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
 def test_derivatives_by_each_delay(machine, hold):
     u = Inputs(*jnp.asarray(sticks(3)))

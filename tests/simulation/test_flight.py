@@ -62,6 +62,7 @@ def test_free_fall_is_a_parabola(xcell):
     assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(60))
 
 
+@pytest.mark.slow
 def test_turning_the_problem_turns_the_trajectory(xcell, hover):
     model, angle, n = models.helicopter("consistent"), 2.2, 150
     u = sticks(hover, n)

@@ -233,6 +233,7 @@ def test_accumulate_with_other_solvers():
     assert float(jax.jit(run)(inputs())) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_is_drawn_as_with_held_inputs():
     """The disturbance does not care what the inputs do: the difference is that without noise."""
     model = with_disturbance(models.roll_on_stand, "roll")
