@@ -117,6 +117,7 @@ def test_shipped_configurations(path):
     [
         ({"ground": 0.0}, ["simulate.ground", "got 0", "less than 0"]),
         ({"start": {"clmb": 1}}, ["simulate.start.clmb", "did you mean 'climb'"]),
+        ({"start": 3}, ["simulate.start", "got 3", "a section of keys", "keys simulate.start"]),
         ({"wind": [1, 2]}, ["simulate.wind[2]", "missing"]),
         ({"wind": [1, 2, float("nan")]}, ["simulate.wind[2]", "finite"]),
         ({"hold_attitude": "often"}, ["simulate.hold_attitude", "'often'", "boolean"]),

@@ -254,6 +254,12 @@ def _sentence(error: ErrorDetails) -> str:
     message = message[0].lower() + message[1:]
     if error["type"] == "list_type" and isinstance(value, str | int | float):
         return f"{place}: expected a list, such as [{value!s:.40}], got {value!r:.60}"
+    if error["type"] in ("model_type", "dict_type"):
+        without = "; left out, it has its defaults" if value is None else ""
+        keys = f"see heli-jax keys {place.partition('[')[0]}"
+        return (
+            f"{place}: got {value!r:.60}, expected a section of keys and values ({keys}){without}"
+        )
     # A section says where it is; quoted, it would fill the line. Our own validators say what they
     # got in their message.
     if isinstance(value, dict | list) or error["type"] == "value_error":
