@@ -478,6 +478,8 @@ def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
         ("nick", "outputs", "pitch"),
         ("Nickrate", "outputs", "pitch_rate"),
         ("Gierwinkel", "outputs", "yaw"),
+        ("assiette [deg]", "outputs", "pitch"),
+        ("Pas général", "inputs", "collective"),
         ("gier_rate", "outputs", "yaw_rate"),
         ("rollspeed", "outputs", "roll_rate"),
         ("roll_cdeg", "outputs", "roll"),

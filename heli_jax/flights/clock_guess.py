@@ -11,7 +11,18 @@ from heli_jax.flights.runs import restarts
 from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import LETTERS, likely_unit, split_unit, time_unit
 
-TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+TIME_NAMES = {
+    "zeit",
+    "temps",
+    "t",
+    "time",
+    "timestamp",
+    "timestamps",
+    "seconds",
+    "sec",
+    "elapsed",
+    "clock",
+}
 _STAMP = ("header", "stamp")
 _SAMPLED = "timestamp_sample"
 """of a topic of PX4, beside `timestamp`, when it was published"""

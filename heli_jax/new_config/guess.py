@@ -1,6 +1,7 @@
 """Which channel of a log is which signal, in which unit: guesses, each with its reason."""
 
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -24,7 +25,10 @@ _OTHER = {
     *("temperature", "rssi", "motor", "esc", "servo", "pid", "gain", "quat", "var", "noise"),
 }
 # gyro_roll is no roll, accel_x no speed.
-_CHANGES = {"gyro", "gyr", "rate", "rates", "vel", "acc", "accel", "acceleration"}
+_CHANGES = {
+    *("gyro", "gyr", "rate", "rates", "vel", "acc", "accel", "acceleration"),
+    *("vitesse", "taux"),
+}
 _EXCITATIONS = {
     *("sweep", "chirp", "sid", "sysid", "inject", "injected", "injection", "excitation"),
     *("excite", "multisine", "prbs"),
@@ -86,6 +90,9 @@ def words_of(name: str) -> tuple[str, ...]:
     """
     stem = without_unit(name)[0]
     stem = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", stem).translate(_UMLAUTS)
+    # Other accents are left out: of Régime an r would remain, which is a yaw rate's name.
+    stem = unicodedata.normalize("NFKD", stem)
+    stem = "".join(c for c in stem if not unicodedata.combining(c))
     return tuple(w for w in re.split(r"[^a-z0-9]+", stem.lower()) if w)
 
 
