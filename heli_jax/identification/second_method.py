@@ -126,11 +126,12 @@ def _may_be_misled(first: Fit) -> bool:
     if first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
     at = first.reached
-    inputs = through_inputs(at, e := evaluate(*at))
+    e = evaluate(*at)
+    inputs = through_inputs(at, e)
     k = len(at.layout.free)
     if inputs is not None and np.any(deviations(inputs.J)[:k] > _HAS_A_SAY * deviations(e.J)[:k]):
         return True
-    return not by_the_inputs(at)
+    return not by_the_inputs(at, e)
 
 
 def _interval(b: Estimate) -> tuple[float, float, float] | None:
@@ -155,12 +156,12 @@ def _apart(a: Estimate, b: Estimate) -> bool:
 def _excluded(a: Estimate, b: Estimate) -> bool:
     """Whether filter error's estimate is one that the other's excludes: their difference has the
     variance of the other less that of filter error."""
-    interval, own = _interval(b), _interval(a)
+    interval, filtered = _interval(b), _interval(a)
     # What it does not determine itself it has nothing against.
-    if not a.sd or not b.sd or interval is None or own is None:
+    if not a.sd or not b.sd or interval is None or filtered is None:
         return False
     value, low, high = interval
-    if own[1] <= value <= own[2]:
+    if filtered[1] <= value <= filtered[2]:
         return False
     sd = (value - low if a.value < value else high - value) / _NORMAL
     return abs(a.value - value) > _APART * sd * math.sqrt(max(_LEAST, 1.0 - (a.sd / b.sd) ** 2))

@@ -27,11 +27,10 @@ def signals_of(model: Any, log: Log) -> text.Signals:
     excitations: dict[str, str] = {}
     sticks = [n for n in log.series if not (guess.is_excitation(n) or is_place(n, log.series))]
     for name in naming.names(model.Inputs):
-        own = model_inputs().get(name)
+        stick = _stick(name)
         known = called["rotor_speed"] if name == "Omega" else []
         commands: list[str] = []
-        if own is not None and name != "Omega":
-            stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+        if stick is not None:
             known, commands = called["inputs"][stick], called["commands"][stick]
             numbered[name] = guess.by_number(called["numbered"][stick], sticks)
         unit, known = naming.unit(model.Inputs, name) or "1", [words_of(name), *known]
@@ -89,13 +88,18 @@ def names_of_output(name: str) -> list[str]:
 
 def names_of_input(name: str) -> list[str]:
     """What people call an input of a model, words by blanks."""
-    own, called = model_inputs().get(name), tables.names()
-    if own is None:
-        return [words_of(name)]
+    stick, called = _stick(name), tables.names()
     if name == "Omega":
         return [words_of(name), *called["rotor_speed"]]
-    stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
-    return [words_of(name), *called["inputs"][stick]]
+    return [words_of(name), *(called["inputs"][stick] if stick is not None else ())]
+
+
+def _stick(name: str) -> str | None:
+    """The stick that moves an input of a model, as the table of names has it; None of others."""
+    signal = model_inputs().get(name)
+    if signal is None or name == "Omega":
+        return None
+    return signal.command.removeprefix("cyclic_").replace("tail", "yaw")
 
 
 def words_of(name: str) -> str:

@@ -102,9 +102,9 @@ def not_by_inputs(verdict: Verdict, by_inputs: Verdict) -> tuple[str, ...]:
     return tuple(n for n in verdict.names if n in alone and n not in lacking)
 
 
-def mostly_by_disturbance(verdict: Verdict, by_inputs: Verdict) -> dict[str, tuple[float, float]]:
+def mostly_by_disturbance(verdict: Verdict, by_inputs: Verdict) -> dict[str, float]:
     """By parameter of which the disturbance tells more than the inputs do, and which both
-    determine, the standard deviation by all and by the inputs alone.
+    determine, the standard deviation by the inputs alone over that by all.
 
     Args:
         verdict: of all that the innovations tell.
@@ -112,19 +112,19 @@ def mostly_by_disturbance(verdict: Verdict, by_inputs: Verdict) -> dict[str, tup
     """
     lacking = {v for of in (verdict, by_inputs) for v in (*of.undetermined, *of.without_effect)}
     sds = zip(verdict.names, deviations_of(verdict), deviations_of(by_inputs), strict=True)
-    return {n: (a, b) for n, a, b in sds if n not in lacking and b > MOSTLY * a}
+    return {n: b / a for n, a, b in sds if n not in lacking and b > MOSTLY * a}
 
 
-def by_inputs_alone(sds: Mapping[str, tuple[float, float]]) -> str:
+def by_inputs_alone(ratios: Mapping[str, float]) -> str:
     """Why parameters have wider intervals than all that the innovations tell would give.
 
     Args:
-        sds: of `mostly_by_disturbance`, with one parameter at least.
+        ratios: of `mostly_by_disturbance`, with one parameter at least.
     """
-    narrower = max(b / a for a, b in sds.values())
+    ratio = max(ratios.values())
     return (
-        f"How the disturbance goes through the machine would tell more of {listed(tuple(sds))} "
-        f"than the inputs do (intervals {narrower:.2g} times as narrow), but only as far as the "
+        f"How the disturbance goes through the machine would tell more of {listed(tuple(ratios))} "
+        f"than the inputs do (intervals {ratio:.2g} times as narrow), but only as far as the "
         "model of the disturbance is right: the intervals are those of the inputs alone."
     )
 

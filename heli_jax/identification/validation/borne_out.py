@@ -9,7 +9,7 @@ parameters: the inputs ask for other values.
 
 import numpy as np
 
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.residual_slopes import (
     longest,
@@ -22,13 +22,14 @@ _LEVEL = 1e-3
 """of all outputs together"""
 
 
-def by_the_inputs(at: Solution) -> bool:
+def by_the_inputs(at: Solution, e: Evaluation) -> bool:
     """Whether nothing shows that the inputs ask for other values of the parameters.
 
     Args:
         at: where the fit ended.
+        e: what that tells.
     """
-    layout, e = at.layout, evaluate(*at)
+    layout = at.layout
     if any(count > 1 for count, _ in layout.windows):
         return True
     flights, k = longest(at), len(layout.of_interest)
