@@ -127,24 +127,28 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("method", "hz", "behind", "said"),
+    ("method", "hz", "behind", "fixed", "said"),
     [
-        ("filter-error", 20, False, True),
-        ("filter-error", 20, True, False),  # noise that the logger added is white
-        ("filter-error", 90, False, False),
-        ("output-error", 20, False, False),  # its intervals allow for it
+        ("filter-error", 20, False, ["sigma_y"], True),
+        ("filter-error", 20, False, [], False),  # it is estimated
+        ("filter-error", 20, True, ["sigma_y"], False),  # noise that the logger added is white
+        ("filter-error", 90, False, ["sigma_y"], False),
+        ("output-error", 20, False, ["sigma_y"], False),  # its intervals allow for it
     ],
 )
-def test_noise_that_a_low_pass_coloured_is_a_caution(load, tmp_path, method, hz, behind, said):
+def test_given_noise_that_a_low_pass_coloured_is_a_caution(
+    load, tmp_path, method, hz, behind, fixed, said
+):
     noise = np.random.default_rng(3).normal(size=TIMES.size)
     passed = noise if behind else scipy.signal.lfilter(*scipy.signal.butter(2, hz * 2 * DT), noise)
     write_log(tmp_path / "flight.log", np.sin(TIMES) + 0.05 * passed, ())
     fit = {"method": method, "free": {"Blat": {"start": 0.1}}}
-    noisy = load(flight(filter={"kind": "biquad", "hz": hz}), fit=fit, disturbance={"on": ["p"]})
+    disturbance = {"on": ["p"], "fixed": fixed}
+    noisy = load(flight(filter={"kind": "biquad", "hz": hz}), fit=fit, disturbance=disturbance)
     (read,) = read_flights(noisy)
     caution = "its noise went through the low-pass of 20 Hz too, and is not white at 200 Hz"
     assert [caution in c for c in read.source.cautions] == ([True] if said else [])
-    assert not said or "state rate: 40 beside" in read.source.cautions[0]
+    assert not said or "leave sigma_y out of it" in read.source.cautions[0]
 
 
 ROTORFLIGHT = {

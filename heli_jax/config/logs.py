@@ -32,6 +32,7 @@ from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.row_clock import by_rate
 from heli_jax.flights.table import Table
+from heli_jax.identification.methods import estimator_of
 
 
 def read_flights(
@@ -110,16 +111,19 @@ def _read_flight(
     first, *others = _treated(experiment, flights, f, where)
     cautions = (
         *filter_cautions(first.source, everything.outputs),
-        *(coloured_noise_cautions(first, everything.outputs) if _filter_error(experiment) else ()),
+        *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),
     )
     return (_with_notes(first, notes, cautions), *others)
 
 
-def _filter_error(experiment: Experiment) -> bool:
-    fit = experiment.config.fit
-    return fit is not None and fit.method == "filter-error"
+def _noise_given(experiment: Experiment) -> bool:
+    """Whether filter error takes the outputs' stated noise as it is."""
+    fit, disturbance = experiment.config.fit, experiment.config.disturbance
+    if fit is None or disturbance is None or not estimator_of(fit.method).process_noise:
+        return False
+    return "sigma_y" in disturbance.fixed
 
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:

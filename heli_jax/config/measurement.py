@@ -16,11 +16,7 @@ from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import shown
-from heli_jax.numerics.white_noise import wanders
-
-_WHITE_TO = 3.0
-"""times its cut-off, up to which rate noise behind a low-pass is nearly white: by simulation, see
-docs/onboard.md"""
+from heli_jax.identification.filtered_noise import filtered_noise
 
 type _Channel = tuple[tuple[Filter, ...], float]
 
@@ -141,40 +137,23 @@ def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) 
     return tuple(said)
 
 
-def coloured_noise_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[str, ...]:
-    """Outputs whose noise went through a modelled low-pass and is not white at the flight's rate.
+def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[str, ...]:
+    """Outputs whose noise went through a modelled low-pass and is not white at the flight's rate,
+    where filter error is told the measurement noise and so estimates no other.
 
-    Filter error has white noise behind the filter. Noise that came in before it is then taken for
-    a disturbance or a faster machine.
+    The noise is then taken for a disturbance or a faster machine.
 
     Args:
         flight: as it is fitted.
-        outputs: what is stated of each, or its preset says.
+        model: with the filters of its outputs.
     """
-    said = []
-    for name, output in outputs.items():
-        lowpasses = [f for f in _modelled(flight.source, output) if f.kind != "notch"]
-        if not lowpasses or name not in flight.outputs:
-            continue
-        hz, rate = cutoff(lowpasses), 1.0 / flight.dt
-        if rate > _WHITE_TO * hz and wanders(flight.outputs[name]):
-            said.append(
-                f"{name}: its noise went through the low-pass of {hz:.3g} Hz too, and is not white "
-                f"at {rate:.4g} Hz, for which filter error takes it: estimates may be off by "
-                f"several standard deviations; state rate: {2.0 * hz:.3g} beside the log, at which "
-                "it is nearly white"
-            )
-    return tuple(said)
-
-
-def _modelled(source: Source | None, output: OutputConfig) -> Iterator[Filter]:
-    """The filters that the model has for an output."""
-    for config in output.filter or ():
-        if config.kind != FROM_LOG:
-            yield config.filter
-        elif source is not None:
-            logged = logged_filters(source.firmware, source.parameters, output.signal)
-            yield from () if logged is None else logged.filters
+    return tuple(
+        f"{p.output}: its noise went through the low-pass of {p.hz:.3g} Hz too, and is not white "
+        f"at {1.0 / flight.dt:.4g} Hz, for which `disturbance.fixed: [sigma_y]` takes it: "
+        "estimates may be off by several standard deviations; leave sigma_y out of it, and the "
+        "noise before the filter is estimated"
+        for p in filtered_noise(model.low_passes, (flight,))
+    )
 
 
 def _not_modelled(name: str, logged: LoggedFilters) -> str:

@@ -125,6 +125,7 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         delay_lines=model.delay_lines,
         positive=model.positive,
         fastest=model.fastest,
+        low_passes=model.low_passes,
         disturbances=(*model.disturbances, *added),
     )
 

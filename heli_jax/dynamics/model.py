@@ -56,6 +56,20 @@ class Disturbance(NamedTuple):
     """its own states, the one that is driven by white noise first"""
 
 
+class LowPass(NamedTuple):
+    """Where the noise of a sensor comes in that an output's low-passes have filtered."""
+
+    output: str
+    """whose filters they are"""
+    state: str
+    """on whose derivative white noise before the first of them acts"""
+    intensity: float
+    """square root of its spectral density there, per unit of its standard deviation behind all of
+    them [1/sqrt(s), for a rate's state 1/s more]"""
+    hz: float
+    """where they are 3 dB down together"""
+
+
 class SteadyFlight(NamedTuple):
     """What trim solves for, by name: as many unknowns as equations."""
 
@@ -131,6 +145,8 @@ class Model(eqx.Module):
     `noise_intensity` is that of the readings over 1 + scale. Filter error keeps them unbiased"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
+    low_passes: tuple[LowPass, ...] = eqx.field(static=True, default=(), kw_only=True)
+    """of the outputs that `with_filters` low-passes where their sensors' noise comes in"""
     body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
         static=True, default=None, kw_only=True
     )

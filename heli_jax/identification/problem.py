@@ -14,13 +14,16 @@ from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
+from heli_jax.dynamics.sensor_noise import sensor_noise
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.arguments import check_arguments, warn_of_degrees
+from heli_jax.identification.filtered_noise import filtered_noise
 from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.push_scale import push_scales
+from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
 
@@ -165,6 +168,22 @@ class Problem:
             return ()
         names = [n for d in disturbances_of(self.model) for n in (d.sigma, d.tau)]
         return tuple(n for n in names if n not in self.fixed_noise)
+
+    @functools.cached_property
+    def filtered_noise(self) -> dict[str, Free]:
+        """By output the start of the sd of its sensor's noise where that came through on-board
+        low-passes and the samples bear it out; filter error estimates it by itself."""
+        if not estimator_of(self.method).process_noise or self.noise_is_fixed:
+            return {}
+        # A model's own parameter of that name is its own noise of that sensor.
+        own = naming.names(self.model.Params)
+        coloured = [p.output for p in filtered_noise(self.model.low_passes, self.training)]
+        return {
+            n: Free(max(f.sd.get(n) or noise_guess(f.outputs[n]) for f in flights))
+            for n in coloured
+            if sensor_noise(n) not in own
+            and (flights := [f for f in self.training if n in f.outputs])
+        }
 
     @property
     def noise_is_fixed(self) -> bool:

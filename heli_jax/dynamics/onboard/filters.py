@@ -10,14 +10,14 @@ its centre. In the firmware they are digital; docs/onboard.md says how far apart
 import functools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, zeros
+from heli_jax.dynamics.model import LowPass, Model, zeros
 from heli_jax.dynamics.onboard.delays import ORDER, line_end, line_rates, line_states
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
 from heli_jax.naming import Record
@@ -200,7 +200,52 @@ def _with_channels(model: Model, channels: tuple[_Channel, ...]) -> Model:
         "filtered",
         lambda bare: _with_channels(bare, channels),
         fastest=max(model.fastest, device.fastest),
+        low_passes=(
+            *model.low_passes,
+            *(_low_pass(name, filters) for name, filters, _ in channels if _lowpasses(filters)),
+        ),
     )
+
+
+def _lowpasses(filters: Iterable[Filter]) -> list[Filter]:
+    return [f for f in filters if f.kind != "notch"]
+
+
+def _low_pass(name: str, filters: tuple[Filter, ...]) -> LowPass:
+    """Where white noise before an output's filters comes in, and how strong it has to be.
+
+    A notch before the first low-pass is left out: white noise stays nearly that behind it.
+    """
+    named = list(_named(name, tuple(s for filter in filters for s in _sections(filter))))
+    while named[0][2].left is not None:
+        named = named[1:]
+    A, b, c = _chain([section for *_, section in named])
+    # The covariance X of its states solves A X + X A' = -b b'.
+    eye = np.eye(b.size)
+    X = np.linalg.solve(np.kron(A, eye) + np.kron(eye, A), -np.outer(b, b).ravel()).reshape(A.shape)
+    sd = math.sqrt((c @ X @ c).item())
+    state, speed, first = named[0]
+    entry, gain = (state, first.omega) if first.order == 1 else (speed, first.omega**2)
+    return LowPass(name, entry, gain / sd, cutoff(_lowpasses(filters)))
+
+
+def _chain(sections: Sequence[_Section]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A (n, n), b (n,) and c (n,) of sections one behind the other, as `_Filtered` has them."""
+    n = sum(section.order for section in sections)
+    rows, unit = np.zeros((n, n + 1)), np.eye(n + 1)
+    # The signal as a sum of states and, last, of what comes in.
+    value, i = unit[n], 0
+    for section in sections:
+        x = unit[i]
+        if section.order == 1:
+            rows[i], value, i = section.omega * (value - x), x, i + 1
+            continue
+        v, band = unit[i + 1], section.omega / section.q
+        rows[i], rows[i + 1] = v, section.omega**2 * (value - x) - band * v
+        left = section.left
+        value = x if left is None else value - (1.0 - left) * v / (section.omega * section.q)
+        i += 2
+    return rows[:, :n], rows[:, n], value[:n]
 
 
 class _Filtered(Device):

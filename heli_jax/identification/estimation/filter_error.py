@@ -138,7 +138,7 @@ class FilterError(Estimator):
             return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes, own=own)
         # The scale of the greatest likelihood, and what the unknowns took from the squares.
         factor = np.sqrt(squares / n * freedom)
-        for name in layout.sigmas:
+        for name in layout.sizes:
             # The filter knows only ratios of noises: with all of them times one factor its gains,
             # and with them the optimum, stay.
             at = layout.disturbance_at(name)

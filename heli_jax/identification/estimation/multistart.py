@@ -218,19 +218,17 @@ class Search:
         return np.arange(layout.size) >= layout.first_nuisance
 
     def _arrived(self, layout: Layout, noise: Noise, run: Optimum) -> Optimum:
-        """A run with several disturbances, gone on with until no step would gain anything.
+        """A run with several noises, gone on with until no step would gain anything.
 
         The optimiser stops where its last step moved no parameter; next to variances that vanish
         that step may have been short for another reason.
         """
-        if len(layout.sigmas) < 2:
+        if len(layout.sizes) < 2:
             return run
         for _ in range(_AGAIN):
             at = residual_and_jacobian(layout, self.data, noise, run.z)
             J, faint = np.asarray(at.J), np.zeros(run.z.shape[0], bool)
-            noises = slice(
-                len(layout.of_interest), len(layout.of_interest) + len(layout.disturbance)
-            )
+            noises = slice(len(layout.of_interest), len(layout.of_interest) + len(layout.noises))
             # Of a variance that vanishes the slope says less than its bounds do.
             faint[noises] = ~(np.linalg.norm(J[:, noises], axis=0) > _FAINT)
             gain = gauss_newton_gain(at.r, J[:, ~faint])

@@ -210,9 +210,8 @@ def _kinds_of(layout: Layout, dtype: np.dtype) -> _Kinds:
     # Not the noise's: a disturbance that is hardly there may wander on where it changes nothing
     # else, since no likelihood has a maximum there.
     mask = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
-    # Of several disturbances one may vanish, where its logarithm runs off: each by itself.
-    noises = (at >= len(layout.of_interest)) & (
-        at < len(layout.of_interest) + len(layout.disturbance)
-    )
-    reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
+    # Of several noises one may vanish, where its logarithm runs off: each by itself.
+    last = layout.first_nuisance - (0 if layout.filtered else len(layout.scaled))
+    noises = (at >= len(layout.of_interest)) & (at < last)
+    reach = np.where(noises & (len(layout.sizes) > 1), _REACH, np.inf)
     return _Kinds(logarithmic.astype(dtype), without_size(layout), mask, reach.astype(dtype))

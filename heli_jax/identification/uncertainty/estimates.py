@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.sensor_noise import sensor_noise
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.sensitivity import references_of, unknowns_of
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.uncertainty.noise_sizes import size_deviations
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -290,6 +292,8 @@ def flight_nuisances(
         return {}
     whites = deviations(e.J)
     sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
+    for name, relative in size_deviations(at, e).items():
+        sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
     estimates = _disturbance(problem, at, sds, quantiles)
     # In the order in which `unpack` takes them from z.
     i = layout.first_nuisance
@@ -311,11 +315,12 @@ def _disturbance(
     sds: Float[np.ndarray, " q"],
     quantiles: Float[np.ndarray, " q"],
 ) -> dict[str, Estimate]:
-    """The parameters of the disturbance, searched in their logarithms: intervals by factors."""
-    layout, starts = at.layout, problem.noise
+    """The parameters of process noise, searched in their logarithms: intervals by factors."""
+    layout = at.layout
+    starts = problem.noise | {sensor_noise(n): f for n, f in problem.filtered_noise.items()}
     estimates = {}
     disturbance = unpack(layout, at.data, at.z).noise
-    for i, name in enumerate(layout.disturbance, len(layout.of_interest)):
+    for i, name in enumerate(layout.noises, len(layout.of_interest)):
         value, relative = float(disturbance[name]), float(sds[i])
         reach = float(np.exp(min(float(quantiles[i]) * relative, _LARGEST)))
         unit = naming.unit(layout.model.Params, name) or ""

@@ -37,7 +37,7 @@ def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
     nuisance = {f"gain {name}": v for name, v in u.gains.items()}
     if layout.shift:
         nuisance["time_shift"] = u.shift
-    nuisance |= {name: u.noise[name] for name in layout.disturbance}
+    nuisance |= {name: u.noise[name] for name in layout.noises}
     nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
     fitted = [s.flight for s in fit.signals if not s.hold_out]
     for i, label in enumerate(fitted):

@@ -36,6 +36,7 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     one, zero = np.ones((), dtype), np.zeros((), dtype)
     z += [one] * len(layout.gains) + [zero] * layout.shift
     z += [np.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
+    z += [np.asarray(np.log(problem.filtered_noise[n].start), dtype) for n in layout.filtered]
     # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
     whole = np.zeros(layout.size, dtype)
     whole[: len(z)] = jax.device_get(z)

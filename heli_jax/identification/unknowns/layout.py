@@ -1,7 +1,8 @@
 """The unknowns of a problem: one vector z, what stands where in it, and the numbers beside it.
 
-z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, then
-for each flight the initial state, the biases and the offsets of the inputs.
+z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, the
+noise of sensors before filters and of outputs, then for each flight the initial state, the biases
+and the offsets of the inputs.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.sensor_noise import sensor_noise, with_sensor_noise
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
@@ -90,6 +92,8 @@ class Layout(eqx.Module):
     """by flight, sorted by name: the order of the residuals"""
     disturbance: tuple[str, ...] = eqx.field(static=True)
     """parameters of the disturbance, estimated beside the others by filter error"""
+    filtered: tuple[str, ...] = eqx.field(static=True)
+    """filter error: outputs whose sensor's noise came through on-board low-passes, of unknown sd"""
     scaled: tuple[str, ...] = eqx.field(static=True)
     """filter error: outputs whose noise has an unknown factor of its own"""
     estimator: Any = eqx.field(static=True)
@@ -132,7 +136,18 @@ class Layout(eqx.Module):
     def first_nuisance(self) -> int:
         """Where in z the nuisance parameters of the flights begin: initial states, biases and
         input offsets, which have weak priors and are projected out of the verdict."""
-        return len(self.of_interest) + len(self.disturbance) + len(self.scaled)
+        return len(self.of_interest) + len(self.noises) + len(self.scaled)
+
+    @property
+    def noises(self) -> tuple[str, ...]:
+        """The parameters of process noise: those of the disturbance, then the sd of what came
+        through filters."""
+        return (*self.disturbance, *map(sensor_noise, self.filtered))
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """The standard deviations among these."""
+        return (*self.sigmas, *map(sensor_noise, self.filtered))
 
     @property
     def sigmas(self) -> tuple[str, ...]:
@@ -140,8 +155,8 @@ class Layout(eqx.Module):
         return tuple(d.sigma for d in disturbances_of(self.model) if d.sigma in self.disturbance)
 
     def disturbance_at(self, name: str) -> int:
-        """Where in z a parameter of the disturbance stands."""
-        return len(self.of_interest) + self.disturbance.index(name)
+        """Where in z a parameter of process noise stands."""
+        return len(self.of_interest) + self.noises.index(name)
 
     @property
     def size(self) -> int:
@@ -230,7 +245,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     scaled, concentrated = estimator.scaled_outputs(problem)
     nuisance = problem.nuisance
     return Layout(
-        model=problem.model,
+        model=with_sensor_noise(problem.model, tuple(problem.filtered_noise)),
         free=tuple(problem.free),
         kinds=tuple(transforms.plain_kind(f) for f in problem.free.values()),
         gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
@@ -241,6 +256,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         # By name, as JAX orders the dictionaries in everything that is compiled.
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         disturbance=tuple(problem.noise),
+        filtered=tuple(problem.filtered_noise),
         scaled=scaled,
         estimator=estimator,
         concentrated=concentrated,
@@ -344,6 +360,11 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
     for name in layout.sigmas:
         size = jnp.log(data.push_scales.get(name, motion))
         limits[name] = (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST)
+    for output in layout.filtered:
+        # A bias's scale is ten times what the output does, which no noise exceeds by far.
+        scales = [f.bias_scale[output] for f in data.flights if output in f.bias_scale]
+        size = jnp.log(functools.reduce(jnp.maximum, scales))
+        limits[sensor_noise(output)] = (size - _FAINTEST, size)
     return limits
 
 
@@ -368,8 +389,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     # Clipped, not transformed: inside the limits the likelihood keeps its shape in the logarithm,
     # and outside its derivative is zero, which tells that the parameter means nothing there.
     noise = {
-        name: jnp.exp(jnp.clip(z[at + i], *limits[name]))
-        for i, name in enumerate(layout.disturbance)
+        name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noises)
     }
     at = layout.first_nuisance
     flights = []
