@@ -121,10 +121,10 @@ def test_imports_point_one_way(name):
 
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
-    "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns", "estimation",
-    "identifiability", "validation", "equation_error", "result", "uncertainty", "agreement",
-    "fit_notes", "assemble", "further_starts", "fit", "likelier_hold", "second_method",
-    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
+    "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns",
+    "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
+    "agreement", "fit_notes", "assemble", "further_starts", "fit", "likelier_hold",
+    "second_method", "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 
