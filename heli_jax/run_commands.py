@@ -32,7 +32,7 @@ def runs(options: argparse.Namespace) -> int:
         return 0
     if not listed:
         raise InputError(f"{folder}: holds no run of heli-jax fit")
-    keys = ("run", "date", "model", "method", "status", "adequate")
+    keys = ("run", "date", "model", "method", "status", "adequate", "untrusted")
     rows = [tuple(str(run[k]) for k in keys) for run in listed]
     print_table(keys, rows)
     return 0
@@ -45,12 +45,13 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
             # Without its reasons, for which a table has no room.
             adequate = adequacy_of(content).partition(" (")[0]
             row = {k: content[k] for k in ("model", "method", "status")}
+            untrusted = ", ".join(map(str, content.get("untrusted") or ()))
         # Any file may be called so: what no fit wrote is no run.
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
         date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
         name = str(path.parent.relative_to(folder))
-        yield {"run": name, "date": date, **row, "adequate": adequate}
+        yield {"run": name, "date": date, **row, "adequate": adequate, "untrusted": untrusted}
 
 
 def _files(folder: Path, deepest: int) -> Iterator[Path]:

@@ -23,6 +23,8 @@ DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
 _MOST_ROWS = 40
 _WIDEST = 24
 """characters of an axis's value"""
+_NAMED = 3
+"""runs that are named of many"""
 
 
 def asked(options: argparse.Namespace) -> Study | None:
@@ -96,7 +98,9 @@ def print_study(result: "xr.Dataset") -> None:
     status = [str(s) for s in flat["status"].to_numpy()]
     counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
     fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
-    tell(f"{fits}: {counts}")
+    adequate = Counter(str(a) for a in flat["adequate"].to_numpy() if a)
+    judged = ", ".join(f"{count} {words}" for words, count in adequate.items())
+    tell(f"{fits}: {counts}" + (f"; adequate: {judged}" if judged else ""))
     rows = []
     for i in range(min(len(status), _MOST_ROWS)):
         one = flat.isel(fit=i)
@@ -110,6 +114,9 @@ def print_study(result: "xr.Dataset") -> None:
     if len(status) > _MOST_ROWS:
         tell(f"... and {len(status) - _MOST_ROWS} more")
     _print_scatter(flat, parameters)
+    for names, runs in _distrusted(flat).items():
+        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
+        tell(f"! Not to be trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
     for run, sentence in _failures(flat):
         tell(f"! {run}: {sentence}")
 
@@ -150,6 +157,15 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
     if rows:
         head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")
         print_table((*head, "median sd of a fit", "unit"), rows)
+
+
+def _distrusted(flat: "xr.Dataset") -> dict[str, list[str]]:
+    """By the parameters that are not to be trusted the fits whose they are."""
+    by_names: dict[str, list[str]] = {}
+    for run, names in zip(flat["run"].to_numpy(), flat["untrusted"].to_numpy(), strict=True):
+        if names:
+            by_names.setdefault(str(names), []).append(str(run))
+    return by_names
 
 
 def _failures(flat: "xr.Dataset") -> list[tuple[str, str]]:

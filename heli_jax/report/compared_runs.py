@@ -59,9 +59,9 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Each parameter's estimate and sd by run, and those of each combination that a run
-        determines, with the differences from the first; in ASCII but for ±, so that a number can be
-        pasted into a vehicle file."""
+        """Each parameter's estimate and sd by run, those of each combination that a run determines
+        and of what flights share beside them, with the differences from the first; in ASCII but for
+        ±, so that a number can be pasted into a vehicle file."""
         return self._estimates(rounded, str)
 
     @property
@@ -101,9 +101,10 @@ class ComparedRuns(NamedTuple):
         return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
 
     def _by_run(self) -> list[dict[str, Estimate]]:
-        """Each run's estimates, then the combinations that one of the runs determines."""
+        """Each run's estimates, the combinations that one of the runs determines, then what all its
+        flights share beside them: gains, a time shift, the disturbance."""
         pairs = zip(self.runs, combinations(self.runs), strict=True)
-        return [{**run.estimates, **of_run} for run, of_run in pairs]
+        return [{**run.estimates, **of_run, **_shared(run)} for run, of_run in pairs]
 
     @property
     def agreement(self) -> Table:
@@ -130,7 +131,9 @@ class ComparedRuns(NamedTuple):
                 method_of(run),
                 run.status,
                 # What the data determine is a property of an optimum.
-                "No optimum was reached." if run.status == "not-converged" else run.verdict,
+                "No optimum was reached."
+                if run.status == "not-converged"
+                else " ".join(filter(None, (run.verdict, run.distrust))),
                 run.adequacy,
             )
             for label, run in zip(self.labels, self.runs, strict=True)
@@ -150,7 +153,10 @@ class ComparedRuns(NamedTuple):
                 notes.append(f"{label} did not converge: its numbers are no result.")
                 if run is first:
                     notes.append("Differences are from the first run: name one first that did.")
-            elif run.adequate is False:
+                continue
+            if run.distrust:
+                notes.append(f"{label}: {run.distrust}")
+            if run.adequate is False:
                 notes.append(f"{label} is not adequate: its intervals may be too narrow.")
             elif run.overconfident:
                 notes.append(f"{label}: its sd are too small, since its residuals are not white.")
@@ -270,7 +276,8 @@ def _measured(
     if not arrived:
         return NOT_CONVERGED
     if e.sd is None:
-        return NOT_DETERMINED
+        # Of a disturbance that does not show the size is zero.
+        return "0" if e.at_bound and e.value == 0.0 else NOT_DETERMINED
     value, sd = pair(e.value, e.sd)
     return f"{value} ± {sd}" + (f" {shown_unit(e.unit)}" if shown_unit else "")
 
@@ -289,6 +296,11 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     if m is not None and diverges(m, FAR):
         return "diverges"
     return text(getattr(m, key, None))
+
+
+def _shared(run: SavedFit) -> dict[str, Estimate]:
+    """The nuisance parameters that belong to no flight: those have FLIGHT/ before their name."""
+    return {n: e for n, e in run.nuisance.items() if "/" not in n}
 
 
 def _share_a_log(first: SavedFit, second: SavedFit) -> bool:

@@ -70,6 +70,7 @@ def residuals(fit: Fit) -> dict[str, Any]:
         "disturbed_loop": fit.disturbed_loop,
         "second_method": fit.second_method._asdict() if fit.second_method else None,
         "untrusted": list(fit.untrusted),
+        "distrust": fit.distrust,
     }
 
 

@@ -54,6 +54,13 @@ class SavedFit(NamedTuple):
         return adequacy_of(self.content)
 
     @property
+    def distrust(self) -> str:
+        """`Not to be trusted: ...`, as the fit said it; empty where nothing speaks against it."""
+        names = ", ".join(self.content.get("untrusted") or ())
+        # Fits of earlier versions have the names alone.
+        return self.content.get("distrust") or (f"Not to be trusted: {names}." if names else "")
+
+    @property
     def overconfident(self) -> bool:
         """Whether the intervals are too narrow, since residuals are not white."""
         return bool((self.content.get("residuals") or {}).get("overconfident", False))

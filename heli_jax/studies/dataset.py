@@ -59,6 +59,7 @@ def dataset(
     texts = {
         "status": [_status(fit) for fit in fits],
         "verdict": [_verdict(fit) for fit in fits],
+        "untrusted": [", ".join(f["untrusted"]) if _is_fit(f) else "" for f in fits],
         "adequate": ["" if not _is_fit(f) else _ADEQUATE[f["adequate"]] for f in fits],
         "sentence": ["" if fit is None else str(fit.get("sentence", "")) for fit in fits],
         "run": [f"fits/{name}" for name in names],
@@ -93,6 +94,7 @@ _PARTS = {"metrics": "", "validation": "held_out_"}
 _WORDS = {
     "status": "converged, not-converged, not-identifiable, failed or not run",
     "verdict": "what the data determine",
+    "untrusted": "parameters that feedback may have biased or another method does not bear out",
     "adequate": "whether the model explains what was measured",
     "sentence": "why there is no fit",
     "run": "directory of the fit, within the study's",

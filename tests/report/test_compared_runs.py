@@ -123,6 +123,38 @@ def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
     assert any("a: its sd are too small" in note for note in compared.notes)
 
 
+def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
+    sentence = "Not to be trusted: Ixx (closed loop without an instrument)."
+    a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
+    b = write_run(
+        tmp_path / "b", {"Ixx": (0.03, 0.001)}, untrusted=["Ixx"], distrust=sentence, adequate=False
+    )
+    compared = compare_runs([a, b])
+    assert compared.verdicts.rows[1][4] == f"The data determine all. {sentence}"
+    assert f"b: {sentence}" in compared.notes
+    assert any("b is not adequate" in note for note in compared.notes)
+    assert cli.main(["runs", str(tmp_path), "--json"]) == 0
+    assert [r["untrusted"] for r in json.loads(capsys.readouterr().out)] == ["", "Ixx"]
+
+
+def test_what_flights_share_is_compared_too(tmp_path: Path) -> None:
+    def of(value: float, sd: float | None, unit: str, *, at_bound: bool = False) -> dict:
+        numbers = {"value": value, "sd": sd, "lower95": None, "upper95": None, "start": 1.0}
+        numbers |= {"sd_white": sd, "sd_alone": sd, "prior_share": 0.0}
+        return numbers | {"unit": unit, "at_bound": at_bound}
+
+    a = {"sigma_w": of(2.0, 0.3, "rad/s^2"), "flight 1/bias p": of(0.1, 0.1, "rad/s")}
+    b = {"sigma_w": of(0.0, None, "rad/s^2", at_bound=True), "time_shift": of(0.05, 0.01, "s")}
+    runs = [
+        write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, nuisance=nuisance)
+        for name, nuisance in (("a", a), ("b", b))
+    ]
+    rows = {row[0]: row[1:] for row in compare_runs(runs).estimates.rows}
+    assert rows["sigma_w"] == ("2.00 ± 0.30", "0", "–", "rad/s^2")
+    assert rows["time_shift"] == ("–", "0.050 ± 0.010", "–", "s")
+    assert set(rows) == {"Ixx", "sigma_w", "time_shift"}
+
+
 def test_runs_of_different_logs_are_not_drawn_over_one_record(tmp_path: Path) -> None:
     fits = [write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}) for name in ("a1", "b1", "b2")]
     fits.append(write_run(tmp_path / "b3", {"Ixx": (0.02, 0.001)}, status="not-converged"))

@@ -74,7 +74,7 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert cli.main([*arguments, "--out", str(whole)]) == 4
     shown = capsys.readouterr()
-    assert "4 fits: 2 converged, 2 failed" in shown.out
+    assert "4 fits: 2 converged, 2 failed; adequate: 2 yes" in shown.out
     assert shown.out.count("holds 3 samples, expected at least 8") == 2
 
     over = {"fit.free.Ixx.start": [0.02, 0.04]}
