@@ -31,7 +31,13 @@ from heli_jax.identification.estimation.same_responses import better_of_same_res
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
-from heli_jax.identification.further_starts import explains_little, further_starts
+from heli_jax.identification.further_starts import (
+    SAID_STABLE,
+    better_of_stable,
+    explains_little,
+    further_starts,
+    left_stability,
+)
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
@@ -241,8 +247,9 @@ def fit(
         starts: how many points to start from; the first is the given one, the others are drawn
             within the bounds, or about a factor of three around the start. None: one, or where a
             delay is free five that differ in the delays; of a linear model by output error six
-            others are tried where the best of these explains less than half of the outputs: what
-            equation error makes of the record, and five that are drawn.
+            others are tried where the best of these explains less than half of the outputs, and by
+            frequency error where a stable model became unstable: what equation error makes of the
+            record, and five that are drawn.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -340,6 +347,10 @@ def _search(
     # Relaxation ends where its first weights of the outputs lead: tried from others too.
     optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
+    if further is not None and left_stability(problem, search, optimum):
+        report(SAID_STABLE)
+        more = further_starts(layout, problem, guess.z, further)
+        optimum = better_of_stable(problem, search, noise, more, optimum)
     if disturbed:
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none

@@ -1,18 +1,28 @@
 """Starts to go on from where a fit explains little: a mode far from where it is sought leaves no
 slope towards it."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax import naming
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.identification.estimation.drawn_starts import draw
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
-from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.multistart import Search, rank
+from heli_jax.identification.estimation.noise_covariance import (
+    RelaxedOptimum,
+    log_likelihood_of,
+    relax_noise_covariance,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Layout, Noise
+from heli_jax.identification.unknowns.layout import Layout, Noise, unpack
+from heli_jax.identification.validation.advice import is_unstable
 
+SAID_STABLE = "the model became unstable on the way: from further starts"
 SAID = "little is explained: from further starts"
 _LITTLE = 0.5
 """part of the outputs' variance below which an optimum explains little"""
@@ -65,3 +75,64 @@ def further_starts(
     if not np.isfinite(row).all():
         return drawn
     return jnp.concatenate([jnp.asarray(row[None, :], z0.dtype), drawn])
+
+
+def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) -> bool:
+    """Whether a search in frequency that began with a stable linear model ended with an unstable
+    one.
+
+    A pole and its mirror image have the same gain at all frequencies, so that where inputs tell
+    little a spectrum which is estimated leaves the likelihood an optimum on either side.
+
+    Args:
+        problem: what was fitted.
+        search: over it.
+        optimum: where it ended.
+    """
+    layout = search.layout
+    if not layout.model.linear or not layout.estimator.noise_spectrum:
+        return False
+    begun, ended = problem.start_params(), _params(problem, search, optimum)
+    return is_unstable(problem, ended) and not is_unstable(problem, begun)
+
+
+def better_of_stable(
+    problem: Problem,
+    search: Search,
+    noise: Noise,
+    points: Float[Array, "s q"],
+    optimum: RelaxedOptimum,
+) -> RelaxedOptimum:
+    """The better of an optimum with an unstable model and the best of further starts with a stable
+    one.
+
+    Args:
+        problem: what was fitted.
+        search: over it.
+        noise: that the search began with.
+        points: where to begin again.
+        optimum: with the unstable model.
+    """
+    stable = [
+        run
+        for run in search.run(noise, points, nearing=search.layout.estimator.nearing)
+        if bool(run.converged)
+        and not is_unstable(problem, _params(problem, search, optimum._replace(best=run)))
+    ]
+    if not stable:
+        return optimum
+    other = relax_noise_covariance(search, noise, min(stable, key=rank))
+    if not bool(other.best.converged):
+        return optimum
+    first, second = (log_likelihood_of(search, o) for o in (optimum, other))
+    if not second > first:
+        return optimum._replace(trace=(*optimum.trace, *other.trace))
+    return other.after(optimum)
+
+
+# Any: a record of the model's Params.
+def _params(problem: Problem, search: Search, optimum: RelaxedOptimum) -> Any:
+    values = unpack(search.layout, search.data, optimum.best.z).params
+    return naming.replace(
+        problem.start_params(), **{n: np.asarray(values[n]) for n in search.layout.free}
+    )

@@ -1,10 +1,13 @@
 """A mode far from where it is sought is found all the same."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model
+from tests.identification.test_through_inputs import heave, heave_problem
 
 DT, SPRING, DAMPING, GAIN = 0.1, 25.0, 0.5, 20.0
 OSCILLATOR = """
@@ -51,3 +54,14 @@ def test_where_little_is_explained_the_search_begins_again_elsewhere(problem: Pr
     alone = fit(problem, starts=1)
     assert len(alone.starts) == 1
     assert alone.status != "converged"
+
+
+def test_a_search_that_left_stability_begins_again():
+    # From a stable start frequency error ended with Zw = +0.25, whose mirror image has the same
+    # gain: 8.7 in log-likelihood below the stable optimum.
+    _, plain = heave_problem(heave(0, 1.0, False, 0.04))
+    found = fit(plain)
+    near = fit(dataclasses.replace(plain, free={"Zw": Free(-0.6), "Zcol": Free(-14.0)}))
+    assert found.estimates["Zw"].value == pytest.approx(near.estimates["Zw"].value, rel=1e-3)
+    assert found.log_likelihood == pytest.approx(near.log_likelihood, abs=0.01)
+    assert not found.untrusted
