@@ -6,6 +6,10 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.result import Signals
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.decimated import (
+    is_decimated,
+    whiteness_in_band,
+)
 from heli_jax.identification.validation.metrics import (
     NO_METRICS,
     Metrics,
@@ -49,8 +53,11 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
     return correlated
 
 
-def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
-    """Of the innovations where there are some, else of the residuals."""
+def whiteness_of(
+    signals: tuple[Signals, ...], e: Evaluation, flights: tuple[Flight, ...]
+) -> dict[str, Whiteness]:
+    """Of the innovations where there are some, else of the residuals, whose colour intervals allow
+    for; innovations of an output that was logged at a higher rate may have its low-pass's."""
     if e.innovations:
         # Their variance falls while the filter learns the initial state: only over it are they one
         # sequence of equal variance.
@@ -63,8 +70,17 @@ def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, White
             }
     else:
         errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+    low_passed = {
+        f"{s.flight}/{n}"
+        for s, f in zip(signals, flights, strict=True)
+        for n in s.measured
+        if e.innovations and is_decimated(f, n)
+    }
     # Of many signals one looks coloured by chance: the level is shared by all.
-    return {name: whiteness(error, len(errors)) for name, error in errors.items()}
+    return {
+        name: (whiteness_in_band if name in low_passed else whiteness)(error, len(errors))
+        for name, error in errors.items()
+    }
 
 
 def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:

@@ -183,7 +183,7 @@ def assemble(
         optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
     signals, absent = signals_of(e, problem.training), absent_names(layout, optimum)
-    white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
+    white, correlated = whiteness_of(signals, e, problem.training), correlated_residuals(signals)
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
     solution = Solution(layout, data, noise, best.z)
