@@ -21,7 +21,15 @@ from heli_jax.flights.resample import (
     longest_gap,
     resampled,
 )
-from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock, usual_step
+from heli_jax.flights.slower import (
+    OWN,
+    Timed,
+    at_nearest,
+    at_own_rate,
+    is_slower,
+    own_clock,
+    usual_step,
+)
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
@@ -213,8 +221,10 @@ def at_times(
             if jumps:
                 inputs = [(signals[n, "input"], low[n]) for n in jumps]
                 made = _resampled_with(own, inputs, times)
-            else:
+            elif usual_step(own.seconds) * rate > OWN or goes_down(own.seconds, times):
                 made = resampled(*own, times)
+            else:
+                made = at_own_rate(own, times)
             samples[key, kind] = np.where(gaps, np.nan, made)
     decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
     return OnGrid(samples, decided, notes)

@@ -1,4 +1,5 @@
-"""Outputs that were sampled more slowly than the flight's grid: missing between their samples.
+"""Outputs with clocks of their own on the flight's grid: slower ones are missing between their
+samples.
 
 Straight lines between two samples of a slow sensor are no measurements: a fit that takes them for
 such believes in twenty samples where there is one, and its intervals come out too narrow.
@@ -8,9 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.flights.resample import interpolate
+
 SLOWER = 1.5
 """grid steps; an output whose usual step is longer is slower than the grid. Up to here a straight
 line makes at most three samples of two."""
+
+
+_NEAR = 0.75
+"""grid steps, to which a sample is moved along its slope"""
+OWN = 1.1
+"""grid steps; an output whose usual step is no longer has a sample for each instant"""
 
 
 class Timed(NamedTuple):
@@ -86,6 +95,41 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     largest = float(np.abs(away[inside]).max())
     left_out = int(inside.sum()) - int(np.count_nonzero(~np.isnan(samples)))
     return Placed(samples, largest if largest > 1e-6 * step else 0.0, left_out)
+
+
+def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
+    """A signal of the grid's own rate with other or uneven stamps: at each instant the sample
+    nearest to it, moved there along the slope.
+
+    A straight line between two samples is right to the same order, but averages their noise: white
+    noise comes out with an autocorrelation of up to +0.5 at one sample, which passes for a
+    disturbance.
+
+    Args:
+        signal: of about the grid's rate.
+        times: (M,) [s], evenly spaced, M >= 2.
+
+    Returns:
+        (M,), in the samples' unit; NaN beside a missing sample. Where samples are far apart, on the
+        straight line between them.
+    """
+    lines, seen = interpolate(signal.seconds, signal.values, times), ~np.isnan(signal.values)
+    if np.count_nonzero(seen) < 3:
+        return lines
+    step = float(times[1] - times[0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = np.gradient(signal.values[seen], signal.seconds[seen], edge_order=2)
+    whole = np.full(seen.size, np.nan)
+    whole[seen] = slope
+    after = np.clip(np.searchsorted(signal.seconds, times), 1, signal.seconds.size - 1)
+    nearer = times - signal.seconds[after - 1] <= signal.seconds[after] - times
+    nearest = np.where(nearer, after - 1, after)
+    away = times - signal.seconds[nearest]
+    # Of stamps that are multiples of the grid's step the rest is rounding.
+    away = np.where(np.abs(away) > 1e-6 * step, away, 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = signal.values[nearest] + whole[nearest] * away
+    return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
 
 
 def note(name: str, placed: Placed, signal: Timed, rate: float) -> str:
