@@ -6,8 +6,8 @@ A roll machine, p' = Lp p + Lda da + gusts, flown by a pilot who holds the bank 
 of 0.1 s and adds test steps. Each record is fitted by output error and by filter error with a
 disturbance on roll; the table has the mean relative error of Lp and Lda over the runs, and in how
 many of them the loop was detected. With `delay` the aileron acts 60 ms after the stick, and the
-fits have that delay free as well, from the five starts that a free delay has. (The frequency domain
-belongs beside them once it is there.)
+fits have that delay free as well, from the five starts that a free delay has. The frequency domain
+is in closed_loop_frequency.py.
 """
 
 from typing import Annotated, Any, NamedTuple

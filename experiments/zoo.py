@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -288,7 +289,7 @@ def short_period(seed: int) -> Puzzle:
 def bench(seed: int, stand: bool = True) -> tuple[Any, Flight, np.random.Generator]:
     """A record of the roll model, from eq. 23."""
     rng = np.random.default_rng(seed)
-    machine = load_vehicle("configs/vehicles/bench-30.yaml")
+    machine = load_vehicle(Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml")
     H = roll_transfer_function(machine, stand=stand)
     held: Any = scipy.signal.cont2discrete((np.array(H.num), np.array(H.den)), DT)
     u = 3e-6 * random_steps(4 * N, DT, rng, (0.2, 1.5))

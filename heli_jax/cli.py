@@ -31,8 +31,14 @@ INTERRUPTED = interrupts.INTERRUPTED
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         # One line as all other errors; argparse would print the usage of the command before it.
-        print(f"heli-jax: {message} (heli-jax --help lists the commands)", file=sys.stderr)
-        raise SystemExit(WRONG_INPUT)
+        _refuse(self.prog, message)
+
+
+def _refuse(prog: str, message: str) -> NoReturn:
+    """End with one line, which names the help of the command (`heli-jax fit`) that was begun."""
+    helps = "says what it takes" if " " in prog else "lists the commands"
+    print(f"heli-jax: {message} ({prog} --help {helps})", file=sys.stderr)
+    raise SystemExit(WRONG_INPUT)
 
 
 class _Version(argparse.Action):
@@ -53,7 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # With arguments of their own tests and programs call it, which an interrupt must not end.
     with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
-        options = _parser().parse_args(arguments)
+        options, unknown = _parser().parse_known_args(arguments)
+        if unknown:
+            # Of which command, argparse has forgotten by then.
+            message = f"unrecognized arguments: {' '.join(unknown)}"
+            _refuse(f"heli-jax {options.command}", message)
         options.interrupts = seen
         try:
             options.say = terminal.say_notes if options.quiet else terminal.say

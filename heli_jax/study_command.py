@@ -94,21 +94,23 @@ def print_study(result: "xr.Dataset") -> None:
         result: of `run_study`.
     """
     axes, parameters = result.attrs["axes"], [str(p) for p in result["parameter"].to_numpy()]
-    flat = result.stack(fit=axes, create_index=False)
+    # Where every fit failed there is neither a parameter nor an output, and nothing to lay flat.
+    empty = [d for d in ("parameter", "output") if not result.sizes[d]]
+    flat = result.drop_dims(empty).stack(fit=axes, create_index=False)
     status = [str(s) for s in flat["status"].to_numpy()]
     counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
     fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
     adequate = Counter(str(a) for a in flat["adequate"].to_numpy() if a)
     judged = ", ".join(f"{count} {words}" for words, count in adequate.items())
     tell(f"{fits}: {counts}" + (f"; adequate: {judged}" if judged else ""))
+    outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
     rows = []
     for i in range(min(len(status), _MOST_ROWS)):
         one = flat.isel(fit=i)
         at = [_axis(one[axis].item()) for axis in axes]
         estimates = [_measured(one, p) for p in parameters]
-        agreement = [_percent(v) for v in one["nrmse_fit_percent"].to_numpy()]
+        agreement = [_percent(v) for v in one["nrmse_fit_percent"].to_numpy()] if outputs else []
         rows.append((*at, status[i], *estimates, *agreement))
-    outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
     # One axis alone names no fit: rows of two would look alike in all tables but the first.
     print_table((*axes, "status", *parameters, *outputs), rows, keys=len(axes))
     if len(status) > _MOST_ROWS:

@@ -396,6 +396,20 @@ def test_usage_and_places_to_write(bench, capsys):
     refused(capsys, ["info", bench.parent / "none.csv"], "none.csv")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["compare", "a", "--jason"], "unrecognized arguments: --jason (heli-jax compare --help"),
+        (["info"], "are required: LOG (heli-jax info --help says what it takes)"),
+        (["fits"], "(heli-jax --help lists the commands)"),
+    ],
+)
+def test_a_wrong_option_names_the_help_of_its_command(arguments, words, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert words in capsys.readouterr().err
+
+
 def test_a_device_that_is_not_there(bench, capsys, monkeypatch):
     import jax
 

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -139,6 +140,26 @@ def test_angles_of_more_than_a_turn_are_warned_of() -> None:
     )  # fmt: skip
     with pytest.warns(UserWarning, match="np.radians"):
         Problem(LINEAR.model, PARAMS, [turning], FREE)
+
+
+def _banked(phi: np.ndarray) -> Problem:
+    flight = Flight(
+        inputs=U, outputs={"phi": phi}, dt=0.02, sd={"phi": 1.0}, hold={"lat": "zero-order"}
+    )
+    return Problem(LINEAR.model, PARAMS, [flight], FREE)
+
+
+def test_angles_that_turn_faster_than_a_helicopter_are_warned_of() -> None:
+    t = 0.02 * np.arange(200)
+    # 15 degrees to either side at 0.8 Hz; as radians that is 75 rad/s.
+    with pytest.warns(UserWarning, match="faster than helicopters turn.*np.radians"):
+        _banked(15.0 * np.sin(5.0 * t))
+    # A roll in half a second, its angle going on and jumping back; and a linear model's drift.
+    rolled = np.interp(t, [1.0, 1.5], [0.0, 2.0 * np.pi])
+    for phi in (rolled, (rolled + np.pi) % (2.0 * np.pi) - np.pi, 4.0 * t):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            _banked(phi)
 
 
 @pytest.mark.parametrize(

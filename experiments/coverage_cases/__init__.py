@@ -5,9 +5,13 @@ A module has a function `cases()` that returns a list of `Case`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 from heli_jax import Fit
+
+BENCH = Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml"
+"""the vehicle file, from wherever a study is started"""
 
 
 class Interval(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from coverage_cases.disturbed import response
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
@@ -31,7 +31,7 @@ MISSING: dict[str, Missing] = {
 def ar_run(missing: Missing, seed: int) -> Run:
     """60 s of the bench with AR(0.9) measurement noise."""
     n = 3000
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     num, den = roll_transfer_function(vehicle, stand=True)
     discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
     rng = np.random.default_rng(seed)
@@ -46,7 +46,7 @@ def ar_run(missing: Missing, seed: int) -> Run:
 def disturbed_run(seed: int) -> Run:
     """The records of monte_carlo.py: 120 s, and an acceleration with a correlation time of 1 s."""
     n = 6000
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     rng = np.random.default_rng(seed)
     u = 3e-6 * random_steps(n, DT, rng, (0.2, 1.5))
     y = response(vehicle, u, DT, 1.04, 1.0, rng)[:, 0] + NOISE * rng.standard_normal(n)

@@ -8,7 +8,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from coverage_cases.disturbed import response
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.disturbance import with_disturbance
@@ -19,7 +19,7 @@ N, DT, NOISE, SIGMA, TAU = 4000, 0.02, 1e-3, 1.04, 1.0
 
 
 def one_run(fixed: tuple[str, ...], seed: int) -> Run:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     rng = np.random.default_rng(seed)
     u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
     y = response(vehicle, u, DT, SIGMA, TAU, rng)[:, 1] + NOISE * rng.standard_normal(N)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from heli_jax import Fit, Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.roll import roll_transfer_function
@@ -22,7 +22,7 @@ MODELS = {poles: with_disturbance(models.roll_on_stand, "roll", poles) for poles
 
 
 def one_run(seed: int, poles: int = 1) -> Run:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     num, den = roll_transfer_function(vehicle, stand=True)
     discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
     b, a = discrete[:2]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.flights.slower import Timed, at_nearest
@@ -21,7 +21,7 @@ NOISE, RATE_NOISE = 2e-3, 5e-2
 
 
 def _flight(seed: int, interpolated: bool) -> Flight:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     num, den = (np.array(x) for x in roll_transfer_function(vehicle, stand=True))
     rng = np.random.default_rng(seed)
     u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
@@ -42,7 +42,7 @@ def _flight(seed: int, interpolated: bool) -> Flight:
 
 
 def one_run(seed: int, interpolated: bool = False) -> Run:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     free = {"Ixx": Free(0.05), "If": Free(5e-4)}
     flight = _flight(seed, interpolated)
     result = fit(Problem(models.roll_on_stand, vehicle, [flight], free))

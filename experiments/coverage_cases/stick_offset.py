@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.simulation.inputs import random_steps
@@ -18,7 +18,7 @@ N, DT, NOISE, AMPLITUDE = 2000, 0.02, 2e-3, 3e-6
 
 
 def one_run(seed: int, share: float) -> Run:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     num, den = roll_transfer_function(vehicle)
     discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
     rng = np.random.default_rng(seed)

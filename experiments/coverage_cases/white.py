@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from coverage_cases import Case, Run, intervals
+from coverage_cases import BENCH, Case, Run, intervals
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.simulation.inputs import random_steps
@@ -17,7 +17,7 @@ N, DT, NOISE = 4000, 0.02, 2e-3
 
 
 def one_run(seed: int) -> Run:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    vehicle = load_vehicle(BENCH)
     num, den = roll_transfer_function(vehicle, stand=True)
     discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
     b, a = discrete[:2]

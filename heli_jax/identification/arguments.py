@@ -16,6 +16,10 @@ _HEADINGS = {"psi", "yaw"}
 """angles that may go on for more than a turn"""
 _FURTHEST = 6 * math.pi
 """rad: linear models of an axis roll over in long records, with no pilot to hold them"""
+_HALF_TURN = 1.1 * math.pi
+"""rad that nothing but an unwrapped roll or loop goes beyond"""
+_FASTEST, _OVER = 15.0, 0.1
+"""rad/s, 860 deg/s: no helicopter turns as fast for that many seconds"""
 
 
 def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
@@ -71,7 +75,7 @@ def _kinds(flights: Any) -> str:
 
 
 def warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
-    """Warn of angles that turn further than a helicopter does, as angles in degrees would.
+    """Warn of angles that turn further or faster than a helicopter does, as degrees would.
 
     Args:
         outputs: the model's class, which has the units.
@@ -82,11 +86,25 @@ def warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
             of_angle = name in naming.names(outputs) and naming.unit(outputs, name) == "rad"
             if flight.source is not None or not of_angle or name in _HEADINGS:
                 continue
-            largest = float(np.nanmax(np.abs(np.asarray(values)), initial=0.0))
+            y = np.asarray(values, float)
+            largest, fastest = float(np.nanmax(np.abs(y), initial=0.0)), _rate(y, flight.dt)
             if largest > _FURTHEST:
-                warnings.warn(
-                    f"{flight.name or 'a flight'}: {name} reaches {largest:.4g} rad, more than "
-                    "three turns; angles are in radians here: np.radians(degrees)",
-                    UserWarning,
-                    stacklevel=4,
-                )
+                found = f"{largest:.4g} rad, more than three turns"
+            elif largest > _HALF_TURN and fastest > _FASTEST:
+                found = f"{largest:.3g} rad and {fastest:.2g} rad/s, faster than helicopters turn"
+            else:
+                continue
+            warnings.warn(
+                f"{flight.name or 'a flight'}: {name} reaches {found}; angles are in radians here: "
+                "np.radians(degrees)",
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def _rate(y: np.ndarray, dt: float) -> float:
+    """How fast an angle (N,) [rad] turns at its fastest [rad/s], single wild samples left out."""
+    steps = max(1, round(_OVER / dt))
+    turned = np.abs(y[steps:] - y[:-steps])
+    turned = turned[np.isfinite(turned)]
+    return float(np.quantile(turned, 0.98)) / (steps * dt) if turned.size else 0.0

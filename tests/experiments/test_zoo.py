@@ -12,8 +12,8 @@ KINDS = {kind.__name__: kind for kind, _ in (*ZOO["SOUND"], *ZOO["UNSOUND"])}
 
 
 @pytest.fixture(autouse=True)
-def _from_the_root(monkeypatch):
-    monkeypatch.chdir(Path(__file__).parents[2])
+def _from_anywhere(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
 
 
 def test_there_are_a_hundred_and_half_are_sound():

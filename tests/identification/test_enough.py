@@ -205,6 +205,26 @@ def test_the_rate_of_an_input_that_moved_between_its_samples():
     assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
 
 
+def test_of_a_stick_that_stays_for_equal_times_it_is_said_how_to_state_a_test_signal_s_clock():
+    # 1.2 values in a period of the swing at 0.95 Hz: a slow channel, or steps with a clock.
+    u = np.repeat(np.random.default_rng(0).standard_normal(60), 40)
+    slow = Flight(
+        dt=DT,
+        inputs={"u": u, "v": np.zeros(u.size)},
+        outputs={"phi": response(u, np.zeros(u.size))[0]},
+        sd={"phi": 1e-3},
+        hold_reason={"u": "it stays for 40 samples at a time and jumps"},
+    )
+    noise = [{"phi": 1e-3}]
+    (found,) = logging_rate(problem(slow), [("flight", slow)], noise)
+    assert found.severity == "refuse"
+    assert (
+        "Where u was commanded in steps of that length, state hold: zero-order." in found.sentence
+    )
+    (stated,) = logging_rate(problem(slow), [("flight", replace(slow, hold_reason={}))], noise)
+    assert stated.severity == "ok"
+
+
 @pytest.mark.slow
 def test_a_log_too_slow_for_the_machine_is_refused_in_words():
     # The machine swings at 0.95 Hz: three samples a second are doubtful, 1.6 hopeless.

@@ -14,6 +14,7 @@ from heli_jax.report.charts import chart_of
 from heli_jax.report.drawings import Analysis
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.panels import panels
+from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.pictures import picture
 from heli_jax.report.tables.agreement import agreement
 from tests.report.test_view import decoded
@@ -119,6 +120,19 @@ def test_alt_texts_and_tables_say_numbers_in_both_units(sound):
     rmse = fit.metrics["roll"].rmse
     assert table.head[-1] == "RMSE as logged"
     assert table.rows[0][-1] == f"{np.degrees(rmse):.4g} deg"
+
+
+def test_a_line_has_the_same_name_in_each_panel(sound):
+    fit, problem, _ = sound
+    flight = FittedFlight(problem.model, fit.params, fit, fit.signals[0])
+    above, below, *_ = chart_of(figures.bode(flight, None)[0].figure).panels
+    names = [s.label for s in above.series]
+    assert "record" in names
+    assert [s.label for s in below.series] == names
+    residual = chart_of(figures.residual_correlation(fit.signals[0], "roll")[0].figure)
+    alt = described(residual)
+    assert "within the 99 % band −" in alt
+    assert "autocorrelation: autocorrelation" not in alt
 
 
 @pytest.mark.parametrize(

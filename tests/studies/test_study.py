@@ -119,6 +119,19 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
         run_study(config, killed, over, overrides)
 
 
+def test_a_study_of_which_no_fit_could_be_made_says_so(config, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(studies, "_outcomes", here)
+    arguments = ["fit", str(config), "--set", "flights.0.log=short.csv"]
+    arguments += ["--over", "fit.seed=1,2", "--out", str(tmp_path / "none")]
+    assert cli.main(arguments) == 4
+    shown = capsys.readouterr()
+    assert "2 fits: 2 failed" in shown.out
+    assert shown.out.count("! fits/") == 2
+    found = xr.open_zarr(tmp_path / "none" / "study.zarr", consolidated=False)
+    assert found.sizes == {"fit.seed": 2, "parameter": 0, "output": 0}
+    assert cli.main([*arguments, "--resume"]) == 4
+
+
 def test_values_with_commas_stay_one_value(config):
     study = read_study(
         config,

@@ -151,7 +151,14 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
             f"{label}: {name} was sampled at {rate:.3g} Hz while it moved, and {fastest.output} "
             f"answers up to {fastest.hz:.3g} Hz (a mode at the {where})"
         )
-        findings.append(_judged(begun, ratio, fastest.hz))
+        finding = _judged(begun, ratio, fastest.hz)
+        if finding.severity != "ok" and flight.hold[name] != "linear":
+            # All stairs of one length are a clock's, and so is a test signal with a clock.
+            finding = finding._replace(
+                sentence=f"{finding.sentence} Where {name} was commanded in steps of that length, "
+                "state hold: zero-order."
+            )
+        findings.append(finding)
     return findings
 
 

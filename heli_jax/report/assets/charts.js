@@ -5,7 +5,7 @@
   const decoded = new Map();
   const night = matchMedia("(prefers-color-scheme: dark)");
   // Of Okabe and Ito's colours those that are too dark on a dark page, and the greys.
-  const NIGHT = { "#000000": "#e4e4e2", "#0072b2": "#5cb3ea", "#d55e00": "#ff8a3d", "#a8a8a8": "#8a8a8a",
+  const NIGHT = { "#000000": "#e4e4e2", "#0072b2": "#5cb3ea", "#56b4e9": "#bfe3fb", "#d55e00": "#ff8a3d", "#a8a8a8": "#8a8a8a",
     "#6b6b6b": "#a0a0a0", "#444444": "#b0b0b0", "#7f7f7f": "#a0a0a0", "#009e73": "#2fc79a" };
   const shown = color => night.matches ? NIGHT[color] ?? color : color;
   const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

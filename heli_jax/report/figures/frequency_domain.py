@@ -153,7 +153,7 @@ def _draw_record(
     name = "record" if coherent.any() else None
     # Behind the curves: many points would hide a fit that goes through them.
     axes[0].plot(omega, 20 * np.log10(np.abs(H)), alpha=0.6, label=name, zorder=1.5, **points)
-    axes[1].plot(omega, reference.beside(omega, H), alpha=0.6, zorder=1.5, **points)
+    axes[1].plot(omega, reference.beside(omega, H), alpha=0.6, label=name, zorder=1.5, **points)
     line(axes[2], record.omega, record.coherence, color=style.BLACK, lw=0.8)
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)

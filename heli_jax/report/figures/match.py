@@ -86,14 +86,15 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
         # Beside the model: point by point, since data may have gaps.
         near = _model_phase(pair)[known]
         angle = near + (angle - near + 180.0) % 360.0 - 180.0
-    _bars(axes[0], w, gain, relative, "data, 95 % intervals")
+    _bars(axes[0], w, gain, relative, _DATA)
     reach = np.degrees(np.minimum(relative, np.pi))
-    axes[1].errorbar(w, angle, yerr=reach, color=style.BLACK, **_STYLE)
+    axes[1].errorbar(w, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
     if w.size:
         axes[0].set_ylim(np.min(gain) - 6.0, np.max(gain) + 6.0)
         axes[1].set_ylim(np.min(angle) - 45.0, np.max(angle) + 45.0)
 
 
+_DATA = "data, 95 % intervals"
 _STYLE: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
 
 

@@ -90,12 +90,15 @@ def _stems(ax: "Axes", x: np.ndarray, y: np.ndarray, band: np.ndarray) -> None:
     """Stems from zero over a band (lags,); those outside it in another colour and thicker."""
     ax.fill_between(x, -band, band, color=style.SKY, alpha=0.35, lw=0, label="99 % band")
     outside = np.abs(y) > band
-    for which, color, width in ((~outside, style.GREY, 0.6), (outside, style.VERMILLION, 0.9)):
+    for which, color, width, label in (
+        (~outside, style.GREY, 0.6, "within the 99 % band"),
+        (outside, style.VERMILLION, 0.9, "outside it"),
+    ):
         # One path, broken by NaN: stem() and vlines() write an element into the SVG for each of up
         # to a thousand stems.
         feet, gaps = np.zeros(which.sum()), np.full(which.sum(), np.nan)
         stems = np.stack([feet, y[which], gaps], axis=1).ravel()
-        ax.plot(np.repeat(x[which], 3), stems, color=color, lw=width)
+        ax.plot(np.repeat(x[which], 3), stems, color=color, lw=width, label=label)
     ax.axhline(0.0, color="#444444", lw=0.6)
     # Twice the band at least: where all is white, the band shall look like one.
     most = 2.0 * float(band.max())
