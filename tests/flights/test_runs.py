@@ -83,6 +83,8 @@ def test_what_is_no_new_run(tmp_path: Path) -> None:
     assert not restarts(times).size
     for change in (
         lambda t: t[50:51].fill(0.1),  # one stamp that went back
+        lambda t: t[50:51].fill(5e9),  # one from which all others go back
+        lambda t: t[50:51].fill(-1e300),
         lambda t: t[100:].__isub__(0.5),  # a clock that was set back
         lambda t: t.__setitem__(slice(None), np.sin(9 * t)),
         lambda t: t[190:].__isub__(3.8),  # too short for a run
