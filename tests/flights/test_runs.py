@@ -78,6 +78,15 @@ def test_info_and_convert_put_them_apart_and_say_so(tmp_path: Path) -> None:
     assert any("3 runs, put one after another" in note for note in converted.notes)
 
 
+def test_a_wrong_stamp_is_no_missing_sample(tmp_path: Path) -> None:
+    t = DT * np.arange(200)
+    t[50] = 5e9
+    log = describe_log(written(tmp_path / "log.csv", t=t, p=np.sin(t)))
+    assert not any("for no value" in note for note in log.notes)
+    assert log.time is not None
+    assert "runs backwards" in log.time.problem
+
+
 def test_what_is_no_new_run(tmp_path: Path) -> None:
     times = DT * np.arange(200)
     assert not restarts(times).size
