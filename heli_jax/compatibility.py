@@ -28,6 +28,9 @@ FILE = "compatibility.yaml"
 
 AGREES = 0.9
 """R^2 of a channel from which on its sensors agree (the acceptance card's gate)"""
+_AS_SHOWN = 1.5
+"""times the noise that the sensors themselves show, up to which the noise that lets a channel drift
+is theirs: of a wrong unit or sign it is many times as much"""
 _RESTS = 0.5
 """share of the prior in what is known of an error from which on the record does not determine it"""
 _NO_NOISE = 1e-9
@@ -168,9 +171,12 @@ def judged(run: FitRun) -> Compatibility:
     """What a fit of a kinematic model says of the sensors."""
     errors = tuple(_error(run, n, e) for n, e in run.fit.estimates.items() if n in SIZES)
     r_squared = r_squared_of(run)
-    bad = [n for n, r in r_squared.items() if not r >= AGREES]
     converged = run.fit.status != "not-converged"
-    compatible, verdict = converged and not bad, _verdict(errors, r_squared, bad, converged)
+    low = [n for n, r in r_squared.items() if not r >= AGREES]
+    drifting = [n for n in low if n in _drifting(run)] if converged else []
+    bad = [n for n in low if n not in drifting]
+    compatible = converged and not bad
+    verdict = _verdict(errors, r_squared, bad, drifting, converged)
     # Of signals that do not fit together the errors are those of a wrong model: none to take off.
     known = {e.name: e.estimate.value for e in errors if e.determined and compatible}
     corrections = _corrections(run, known, errors)
@@ -202,8 +208,28 @@ def r_squared_of(run: FitRun) -> dict[str, float]:
     return shares
 
 
+def _drifting(run: FitRun) -> set[str]:
+    """Outputs whose reconstruction drifts as far as noise that the gyros and accelerometers show
+    makes it drift, each sample being foretold from those before."""
+    fit = run.fit
+    if fit.method != "filter-error":
+        return set()
+    for n in {*NOISES} & {*fit.estimates}:
+        # The search begins at what third differences show of the noise.
+        if not fit.estimates[n].value <= _AS_SHOWN * run.problem.free[n].start:
+            return set()
+    ratios = {
+        o.output: o.against_disturbance for o in fit.adequacy.judged if o.adequate and o.white
+    }
+    return {n for n, ratio in ratios.items() if ratio is not None and ratio <= _AS_SHOWN**2}
+
+
 def _verdict(
-    errors: Sequence[SensorError], r_squared: dict[str, float], bad: list[str], converged: bool
+    errors: Sequence[SensorError],
+    r_squared: dict[str, float],
+    bad: Sequence[str],
+    drifting: Sequence[str],
+    converged: bool,
 ) -> str:
     if not converged:
         return "Not judged: the search did not converge."
@@ -213,11 +239,15 @@ def _verdict(
             f"Not compatible: no errors of these kinds bring {channels} to R2 {AGREES:g}. Look for "
             "a wrong unit, sign or axis, a filter, a scale that changes in the flight."
         )
-    lowest = min(r_squared.values())
+    lowest = min([r for n, r in r_squared.items() if n not in drifting] or r_squared.values())
+    agree = f"R2 {lowest:.4f} or more"
+    if drifting:
+        channels = ", ".join(f"{n} (R2 {r_squared[n]:.3f})" for n in drifting)
+        agree += f", but of {channels}, which the noise of the sensors lets drift so far"
     shown = [e.name for e in errors if e.shows]
     if not shown:
-        return f"Compatible as logged: R2 {lowest:.4f} or more, and no error shows."
-    return f"Compatible once {', '.join(shown)} are corrected: R2 {lowest:.4f} or more."
+        return f"Compatible as logged: {agree}, and no error shows."
+    return f"Compatible once {', '.join(shown)} are corrected: {agree}."
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:

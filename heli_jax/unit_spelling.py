@@ -17,8 +17,9 @@ _UNDERLINED = re.compile(
     r"_(s|sec|secs|second|seconds|h|min)(\^?2)?"
 )
 _WORDS = {
-    "dps": "deg/s", "radps": "rad/s", "mps": "m/s", "Grad": "deg", "metre": "m", "metres": "m",
-    "percentage": "percent", "pct": "percent", "secs": "s",
+    "dps": "deg/s", "radps": "rad/s", "mps": "m/s", "metre": "m", "metres": "m",
+    "Grad": "deg", "grad": "deg", "percentage": "percent", "pct": "percent", "secs": "s",
+    **dict.fromkeys(("U/min", "Upm", "tr/min"), "rpm"),
 }  # fmt: skip
 _WORD = re.compile(r"[A-Za-zµ°%_]+")
 

@@ -189,6 +189,12 @@ def factor(unit: str, si: str) -> float:
     # or rad/s for 1/s, is refused, since a factor of 2 pi would go unseen.
     if _angle_free(have) and _without_angle(have) == _without_angle(want):
         base = have.to_base_units()
+        # Nobody logs radians a minute: 1/min is how many write turns, 2 pi times as many.
+        if dict(have.dimensionality) == {"[time]": -1.0} and float(base.magnitude) != 1.0:
+            raise ValueError(
+                f"unit {unit!r} is a number in a time, of turns or of radians, expected 'rpm' of "
+                "turns in a minute, or 'rad/min'"
+            )
         if float(base.magnitude) == 1.0 or dict(base.dimensionality):
             return float(base.magnitude / want.to_base_units().magnitude)
     raise ValueError(f"unit {unit!r} is {_kind(have)}, expected {_kind(want)} such as {si!r}")

@@ -13,6 +13,7 @@ from heli_jax import compatibility, config, run_directory, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.validation.advice import OutputAdequacy
 
 RATE, DURATION = 25.0, 16.0
 TREX = Path(__file__).parents[2] / "shared" / "data" / "trex550" / "Pitchtest.csv"
@@ -119,7 +120,7 @@ def test_a_model_of_the_machine_is_refused(folder, capsys):
     assert not (folder / "out").exists()
 
 
-def fitted(folder, estimates, shares, status="converged") -> Any:
+def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     """What a fit would have said, by error (value, reach of its interval), by output R2."""
     experiment = config.load(configured(folder))
     y = np.sin(np.arange(100.0))
@@ -134,9 +135,15 @@ def fitted(folder, estimates, shares, status="converged") -> Any:
         status=status,
         signals=[signals],
         notes=("of the fit", "of a machine"),
-        adequacy=SimpleNamespace(sentences=("of a machine",)),
+        adequacy=SimpleNamespace(
+            sentences=("of a machine",),
+            judged=[OutputAdequacy(n, True, r, 1.0, True, 0.0, 0.4) for n, r in shares.items()],
+        ),
+        method="filter-error",
     )
-    problem = SimpleNamespace(flights=config.read_flights(experiment))
+    # Third differences show half the noise that was found, unless told otherwise.
+    free = {"noise_gyro": SimpleNamespace(start=noise)}
+    problem = SimpleNamespace(flights=config.read_flights(experiment), free=free)
     return SimpleNamespace(config=experiment, fit=fit, problem=problem)
 
 
@@ -165,6 +172,13 @@ def test_a_fit_is_put_in_words(folder):
     assert "bring psi (R2 0.200) to R2 0.9" in bad.verdict
     assert bad.corrections["verdict"] == bad.verdict
     assert not bad.corrections["signals"]
+    # As the gyros' own noise lets an angle drift that hardly moves.
+    drifts = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.8}, noise=0.009))
+    assert drifts.compatible
+    assert drifts.verdict.endswith(
+        "or more, but of psi (R2 0.800), which the noise of the sensors lets drift so far."
+    )
+    assert drifts.corrections["signals"]
     lost = compatibility.judged(fitted(folder, found, {"phi": 0.99}, "not-converged"))
     assert not lost.compatible
     assert not lost.corrections["signals"]

@@ -477,6 +477,8 @@ def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
         ("Nickwinkel_deg", "outputs", "pitch"),
         ("nick", "outputs", "pitch"),
         ("Nickrate", "outputs", "pitch_rate"),
+        ("Nickrate_grad_s", "outputs", "pitch_rate"),
+        ("Rollwinkel_Grad", "outputs", "roll"),
         ("Gierwinkel", "outputs", "yaw"),
         ("assiette [deg]", "outputs", "pitch"),
         ("Pas général", "inputs", "collective"),

@@ -68,6 +68,10 @@ FACTORS = [
     ("1/s", "rad/s", 1.0),
     ("1", "rad", 1.0),
     ("1", "1/rad", 1.0),
+    ("1/min", "1/s", 1.0 / 60.0),
+    ("U/min", "rad/s", 2.0 * math.pi / 60.0),
+    ("tr/min", "rad/s", 2.0 * math.pi / 60.0),
+    ("grad/s", "rad/s", math.pi / 180.0),
 ]
 
 
@@ -107,6 +111,13 @@ def test_radians_do_not_pass_for_a_plain_number():
     # The other way round is SI's habit; this way a Hz could pass for 1/s.
     with pytest.raises(ValueError, match="Hz"):
         units.factor("Hz", "1/s")
+
+
+@pytest.mark.parametrize("unit", ["1/min", "min^-1", "min-1", "1/h"])
+def test_a_number_in_a_minute_is_no_angular_speed(unit):
+    """Benches write turns so, and of radians in a minute they are 6.28 times as many."""
+    with pytest.raises(ValueError, match="expected 'rpm'"):
+        units.factor(unit, "rad/s")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import re
 from heli_jax import units
 
 _PLAIN = {
-    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("deg", "degree", "degrees", "grad"), "deg"),
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
     "mrad": "mrad",
     **dict.fromkeys(("cdeg", "centideg", "centidegrees"), "cdeg"),

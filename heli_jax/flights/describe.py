@@ -257,7 +257,9 @@ def describe_table(
         once = without_copies(table, signal.name, surveys)
         if once is not table:
             table, surveys = once, once.survey()
-    marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
+    # A stamp is never taken as missing: a wrong one is refused with its row.
+    measured = [s for s in surveys if signal is None or s.name != signal.name]
+    marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
     if clock is not None:
         numbered = "" if starts.size or clock.gaps else numbering(surveys)

@@ -87,6 +87,9 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     bounds = np.concatenate([[0], falls, [stamps.size]])
     if not falls.size or np.diff(bounds).min() < _SHORTEST:
         return none
+    # Without one row the clock goes on: that stamp is wrong, and nothing begins.
+    if np.any((stamps[falls] > stamps[falls - 2]) | (stamps[falls + 1] > stamps[falls - 1])):
+        return none
     first, last = stamps[bounds[:-2]], stamps[falls - 1]
     anew = stamps[falls] <= first + _BEGINNING * (last - first)
     return falls if anew.all() else none

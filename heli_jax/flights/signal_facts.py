@@ -4,7 +4,7 @@ Taken before any resampling: a low-pass filter rounds off a flat top and fills t
 log, and what then looks smooth is none the better for it.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,8 @@ _STUCK, STUCK_SECONDS = 20.0, 0.5
 """times the usual number of equal samples in a row, and time, from which on a signal is stuck"""
 _AT_REST = 1e-3
 """of a usual move: what is nearer to a value before it stays there has come to it by itself"""
+_OFTEN = 3
+"""times at one value that need last so long together alone"""
 _REGULAR = 0.9
 """part of the runs of equal samples that are no longer than usual: a slow motion in coarse steps
 has runs of any length"""
@@ -138,12 +140,12 @@ class SignalFacts:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
             return replace(rail, times=times - begin)
 
-        stretches = []
-        for one in self.stretches:
-            inside = (max(one.begin, begin) - begin, min(one.end, end) - begin)
-            if inside[1] - inside[0] >= STUCK_SECONDS:
-                stretches.append(Stuck(*inside, one.value))
-        stretches.sort(key=lambda one: one.begin - one.end)
+        inside = [
+            Stuck(max(one.begin, begin) - begin, min(one.end, end) - begin, one.value)
+            for one in self.stretches
+            if one.begin < end and one.end > begin
+        ]
+        stretches = _that_count(inside, end - begin)
         drops = self.dropouts
         if drops is not None:
             times = drops.times[(drops.times >= begin) & (drops.times <= end)]
@@ -156,7 +158,7 @@ class SignalFacts:
             size=size,
             low=cut(self.low),
             high=cut(self.high),
-            stretches=tuple(stretches),
+            stretches=stretches,
             dropouts=drops,
             marked=tuple(m._replace(places=m.places - begin) for m in marked),
             strays=tuple(s for s in strays if s.times.size),
@@ -209,11 +211,12 @@ def facts_of_all[K: Hashable](
         for key in outputs:
             others = [one for other, one in signals.items() if other != key]
             # A machine that stands on the ground holds everything still, and no sensor is stuck.
-            stretches = tuple(
+            found = [
                 one
                 for one in _stretches(*signals[key], facts[key])
                 if any(_moves_as_usual(*other, one) for other in others)
-            )
+            ]
+            stretches = _that_count(found, facts[key].size * facts[key].usual)
             dropouts = _dropouts(*signals[key])
             facts[key] = replace(facts[key], stretches=stretches, dropouts=dropouts)
         for key in signals.keys() - outputs:
@@ -222,7 +225,7 @@ def facts_of_all[K: Hashable](
 
 
 def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[Stuck]:
-    """The times at one value that are out of all proportion, the longest first."""
+    """The times at one value that are out of all proportion."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     moves = np.abs(np.diff(y))
@@ -246,6 +249,7 @@ def _runs_out_of_proportion(
     # What rests at a rail is told as such.
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
+    noisy = _turns(moves) >= _TURNS
     least = _longest_by_itself(lengths, moves)
     stuck = []
     for i in np.flatnonzero(lengths >= least):
@@ -255,9 +259,24 @@ def _runs_out_of_proportion(
         before = abs(moves[first - 1]) if first else np.inf
         rests = before < max(_AT_REST * usual, 10.0 * within)
         drifts = np.ptp(y[first : last + 1]) > within
-        if end - begin >= STUCK_SECONDS and not rests and not drifts:
+        # What has no noise may rest for a while without being stuck.
+        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy):
             stuck.append(Stuck(begin, end, float(y[first])))
-    return sorted(stuck, key=lambda one: one.begin - one.end)
+    return stuck
+
+
+def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
+    """The longest first of those that last; all, where short ones take a share of a record [s]."""
+    total = sum(one.end - one.begin for one in stuck)
+    often = len(stuck) >= _OFTEN and total >= max(STUCK_SECONDS, DROP_SHARE * duration)
+    counted = [one for one in stuck if often or one.end - one.begin >= STUCK_SECONDS]
+    return tuple(sorted(counted, key=lambda one: one.begin - one.end))
+
+
+def _turns(moves: np.ndarray) -> float:
+    """The part of a signal's moves that go back."""
+    ways = np.sign(moves[moves != 0])
+    return float(np.mean(ways[1:] != ways[:-1])) if ways.size > 1 else 0.0
 
 
 def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
@@ -268,8 +287,7 @@ def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
         return _STUCK * usual
     # A slow motion in coarse steps has runs of any length; noise as large as the steps turns back
     # at every other one, and ends each run by chance.
-    ways = np.sign(moves[moves != 0])
-    if np.mean(ways[1:] != ways[:-1]) < _TURNS:
+    if _turns(moves) < _TURNS:
         return np.inf
     # The runs in which all but a hundredth of the time is spent, those that are stuck left out.
     ordered = np.sort(lengths[lengths < _STUCK * usual])

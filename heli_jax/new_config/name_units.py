@@ -9,6 +9,7 @@ from heli_jax.flights.channel_names import rate_at_end
 _UNIT_WORDS = {
     "deg/s": "deg/s", "deg per s": "deg/s", "degs": "deg/s", "dps": "deg/s", "rad/s": "rad/s",
     "rads": "rad/s", "radps": "rad/s", "deg": "deg", "degree": "deg", "degrees": "deg",
+    "grad": "deg",
     "rad": "rad", "mrad": "mrad", "rpm": "rpm", "percent": "%", "pct": "%", "mps": "m/s",
     "m/s": "m/s", "cm": "cm", "mm": "mm", "kt": "kt", "kn": "kt", "kts": "kt", "knot": "kt",
     "knots": "kt", "fps": "ft/s", "ft/s": "ft/s", "kmh": "km/h", "km/h": "km/h", "volt": "V",

@@ -78,11 +78,22 @@ def test_info_and_convert_put_them_apart_and_say_so(tmp_path: Path) -> None:
     assert any("3 runs, put one after another" in note for note in converted.notes)
 
 
+def test_a_wrong_stamp_is_no_missing_sample(tmp_path: Path) -> None:
+    t = DT * np.arange(200)
+    t[50] = 5e9
+    log = describe_log(written(tmp_path / "log.csv", t=t, p=np.sin(t)))
+    assert not any("for no value" in note for note in log.notes)
+    assert log.time is not None
+    assert "runs backwards" in log.time.problem
+
+
 def test_what_is_no_new_run(tmp_path: Path) -> None:
     times = DT * np.arange(200)
     assert not restarts(times).size
     for change in (
         lambda t: t[50:51].fill(0.1),  # one stamp that went back
+        lambda t: t[50:51].fill(5e9),  # one from which all others go back
+        lambda t: t[50:51].fill(-1e300),
         lambda t: t[100:].__isub__(0.5),  # a clock that was set back
         lambda t: t.__setitem__(slice(None), np.sin(9 * t)),
         lambda t: t[190:].__isub__(3.8),  # too short for a run

@@ -1,13 +1,17 @@
 """Late sticks, stuck sensors and dropouts, as they are told of a record at any rate."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal
 
+from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, _of_noise
 from heli_jax.identification.validation.advice import OutputAdequacy, Record
 from heli_jax.identification.validation.late_inputs import led_by
+from heli_jax.identification.validation.signal_quality import stuck
 
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)
@@ -58,6 +62,32 @@ def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise_and_dropouts_are_
     rests = scipy.signal.lfilter([0.05], [1.0, -0.95], u)
     assert of(np.round(rests, 5)).dropouts is None
     assert of(np.round(rests, 5)).stretches == ()
+
+
+def test_dropouts_that_hold_the_last_value_are_told_by_what_they_take_together():
+    noisy = ANSWER + 0.1 * np.random.default_rng(4).standard_normal(T.size)
+    moves = np.random.default_rng(5).standard_normal(T.size)
+
+    def of(begins, length):
+        y = noisy.copy()
+        for k in begins:
+            y[k : k + length] = y[k]
+        signals = {"p": (T, y), "q": (T, moves)}
+        return facts_of_all(signals, frozenset({"p"}))["p"]
+
+    # 0.3 s each, of 30 s.
+    found = of(range(300, 5700, 600), 60)
+    assert len(found.stretches) == 9
+    flight = Flight(0.005, inputs={"u": STICK}, outputs={"p": noisy})
+    source = Source("a.csv", "", facts={("p", "output"): found})
+    [told] = stuck([("one", replace(flight, source=source))])
+    assert "p stays at one value 9 times, 2.66 s in all, the longest 0.295 s" in told.sentence
+    # A second of it, and a part that has one of them alone.
+    assert len(found.within(1.0, 9.0).stretches) == 3
+    assert found.within(3.0, 6.0).stuck is None
+    # Once or twice, or for less than a hundredth of a record, is a logger's hiccup.
+    assert of((300, 3000), 60).stretches == ()
+    assert of(range(300, 5700, 2000), 22).stretches == ()
 
 
 def test_an_output_of_which_nothing_is_explained_is_named():

@@ -208,10 +208,16 @@ def _flown(problem: Problem, flight: Flight, name: str, size: float) -> bool:
     p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
     if p is None or size > _FLOWN_TURNS * 2 * np.pi or np.nanmax(np.abs(p)) > _LARGEST_RATE:
         return False
-    moved, by_rate = np.diff(phi), 0.5 * (p[1:] + p[:-1]) * flight.dt
-    both = np.isfinite(moved) & np.isfinite(by_rate)
-    power = float(np.sum(by_rate[both] ** 2))
-    return power > 0 and abs(float(np.sum(moved[both] * by_rate[both])) / power - 1.0) < 0.3
+    seen, rated = np.isfinite(phi), np.isfinite(p)
+    if not rated.any():
+        return False
+    # From one sample of the angle to its next, which a slower sensor has seconds later.
+    at = np.arange(p.size)
+    p = np.interp(at, at[rated], p[rated])
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (p[1:] + p[:-1]) * flight.dt)])
+    moved, by_rate = np.diff(phi[seen]), np.diff(turned[seen])
+    power = float(np.sum(by_rate**2))
+    return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < 0.3
 
 
 def _sticks(label: str, flight: Flight) -> Iterator[Misread]:

@@ -18,6 +18,7 @@ from heli_jax.flights.signal_facts import (
     STUCK_SECONDS,
     Rail,
     SignalFacts,
+    Stuck,
     at_rails,
     facts_of_all,
     quantum,
@@ -164,14 +165,9 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
             if facts.dropouts is not None and facts.dropped >= least:
                 words = dropout_words(label, flight, (name, kind), facts)
                 doubts.append((facts.dropped * facts.size * facts.usual, words))
-            for at in facts.stretches:
-                length = at.end - at.begin
-                words = (
-                    f"{label}: {name} stays at {at.value:.4g} for {length:.3g} s from "
-                    f"{at.begin:.4g} s on, while other signals change: it is no measurement there;"
-                    " leave this part out."
-                )
-                doubts.append((length, words))
+            doubts += [
+                (length, f"{label}: {name} {words}") for length, words in _stays(facts.stretches)
+            ]
     if not doubts:
         words = "no output stays at one value while others change."
         return [Finding("stuck outputs", "ok", words, 0.0, _STUCK_LIMIT)]
@@ -179,6 +175,27 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     return [
         Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
         for length, words in doubts[:_MOST_NAMED]
+    ]
+
+
+def _stays(stretches: Sequence[Stuck]) -> list[tuple[float, str]]:
+    """What is said of the times at one value, the longest first, with how long it was [s]."""
+    while_others = "while other signals change: it is no measurement there"
+    lengths = [one.end - one.begin for one in stretches]
+    if len(stretches) > _MOST_NAMED or any(length < STUCK_SECONDS for length in lengths):
+        words = (
+            f"stays at one value {len(stretches)} times, {sum(lengths):.3g} s in all, the longest "
+            f"{lengths[0]:.3g} s from {stretches[0].begin:.4g} s on, {while_others}; leave these "
+            "parts out, or empty their cells."
+        )
+        return [(sum(lengths), words)]
+    return [
+        (
+            length,
+            f"stays at {one.value:.4g} for {length:.3g} s from {one.begin:.4g} s on, "
+            f"{while_others}; leave this part out.",
+        )
+        for one, length in zip(stretches, lengths, strict=True)
     ]
 
 

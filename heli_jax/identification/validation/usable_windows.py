@@ -35,7 +35,7 @@ class Exclusions:
         for (name, _), whole in self.facts[i].items():
             facts = whole.within(first * flight.dt, (last - 1) * flight.dt)
             if facts.stuck is not None:
-                length = facts.stuck.end - facts.stuck.begin
+                length = sum(one.end - one.begin for one in facts.stretches)
                 return f"{name} stuck at one value for {length:.2g} s"
             if facts.dropped >= DROP_SHARE and facts.dropouts is not None:
                 words = f"jumps to {facts.dropouts.value:.4g} and back"
