@@ -1,6 +1,6 @@
 """What separates the lift slope a from the inertias: thrust carries a known mass.
 
-    .venv/bin/python experiments/heave_separates_a.py [--out FOLDER]
+    .venv/bin/python experiments/heave_separates_a.py [CASES | --quick] [--out FOLDER]
 
 Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
 rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines none of the
@@ -155,10 +155,10 @@ CASES: dict[str, Callable[[], Fit]] = {
 }
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, cases: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     page, results = ["# What separates a from the inertias", ""], {}
-    for title, identified in CASES.items():
+    for title, identified in list(CASES.items())[:cases]:
         result = identified()
         page += [f"## {title}", "", *table(result), "", f"{result.status}: {result.verdict.text}"]
         page += [*result.notes, ""]
@@ -175,6 +175,8 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    from script import asked
+    from script import Size, asked
 
-    main(asked(__doc__, "ten minutes", out="runs/heave").out)
+    cases = Size("cases", len(CASES), 1, "how many of them, the shortest first")
+    options = asked(__doc__, "ten minutes", cases, out="runs/heave")
+    main(options.out, options.cases)

@@ -23,6 +23,7 @@ DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
 _MOST_ROWS = 40
 _WIDEST = 24
 """characters of an axis's value"""
+_MOST_FAILURES = 10
 _NAMED = 3
 """runs that are named of many"""
 
@@ -119,8 +120,13 @@ def print_study(result: "xr.Dataset") -> None:
     for names, runs in _distrusted(flat).items():
         more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
         tell(f"! Not to be trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
-    for run, sentence in _failures(flat):
+    failures = _failures(flat)
+    for run, sentence in failures[:_MOST_FAILURES]:
         tell(f"! {run}: {sentence}")
+    if len(failures) > _MOST_FAILURES:
+        tell(
+            f"! ... and {len(failures) - _MOST_FAILURES} more that failed: `sentence` of study.zarr"
+        )
 
 
 def _axis(value: Any) -> str:

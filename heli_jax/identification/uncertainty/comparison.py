@@ -15,6 +15,9 @@ from heli_jax.stages import stage
 
 DIFFERENT = 0.15
 """intervals whose ends lie further apart than this part of their width differ"""
+_OF_QUANTILES = 2.0
+"""over the root of the number of samples, the same for the ends of a bootstrap: three standard
+deviations of a normal sample's 2.5 % quantile, sqrt(0.025 0.975) / 0.0584 of its own, over 3.92"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,11 +150,18 @@ def _sentences(
         )
     for name, by in by_parameter.items():
         others = {m: i for m, i in by.items() if m != "gaussian"}
-        far = [m for m, i in others.items() if apart(by["gaussian"], i) > DIFFERENT]
+        far = [m for m, i in others.items() if apart(by["gaussian"], i) > _limit(m, name, booted)]
         # With coloured residuals they differ for the reason that was given above.
         if far and not fit.coloured:
             sentences.append(f"{name}: {_which(far, others, booted, posterior)}")
     return sentences
+
+
+def _limit(method: str, name: str, booted: Bootstrap | None) -> float:
+    """By which part of its width an interval may differ from the Gaussian one."""
+    if method != "bootstrap" or booted is None:
+        return DIFFERENT
+    return max(DIFFERENT, _OF_QUANTILES / booted.values[name].size ** 0.5)
 
 
 def _which(
