@@ -12,7 +12,7 @@ from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
-from heli_jax.new_config import guess, tables, write_config
+from heli_jax.new_config import scales, tables, write_config
 from heli_jax.new_config.guess import (
     Series,
     by_motion,
@@ -20,12 +20,12 @@ from heli_jax.new_config.guess import (
     by_number,
     full_travel,
     may_be,
-    scaled,
     without_unit,
     words_of,
 )
 from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate
+from heli_jax.new_config.scales import scaled
 
 T = np.arange(0.0, 20.0, 0.02)
 STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))
@@ -554,12 +554,12 @@ def test_numbered_channels_are_guesses_and_what_follows_one_goes_before(tmp_path
 def test_counts_of_a_converter_are_no_degrees() -> None:
     counts = Series(T, np.rint(2048 + 300 * np.sin(3 * T)))
     for si in ("rad", "rad/s"):
-        found = guess.scaled("gyro_x_raw", counts, si)
+        found = scales.scaled("gyro_x_raw", counts, si)
         assert (found.unit, found.scale, found.offset) == (si, "EDIT", pytest.approx(2048, abs=150))
     # Neither a heading in whole degrees nor the speed of a rotor is one.
     heading = Series(T, np.rint(200 + 90 * np.sin(3 * T)))
-    assert guess.scaled("heading", heading, "rad").unit == "deg"
-    assert guess.scaled("headspeed", counts, "rad/s").scale == 1.0
+    assert scales.scaled("heading", heading, "rad").unit == "deg"
+    assert scales.scaled("headspeed", counts, "rad/s").scale == 1.0
 
 
 def test_columns_that_cannot_be_read_are_named_where_they_would_be_a_signal(
@@ -603,3 +603,15 @@ def test_a_latitude_is_no_lateral_stick() -> None:
     sticks = log(lat=stick, lon=0.2 + stick, rc__lat=1500 + 5 * stick, rc__lon=1500 + 0 * stick)
     assert not [name for name in sticks if is_place(name, sticks)]
     assert is_place("lat", log(lat=514234567 + 900 * stick))
+
+
+def test_counts_of_a_serial_bus_are_no_pulse_widths() -> None:
+    stick = Series(T, np.rint(992.0 + 250.0 * np.sin(T)))
+    found = scaled("ch1", stick, "1")
+    assert found.offset == 992.0
+    assert found.scale == pytest.approx(1.0 / 819.5)
+    assert "S.BUS" in found.remarks[0]
+    assert scaled("sbus_ch1", Series(T, np.rint(992.0 + 800.0 * np.sin(T))), "1").offset == 992.0
+    # Of pulse widths the middle is 1500, also where a throttle stays below.
+    assert "pulse" in scaled("ch1", Series(T, np.rint(1500.0 + 300.0 * np.sin(T))), "1").remarks[0]
+    assert "pulse" in scaled("thr", Series(T, np.rint(1250.0 + 90.0 * np.sin(T))), "1").remarks[0]

@@ -10,7 +10,6 @@ import numpy as np
 from heli_jax import units
 from heli_jax.flights.channel_names import no_stick
 from heli_jax.new_config.name_units import FILLERS, without_unit
-from heli_jax.yaml_file import EDIT
 
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
 _NUMBERED = re.compile(r"(?<=[a-z])(?=[0-9])")
@@ -33,23 +32,8 @@ _EXCITATIONS = {
     *("sweep", "chirp", "sid", "sysid", "inject", "injected", "injection", "excitation"),
     *("excite", "multisine", "prbs"),
 }
-_PULSES = (700.0, 2300.0)
-"""us: what receivers and servos are sent"""
-_FULL_PULSE = 500.0
-"""us from the middle to the end"""
-_MIDDLE, _TRIM = 1500.0, 150.0
-"""us: a stick's place at rest, and how far from it trims may move that"""
-_LONG = 0.2
-"""part of a record, for which nobody holds a stick away from where it rests"""
 _AXES = {"r": "roll", "p": "pitch", "y": "yaw"}
 _SETPOINTS = {letter + word for letter in _AXES for word in ("des", "out", "tar")}
-_ROTORS = {"rpm", "omega", "rotor", "headspeed", "head", "nr", "speed"}
-_FULL_COMMAND = 500.0
-"""at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
-_PARTS = 1.5
-"""above which a stick is not logged in parts of its travel"""
-_FASTEST_TURN = 8.0
-"""rad/s, which a small helicopter hardly exceeds in a log for identification"""
 _LAGS = 0.5
 """s by which an output may follow an input"""
 _RELATED = 0.4
@@ -194,7 +178,7 @@ def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> s
     """
     words = words_of(names[0])
     alike = [n for n in names if words_of(n) == words]
-    known = (n for n in alike if _fits(log[n].unit or without_unit(n)[1] or "none", si))
+    known = (n for n in alike if fits(log[n].unit or without_unit(n)[1] or "none", si))
     return next(known, names[0])
 
 
@@ -230,7 +214,7 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
     """
     unit = series.unit or without_unit(name)[1]
     # A model that states no unit takes any.
-    if unit and si != "1" and not _fits(unit, si):
+    if unit and si != "1" and not fits(unit, si):
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
     return not (_OTHER | _CHANGES) & words - own
@@ -295,123 +279,20 @@ def full_travel(sticks: Mapping[str, Series]) -> float | None:
     for series in sticks.values():
         values = series.values[np.isfinite(series.values)]
         # Radios of the EdgeTX family count to 1024, in whole numbers.
-        if values.size and np.max(np.abs(values)) == 1024.0 and _are_whole(values):
+        if values.size and np.max(np.abs(values)) == 1024.0 and are_whole(values):
             return 1024.0
     return None
 
 
-def _are_whole(values: np.ndarray) -> bool:
+def are_whole(values: np.ndarray) -> bool:
+    """Whether samples (N,) are whole numbers."""
     return bool(np.all(values == np.rint(values)))
 
 
-def scaled(channel: str, series: Series, si: str, full: float | None = None) -> Guess:
-    """A channel with the unit and the scale that its name, the log or its numbers tell.
-
-    Args:
-        channel: its name.
-        series: its samples.
-        si: the unit that the model has.
-        full: what the log's sticks count to at their stops, where that is known.
-    """
-    values = series.values[np.isfinite(series.values)]
-    low, high = float(np.min(values)), float(np.max(values))
-    stated, source = series.unit, "the log"
-    if not stated:
-        stated, source = without_unit(channel)[1], "its name"
-    if stated and _fits(stated, si):
-        return Guess(channel, stated, remarks=(f"unit by {source}",))
-    if _PULSES[0] < low and high < _PULSES[1] and high - low > 20:
-        return _of_pulses(channel, values, si)
-    if _are_counts(channel, values, si):
-        return _of_counts(channel, values, si)
-    if si == "rad":
-        # A heading may count from 0 to a turn; a pitch angle ends at a quarter of it.
-        most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
-        unit = "deg" if max(-low, high) > most else "rad"
-    elif si == "rad/s":
-        # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.
-        largest = max(-low, high)
-        # Whole numbers of rad/s nobody logs.
-        is_coarse = largest >= 2.0 and _are_whole(values)
-        unit = "deg/s" if largest > _FASTEST_TURN or is_coarse else "rad/s"
-    elif si == "1" and stated:
-        # A command in degrees: of an angle, or of the swashplate.
-        remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 over what full travel is in it"
-        return Guess(channel, "1", EDIT, remarks=(remark,))
-    elif si == "1":
-        return _of_stick(channel, low, high, full)
-    elif _fits("m", si):
-        guess = "GUESS: full travel of the input for 1 in the log is not known"
-        return Guess(channel, si, EDIT, remarks=(guess,))
-    else:
-        unit = si
-    return Guess(channel, unit, remarks=(f"GUESS: {low:.4g} to {high:.4g} taken for {unit}",))
-
-
-def _fits(unit: str, si: str) -> bool:
+def fits(unit: str, si: str) -> bool:
+    """Whether a unit is one of what the model has in `si`."""
     try:
         units.factor(unit, si)
     except ValueError:
         return False
     return True
-
-
-def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
-    # Most records begin with the stick at rest; where this one does not, receivers' middle. One
-    # that begins within a manoeuvre, stick held, does not come back to that place for long.
-    begin = values[: max(len(values) // 100, 5)]
-    first, small = float(np.median(begin)), 0.02 * float(np.ptp(values))
-    is_still = np.ptp(begin) < small
-    is_middle = abs(first - _MIDDLE) < _TRIM or np.mean(np.abs(values - first) < small) > _LONG
-    rest = first if is_still and is_middle else _MIDDLE
-    remark = f"GUESS: pulse widths, {rest:g} us at rest"
-    if si == "1":
-        remark = f"{remark}, {_FULL_PULSE:g} us to the stop"
-        return Guess(channel, "1", 1.0 / _FULL_PULSE, rest, (remark,))
-    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
-
-
-def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
-    """Whether whole numbers far from zero are those of a converter, and no angle or rate."""
-    low, high = float(np.min(values)), float(np.max(values))
-    if not _are_whole(values) or low < 0.1 * high or _ROTORS & set(words_of(channel)):
-        return False
-    # A heading has 360 degrees; nothing turns by more than 100 deg/s all the time.
-    return (si == "rad" and high > 2 * 360.0) or (si == "rad/s" and low > 100.0)
-
-
-def _of_counts(channel: str, values: np.ndarray, si: str) -> Guess:
-    rest = float(np.median(values[: max(len(values) // 100, 5)]))
-    words = f"GUESS: counts, {rest:g} at the beginning; scale: {si} for a count"
-    return Guess(channel, si, EDIT, rest, (words,))
-
-
-def _of_stick(channel: str, low: float, high: float, full: float | None) -> Guess:
-    largest = max(-low, high)
-    # What pilots command of Betaflight's family counts to 500, its collective to 1000 or so.
-    commanded = words_of(channel)[-3:-1] == ("rc", "command") and largest <= _FULL_COMMAND
-    travel = _FULL_COMMAND if commanded else full
-    if travel and _PARTS < largest <= travel:
-        remark = f"GUESS: {low:.4g} to {high:.4g}, {travel:g} at the stop"
-        return Guess(channel, "1", 1.0 / travel, remarks=(remark,))
-    for most, unit, scale in ((_PARTS, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
-        if largest <= most:
-            what = "thousandths" if scale != 1.0 else {"1": "parts of full travel"}.get(unit, unit)
-            remark = f"GUESS: {low:.4g} to {high:.4g} taken for {what}"
-            return Guess(channel, unit, scale, remarks=(remark,))
-    remark = f"GUESS: {low:.4g} to {high:.4g}; scale: 1 over what full travel is in the log"
-    return Guess(channel, "1", EDIT, remarks=(remark,))
-
-
-def rotor_speed(channel: str, series: Series) -> float:
-    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s.
-
-    Args:
-        channel: its name.
-        series: its samples.
-    """
-    mean = float(np.nanmean(series.values))
-    unit = series.unit or without_unit(channel)[1]
-    if unit and _fits(unit, "rad/s"):
-        return mean * units.factor(unit, "rad/s")
-    return mean * units.factor("rpm", "rad/s") if mean > 500.0 else mean

@@ -9,7 +9,7 @@ from heli_jax import naming
 from heli_jax.dynamics.model import axes_of
 from heli_jax.flights.channel_names import names_a_stick
 from heli_jax.flights.preset import model_inputs, model_outputs
-from heli_jax.new_config import guess, tables, text
+from heli_jax.new_config import guess, scales, tables, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log
 from heli_jax.new_config.places import is_place
@@ -53,7 +53,7 @@ def signals_of(model: Any, log: Log) -> text.Signals:
     speed = guess.by_name(called["rotor_speed"], tuple(log.series))
     known = {}
     if speed and "Omega" in naming.names(model.Params):
-        known = {"Omega": (speed[0], guess.rotor_speed(speed[0], log.series[speed[0]]))}
+        known = {"Omega": (speed[0], scales.rotor_speed(speed[0], log.series[speed[0]]))}
         taken.append(speed[0])
     rest = tuple(n for n in log.series if n not in taken)
     measured = [log.series[g.channel].values for g in outputs.values()]
@@ -132,7 +132,7 @@ def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess |
         return None
     chosen = guess.of_known_unit(candidates, log.series, si)
     taken.append(chosen)
-    scaled = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    scaled = scales.scaled(chosen, log.series[chosen], si, _full_travel(log))
     others = [n for n in candidates if n != chosen]
     if not others:
         return scaled
@@ -190,7 +190,7 @@ def _by_correlation(
         if best is None:
             continue
         channel, related = best
-        made = guess.scaled(channel, log.series[channel], si, _full_travel(log))
+        made = scales.scaled(channel, log.series[channel], si, _full_travel(log))
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)
