@@ -150,11 +150,11 @@ class FilterError(Estimator):
         return z, Noise(sd, level)
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """Only where priors are weighed against a scale that is concentrated out, where the noise
-        fell past what the likelihood's row can show, or where it attenuates scale errors or is
-        itself too small by what the parameters take up."""
+        """Only where priors are weighed against a scale that is concentrated out, where that is far
+        from what it was or the noise fell past what the likelihood's row can show, or where it
+        attenuates scale errors or is itself too small by what the parameters take up."""
         if layout.concentrated:
-            return any(f.prior for f in problem.free.values())
+            return any(f.prior for f in problem.free.values()) or _is_far(before, after)
         fell = before.log_variance_ratio - after.log_variance_ratio
         attenuates = slopes_changed(before, after) > _ATTENUATES
         return bool(fell > _FELL) or attenuates or own_changed(before, after)
@@ -273,6 +273,16 @@ class FilterError(Estimator):
             f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
             "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
         ]
+
+
+def _is_far(before: Noise, after: Noise) -> bool:
+    """Whether the rows had another variance than 1 by far: what they tell of variances, whose rows
+    have no such factor, then had another weight beside them, and a search may have ended early."""
+    ratios = [
+        float(sd[n] / old[n]) for sd, old in zip(after.sd, before.sd, strict=True) for n in sd
+    ]
+    level = abs(float(before.log_variance_ratio - after.log_variance_ratio))
+    return bool(2.0 * abs(np.log(max(ratios))) + level > _FELL)
 
 
 _ILL = (
