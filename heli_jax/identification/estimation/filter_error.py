@@ -24,6 +24,7 @@ from heli_jax.identification.estimation.kalman import SMALL, Innovations, innova
 from heli_jax.identification.estimation.measured_signals import (
     measured_count,
     measured_signals,
+    measurement_sd,
     signals,
 )
 from heli_jax.identification.estimation.noiseless_outputs import (
@@ -342,7 +343,7 @@ def filter_arguments(
     """Of `kalman.innovations` for the i-th flight; arguments as of `filtered_flights`."""
     drive = driven(layout, data, u, i)
     measured = {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()}
-    sd = {n: s * u.scales[n] if n in u.scales else s for n, s in noise.sd[i].items()}
+    sd = {n: measurement_sd(u, n, s) for n, s in noise.sd[i].items()}
     options = SimulationOptions(
         dt=drive.dt,
         initial_state=drive.state,

@@ -4,7 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.dynamics.sensor_noise import sensor_noise
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+
+_BEHIND = 0.02
+"""of the noise that came through filters, which is behind them at least: without any the first
+innovation, which an initial state makes zero, would have no variance, and the likelihood no end"""
 
 
 def signals(layout: Layout) -> list[tuple[int, str]]:
@@ -32,6 +37,19 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
     sd = jnp.stack([noise.sd[i][n] for i, n in at])
     y = jnp.concatenate([data.flights[i].outputs[n] for i, n in at])
     return y, sd[signal_numbers(layout, data)]
+
+
+def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
+    """The sd of an output's white measurement noise.
+
+    Args:
+        u: the unknowns, in the units of the model.
+        output: whose it is.
+        sd: the guess of it, or what is stated.
+    """
+    sd = sd * u.scales[output] if output in u.scales else sd
+    through = u.noise.get(sensor_noise(output))
+    return sd if through is None else jnp.hypot(sd, _BEHIND * through)
 
 
 def measured_count(data: Data) -> int:

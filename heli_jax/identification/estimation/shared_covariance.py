@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import Innovations, first_covariance
+from heli_jax.identification.estimation.measured_signals import measurement_sd
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.estimation.steady_gain import Gaussian, Records, filtered_records
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
@@ -82,7 +83,7 @@ def _shared_sd(
     by_flight = jnp.stack([jnp.stack([noise.sd[i][n] for n in names]) for i in group])
     # No number at all is better than one of another flight's noise.
     sd = jnp.where(jnp.all(by_flight == by_flight[:1]), by_flight[0], jnp.nan)
-    return sd * jnp.stack([u.scales[n] if n in u.scales else jnp.ones_like(sd[0]) for n in names])
+    return jnp.stack([measurement_sd(u, n, s) for n, s in zip(names, sd, strict=True)])
 
 
 def _first_state(layout: Layout, drive: Drive, dtype: Any) -> Float[Array, " n"]:

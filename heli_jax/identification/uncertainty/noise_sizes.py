@@ -19,8 +19,10 @@ from heli_jax.identification.unknowns.layout import Solution
 
 _STEP = 1e-3
 """of a coordinate, for a difference"""
-_NO_EFFECT = 1e-10
-"""of the largest singular value"""
+_NO_EFFECT = 1e-5
+"""of the largest singular value, below which a direction is that of the common scale"""
+_TAKES_PART = 0.02
+"""part of a direction without effect from which on a size is lost with it"""
 
 
 def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
@@ -55,4 +57,7 @@ def _deviations(
     norms = np.where(norms > 0, norms, 1.0)
     _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
     kept = sizes > _NO_EFFECT * sizes[0]
-    return np.linalg.norm((rows / norms) @ right[kept].T / sizes[kept], axis=1)
+    along = (rows / norms) @ right.T
+    lost = np.abs(along[:, ~kept]) > _TAKES_PART * np.linalg.norm(rows / norms, axis=1)[:, None]
+    sds = np.linalg.norm(along[:, kept] / sizes[kept], axis=1)
+    return np.where(lost.any(axis=1), np.inf, sds)
