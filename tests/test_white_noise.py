@@ -5,11 +5,17 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 
 from heli_jax import Flight, Free, Problem, cli, linear_model, yaml_file
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.validation.wandering_angles import wandering_notes
-from heli_jax.numerics.white_noise import noise_guess, wanders, without_noise
+from heli_jax.numerics.white_noise import (
+    noise_guess,
+    rises_when_slower,
+    wanders,
+    without_noise,
+)
 
 T = np.arange(3000) * 0.01
 STICK = 0.1 * np.sign(np.sin(2.0 * T)) * (np.sin(0.31 * T) > -0.5)
@@ -101,3 +107,18 @@ def test_new_takes_output_error_for_a_log_without_noise(tmp_path: Path) -> None:
     assert made["fit"]["method"] == "output-error"
     assert "disturbance" not in made
     assert "smoothed or" in text
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_went_through_a_low_pass_shows_below_white_noise(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    white, before = rng.normal(size=(2, 3000))
+    a = np.exp(-2 * np.pi * 10.0 * 0.01)
+    filtered = np.asarray(scipy.signal.lfilter([np.sqrt(1 - a * a)], [1, -a], before))
+    assert rises_when_slower(filtered + white, 3)
+    assert not wanders(filtered + white)
+    lost = rng.random(3000) < 0.2
+    assert rises_when_slower(np.where(lost, np.nan, filtered), 3)
+    assert not rises_when_slower(np.where(lost, np.nan, white), 3)
+    assert not rises_when_slower(white, 3)
+    assert not rises_when_slower(filtered[:300], 3)

@@ -8,6 +8,9 @@ _WHITE, _INTEGRATED = -0.75, -2.0 / 3.0
 """autocorrelation at one sample of the third differences of white noise and of its sum"""
 _SPREAD = 0.45
 """sd of the first of them times the root of the number of samples (Bartlett's formula)"""
+_POWER_SPREAD = 2.15
+"""sd of the logarithm of their mean square times the root of the number of samples: the root of
+twice the sum of their squared autocorrelations"""
 _FEWEST = 400
 """third differences that tell the two apart"""
 _REPEATED = 0.3
@@ -95,6 +98,39 @@ def wanders(signal: np.ndarray) -> bool:
     square = 0.5 * float(np.sum(first**2) + np.sum(second**2))
     related = float(np.sum(first * second)) / square if square else _WHITE
     return related > max(0.5 * (_WHITE + _INTEGRATED), _WHITE + 3.0 * _SPREAD / first.size**0.5)
+
+
+def rises_when_slower(signal: np.ndarray, every: int) -> bool:
+    """Whether a signal has more noise below a lower rate than near its own, as noise has that went
+    through a low-pass, with white noise over it or without.
+
+    White noise has as much in the third differences of every n-th sample as in those of neighbours.
+
+    Args:
+        signal: (N,), NaN where nothing is measured.
+        every: samples from one to the next at the lower rate, at least 2.
+    """
+    fast, slow = _third_differences(signal, 1), _third_differences(signal, every)
+    if min(fast.size, slow.size) < _FEWEST:
+        return False
+    powers = [float(np.mean(_without_corners(d) ** 2)) for d in (fast, slow)]
+    spread = _POWER_SPREAD * np.sqrt(1.0 / fast.size + 1.0 / slow.size)
+    return bool(powers[1] > powers[0] * np.exp(3.0 * spread))
+
+
+def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
+    """Of samples so far apart, without those in which one is missing; of white noise they have its
+    sd."""
+    y = signal
+    for _ in range(3):
+        y = y[every:] - y[:-every]
+    return y[np.isfinite(y)] / np.sqrt(20.0)
+
+
+def _without_corners(d: np.ndarray) -> np.ndarray:
+    """Differences clipped at four times their sd by the median of what is large or small."""
+    most = 4.0 * float(np.median(np.abs(d))) / 0.6744897501960817
+    return np.clip(d, -most, most)
 
 
 def without_noise(signal: np.ndarray) -> bool:

@@ -159,7 +159,7 @@ class Profile(NamedTuple):
         t = self.reach * sd
         furthest = self._furthest(side)
         seen, guess = [(0.0, 0.0)], z0
-        tangent = self.along / self.along[self.i]
+        tangent = self._ahead(self.along / self.along[self.i])
         for k in range(_POINTS):
             t = min(t, furthest)
             guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
@@ -174,7 +174,7 @@ class Profile(NamedTuple):
                 if t >= furthest:
                     return self._at_limit(side)
                 # The direction in which the others went last is where they go on.
-                tangent = (point.z - z0) / (point.z[self.i] - z0[self.i])
+                tangent = self._ahead((point.z - z0) / (point.z[self.i] - z0[self.i]))
                 guess, t = point.z, t * _OUTWARDS
                 above = [s for s, r in seen if r >= self.reach]
                 if above:
@@ -183,7 +183,7 @@ class Profile(NamedTuple):
                 break
             else:
                 inside = max(s for s, r in seen if r < self.reach)
-                guess, tangent = z0, self.along / self.along[self.i]
+                guess, tangent = z0, self._ahead(self.along / self.along[self.i])
                 t = max(0.5 * (t + inside), t * self.reach / root) if root < math.inf else 0.5 * t
         # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
         # chance is one among many places where the noise may have put it.
@@ -193,6 +193,17 @@ class Profile(NamedTuple):
             self.inside.append(Inside(point.z, 0.0))
             return self._at_limit(side)
         return End(self._value(z0[self.i] + side * self._crossing(seen)), False)
+
+    def _ahead(self, tangent: np.ndarray) -> np.ndarray:
+        """A tangent (q,) along which to guess the next point."""
+        layout = self.at.layout
+        if not (layout.filtered and layout.concentrated):
+            return tangent
+        # All sizes are relative to the noise behind a filter, which may be next to nothing: they
+        # go by it together, as far as their limits, from where no slope leads back.
+        ahead = tangent.copy()
+        ahead[[layout.disturbance_at(name) for name in layout.sizes]] = 0.0
+        return ahead
 
     def _left(self, root: float) -> float:
         """What part of an interval is left where so much of the likelihood is lost already."""
