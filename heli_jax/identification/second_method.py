@@ -35,9 +35,11 @@ _WELL_EXPLAINED = 0.95
 _APART = 3.3
 """standard deviations that chance takes two estimates apart in one of 1000: of output error, and of
 the difference between the consistent estimate and filter error's"""
-_HAS_A_SAY = 1.05
+_DOUBTED = 2.2
+"""the same that chance takes them apart in one of 36, from which on a reader should know of it"""
+_HAS_A_SAY = 1.02
 """factor between standard deviations by the inputs alone and by all, above which a wrong
-disturbance moves estimates by their standard deviation"""
+disturbance moves estimates by their standard deviation: gusts of two time constants did at 1.025"""
 _LEAST = 0.25
 """part of the consistent estimate's variance that its difference from the efficient one has at
 least: both variances are estimates, and neither method attains its bound"""
@@ -68,7 +70,7 @@ def with_second_method(
     Asked of linear models whose inputs do not follow the response: of output error where
     disturbances colour its residuals and take a good part of an output, of filter error where the
     answer to the inputs, by itself, asks for other values, or where the disturbance narrows an
-    interval by a twentieth.
+    interval or takes a good part of an output.
 
     Args:
         problem: what was fitted.
@@ -102,7 +104,17 @@ def with_second_method(
         if question.is_apart(a, other.estimates[n])
     }
     second = SecondMethod(METHODS[_METHOD].label, estimates)
-    notes = (*first.notes, sentence(second, question.remedy)) if estimates else first.notes
+    notes = first.notes
+    if estimates:
+        notes = (*notes, sentence(second, question.remedy))
+    elif filtered:
+        doubted = {
+            n: _interval(other.estimates[n])
+            for n, a in first.estimates.items()
+            if _excluded(a, other.estimates[n], _DOUBTED)
+        }
+        if doubted:
+            notes = (*notes, sentence(second._replace(estimates=doubted), _OF_DOUBT))
     return dataclasses.replace(first, second_method=second, notes=notes)
 
 
@@ -116,8 +128,13 @@ def _is_doubtful(problem: Problem, first: Fit) -> bool:
 
 def _is_disturbed(first: Fit) -> bool:
     """Whether disturbances colour output error's residuals and take a good part of an output."""
+    return first.coloured and _least_explained(first) < _WELL_EXPLAINED
+
+
+def _least_explained(first: Fit) -> float:
+    """The least VAF of an output, simulated; 1 without any."""
     vafs = [m.vaf for m in first.metrics.values()]
-    return first.coloured and bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
+    return min((v if math.isfinite(v) else -math.inf for v in vafs), default=1.0)
 
 
 def _may_be_misled(first: Fit) -> bool:
@@ -125,6 +142,10 @@ def _may_be_misled(first: Fit) -> bool:
     a say in one of them: a wrong one then misleads."""
     if first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
+    # By which spectrum a disturbance moved an output, neither its innovations nor the inputs tell:
+    # of two time constants one is found, with white innovations, and the parameters make up for it.
+    if _least_explained(first) < _WELL_EXPLAINED:
+        return True
     at = first.reached
     e = evaluate(*at)
     inputs = through_inputs(at, e)
@@ -153,9 +174,9 @@ def _apart(a: Estimate, b: Estimate) -> bool:
     return abs(value - a.value) > _APART * a.sd and not low <= a.value <= high
 
 
-def _excluded(a: Estimate, b: Estimate) -> bool:
-    """Whether filter error's estimate is one that the other's excludes: their difference has the
-    variance of the other less that of filter error."""
+def _excluded(a: Estimate, b: Estimate, apart: float = _APART) -> bool:
+    """Whether filter error's estimate is one that the other's excludes, by so many standard
+    deviations of their difference: that has the variance of the other less that of filter error."""
     interval, filtered = _interval(b), _interval(a)
     # What it does not determine itself it has nothing against.
     if not a.sd or not b.sd or interval is None or filtered is None:
@@ -164,7 +185,7 @@ def _excluded(a: Estimate, b: Estimate) -> bool:
     if filtered[1] <= value <= filtered[2]:
         return False
     sd = (value - low if a.value < value else high - value) / _NORMAL
-    return abs(a.value - value) > _APART * sd * math.sqrt(max(_LEAST, 1.0 - (a.sd / b.sd) ** 2))
+    return abs(a.value - value) > apart * sd * math.sqrt(max(_LEAST, 1.0 - (a.sd / b.sd) ** 2))
 
 
 def sentence(second: SecondMethod, why: str) -> str:
@@ -179,6 +200,13 @@ def sentence(second: SecondMethod, why: str) -> str:
         for n, v in second.estimates.items()
     )
     return f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. {why}"
+
+
+_OF_DOUBT = (
+    "Filter error's value lies further from that than the two methods should: its interval holds "
+    "if the disturbance is as it is stated (one correlation time, where it acts), the other one in "
+    "any case."
+)
 
 
 class _Question(NamedTuple):
