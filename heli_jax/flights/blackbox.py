@@ -11,6 +11,7 @@ import numpy as np
 
 from heli_jax.errors import InputError
 from heli_jax.flights import progress
+from heli_jax.flights.blackbox_columns import columns_of
 from heli_jax.flights.blackbox_frames import Frames, find_frames
 from heli_jax.flights.blackbox_header import HOME, MARK, FrameLayout, Header, read_header
 from heli_jax.flights.blackbox_predictors import MainFrames, main_frames, other_frames
@@ -19,7 +20,7 @@ from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 10**9
-"""bytes: decoded it takes about ten times as much"""
+"""bytes: decoded it takes about six times as much"""
 _MOST_FLIGHTS = 1000
 _DEGREES_PER_SECOND = "0x3f800000"
 """gyro_scale of firmware whose gyro counts are degrees per second: the float 1.0"""
@@ -79,7 +80,8 @@ def _flight(
     # P frames have the names and signs of I frames, so one layout is right for all rows.
     layout = head.layouts["I"]
     units = _units(layout, head)
-    topics = [Topic("main", main.times * 1e-6, _columns(main.values, layout), units, "time")]
+    named = dict(zip(layout.names, main.columns, strict=True))
+    topics = [Topic("main", main.times * 1e-6, named, units, "time")]
     # H frames make no topic: they hold the origin that the positions of G frames are told from, and
     # are added to these.
     topics += [t for letter in "SG" if (t := _other(frames, letter, head, main)) is not None]
@@ -95,28 +97,6 @@ def _flight(
         notes=_losses(frames, main),
         flight=flight,
     )
-
-
-def _columns(values: np.ndarray, layout: FrameLayout) -> dict[str, np.ndarray]:
-    columns = {}
-    for i, (name, signed) in enumerate(zip(layout.names, layout.signed, strict=True)):
-        # Kept as 32 bits, of which an unsigned field uses the top one for its size.
-        column = np.ascontiguousarray(values[:, i].astype(np.int32, copy=False))
-        columns[name] = _narrowed(column if signed else column.view(np.uint32))
-    return columns
-
-
-def _narrowed(column: np.ndarray) -> np.ndarray:
-    """The numbers in the fewest bits that hold them: most need half of 32, and a file's flights
-    are all kept."""
-    if not column.size:
-        return column
-    low, high = int(column.min()), int(column.max())
-    kinds = (np.int8, np.int16) if column.dtype.kind == "i" else (np.uint8, np.uint16)
-    for kind in kinds:
-        if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max:
-            return column.astype(kind)
-    return column
 
 
 def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
@@ -153,7 +133,8 @@ def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic
         last = np.searchsorted(main.starts, frames.starts[letter]) - 1
         times, clock = main.times[np.maximum(last, 0)], "time of the main frame before"
     names = {"S": "slow", "G": "GPS"}
-    columns = _columns(values.astype(np.int64), layout)
+    of_fields = columns_of(values.astype(np.int32), layout.signed)
+    columns = dict(zip(layout.names, of_fields, strict=True))
     # A field such as time may stand in several kinds of frames, but a channel's name has to be one
     # topic's alone.
     taken = set(head.layouts["I"].names)

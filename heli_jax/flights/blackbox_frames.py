@@ -11,9 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from heli_jax.flights.blackbox_columns import Rows
 from heli_jax.flights.blackbox_encodings import decode
 from heli_jax.flights.blackbox_header import FrameLayout
 
+MAIN = "IP"
+"""letters of the control loop's frames"""
 LONGEST_FRAME = 256
 """bytes, as firmware's own tools have it: what goes on for longer is damage"""
 _CELLS_AT_ONCE = 1 << 25
@@ -32,13 +35,15 @@ _ADJUSTMENT, _RESUME, _CUSTOM, _END = 13, 14, (100, 101), 255
 class Frames:
     """The frames of one flight, by kind in the order of the file.
 
-    `rows` (M, F) int32 by letter are the numbers as written, before any prediction; `starts` (M,)
-    where each frame begins [bytes]. `damage` (D,) are the places where something was no frame,
+    `rows` (M, F) int32 by letter are the numbers as written, before any prediction, those of the
+    control loop (I and P, nearly all) packed in `packed`; `starts` (M,) where each frame begins
+    [bytes]. `damage` (D,) are the places where something was no frame,
     `resumes` where the firmware says that it went on after a pause, `end` says that it closed the
     log.
     """
 
     rows: dict[str, np.ndarray]
+    packed: dict[str, Rows]
     starts: dict[str, np.ndarray]
     damage: list[int] = field(default_factory=list)
     resumes: list[int] = field(default_factory=list)
@@ -123,20 +128,23 @@ class _Walk:
         # one, each with as many numbers as the widest frame has fields.
         widest = max(len(layout.names) for layout in layouts.values())
         self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
-        self.frames = Frames({}, {})
-        self.kept: dict[str, list[_Candidates]] = {letter: [] for letter in layouts}
+        self.frames = Frames({}, {}, {})
+        self.kept = {letter: Rows(len(layout.names)) for letter, layout in layouts.items()}
+        self.starts: dict[str, list[np.ndarray]] = {letter: [] for letter in layouts}
         self.in_damage = False
 
     def run(self) -> Frames:
         while self.at < self.size and not self.frames.end:
             self._walk_piece(self.at, min(self.at + self.piece, self.size))
-        for letter, layout in self.layouts.items():
-            none = np.zeros((0, len(layout.names)), np.int32)
-            pieces = self.kept[letter]
-            self.frames.rows[letter] = np.concatenate([none, *(p.values for p in pieces)])
+        for letter, rows in self.kept.items():
+            if letter in MAIN:
+                self.frames.packed[letter] = rows
+            else:
+                self.frames.rows[letter] = rows.take(rows.size)
             self.frames.starts[letter] = np.concatenate(
-                [np.zeros(0, np.int64), *(p.starts for p in pieces)]
+                [np.zeros(0, np.uint32), *self.starts[letter]]
             )
+            self.starts[letter].clear()
         return self.frames
 
     def _walk_piece(self, first: int, last: int) -> None:
@@ -166,7 +174,9 @@ class _Walk:
         is_frame[chain.visited() - first] = True
         for letter, each in candidates.items():
             i = np.flatnonzero(is_frame[each.starts - first])
-            self.kept[letter].append(_Candidates(each.starts[i], each.ends[i], each.values[i]))
+            self.kept[letter].append(each.values[i])
+            # A file has less than 2^32 bytes.
+            self.starts[letter].append(each.starts[i].astype(np.uint32))
 
     def _candidates(self, letter: str, first: int, last: int) -> _Candidates:
         starts = first + np.flatnonzero(self.bytes[first:last] == ord(letter))

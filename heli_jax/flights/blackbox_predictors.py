@@ -8,46 +8,89 @@ All arithmetic is that of the firmware: 32 bits that overflow silently, division
 field without a sign has the same bits.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
 from heli_jax.flights import blackbox_header as header
+from heli_jax.flights.blackbox_columns import columns_of
 from heli_jax.flights.blackbox_frames import Frames
 from heli_jax.flights.blackbox_header import FrameLayout, Header
 
+_PART = 1 << 15
+"""frames that are computed at once, about: as numbers of 32 bits all of a log take five times it"""
 _LONGEST_JUMP = 10_000_000
 """us between frames, as firmware's own tools have it: what jumps further was misread"""
 
 
 @dataclass(frozen=True)
 class MainFrames:
-    """The frames of the control loop: `values` (N, F) int32, unsigned fields modulo 2^32, `times`
-    (N,) [us] from the firmware's start, `starts` (N,) [bytes]; `dropped` frames could not be
-    computed or have impossible times."""
+    """The frames of the control loop: `columns` F of (N,), in the fewest bits, `times` (N,) [us]
+    from the firmware's start, `starts` (N,) [bytes]; `dropped` frames could not be computed or have
+    impossible times."""
 
-    values: np.ndarray
+    columns: tuple[np.ndarray, ...]
     times: np.ndarray
     starts: np.ndarray
     dropped: int
 
 
 def main_frames(frames: Frames, head: Header) -> MainFrames:
-    """The frames I and P with predictions added, in the order of the file."""
+    """The frames I and P with predictions added, in the order of the file.
+
+    Args:
+        frames: what was found; their packed numbers are taken.
+        head: the flight's header.
+    """
     layout = head.layouts["I"]
     # The finder keeps each kind apart. A difference needs the frame that stood before it in the
     # file, so the two kinds are merged by their positions.
     starts = np.concatenate([frames.starts["I"], frames.starts["P"]])
     order = np.argsort(starts, kind="stable")
-    place = np.empty_like(order)
-    place[order] = np.arange(order.size)
-    count = frames.starts["I"].size
-    starts, is_first = starts[order], (order < count)
-    # Each kind straight to its places: a copy of all numbers less.
-    values = np.empty((starts.size, len(layout.names)), np.int32)
-    values[place[:count]], values[place[count:]] = frames.rows["I"], frames.rows["P"]
+    starts, is_first = starts[order], (order < frames.starts["I"].size)
+    del order  # of a long log each number a frame counts
     first, length = _runs(starts, is_first, np.asarray(frames.damage, np.int64))
-    _predict_first(values, first, layout, head)
+    # In parts that begin with an I frame, which needs none before it.
+    at = np.searchsorted(first, np.arange(_PART, starts.size, _PART)) - 1
+    edges = np.unique(first[at]) if first.size else first
+    pieces: list[list[np.ndarray]] = []
+    stamps: list[np.ndarray] = []
+    for begin, end in itertools.pairwise([0, *edges[edges > 0].tolist(), starts.size]):
+        values = _part(frames, is_first[begin:end], len(layout.names))
+        own = slice(*np.searchsorted(first, [begin, end]))
+        _predict(values, first[own] - begin, length[own], head)
+        stamps.append(np.ascontiguousarray(values[:, layout.names.index("time")]).view(np.uint32))
+        pieces.append(columns_of(values, layout.signed))
+    keep, times = _plausible(np.concatenate(stamps), first, length, frames, starts)
+    del stamps
+    columns = tuple(_joined(pieces, i) for i in range(len(layout.names)))
+    if keep is None:
+        return MainFrames(columns, times, starts, 0)
+    dropped = starts.size - keep.size
+    return MainFrames(tuple(column[keep] for column in columns), times, starts[keep], dropped)
+
+
+def _part(frames: Frames, is_first: np.ndarray, width: int) -> np.ndarray:
+    """The next frames (N, F) as written, of which some (N,) are I frames."""
+    values = np.empty((is_first.size, width), np.int32)
+    count = int(np.count_nonzero(is_first))
+    values[is_first] = frames.packed["I"].take(count)
+    values[~is_first] = frames.packed["P"].take(is_first.size - count)
+    return values
+
+
+def _joined(pieces: list[list[np.ndarray]], i: int) -> np.ndarray:
+    """The i-th column of all parts, which are given away."""
+    column = np.concatenate([piece[i] for piece in pieces])
+    for piece in pieces:
+        piece[i] = column[:0]
+    return column
+
+
+def _predict(values: np.ndarray, first: np.ndarray, length: np.ndarray, head: Header) -> None:
+    """Add predictions to frames (N, F), by runs that begin at `first` (R,) with `length` (R,)."""
+    _predict_first(values, first, head.layouts["I"], head)
     for k in range(1, int(length.max(initial=0))):
         rows = first[length > k] + k
         # An I frame counts as both frames before the first P frame.
@@ -56,12 +99,6 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
         before = values[rows - 1]
         earlier = values[rows - 2] if k > 1 else before
         values[rows] = _predicted(values[rows], before, earlier, head)
-    stamps = values[:, layout.names.index("time")].view(np.uint32).astype(np.int64)
-    keep, times = _plausible(stamps, first, length, frames, starts)
-    dropped = starts.size - keep.size
-    if not dropped:
-        return MainFrames(values, times, starts, 0)
-    return MainFrames(values[keep], times, starts[keep], dropped)
 
 
 def _runs(
@@ -172,16 +209,23 @@ def _wrapped(values: np.ndarray, layout: FrameLayout) -> np.ndarray:
 
 def _plausible(
     stamps: np.ndarray, first: np.ndarray, length: np.ndarray, frames: Frames, starts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The frames whose times go on from the last one's, and these times [us]."""
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """The frames whose times go on from the last one's, None where all do, and these times
+    [us]."""
     resumed = set(np.searchsorted(starts, np.asarray(frames.resumes, np.int64)).tolist())
-    rows = np.flatnonzero(_inside(first, length, stamps.size))
+    inside = _inside(first, length, stamps.size)
+    rows = None if inside.all() else np.flatnonzero(inside)
+    kept = stamps if rows is None else stamps[rows]
     # Modulo 2^32, so that the turn of the counter is a small step like any other, and a step back
     # is a huge one.
-    steps = np.diff(stamps[rows]) & 0xFFFFFFFF
+    steps = np.diff(kept)
     # Nearly always nothing is wrong, and the runs need not be looked at one by one.
-    if rows.size and not resumed and np.all(steps < _LONGEST_JUMP):
-        return rows, stamps[rows[0]] + np.concatenate([[0], np.cumsum(steps)])
+    if kept.size and not resumed and np.all(steps < _LONGEST_JUMP):
+        in_turn = np.empty(kept.size, np.int64)
+        in_turn[0] = 0
+        np.cumsum(steps, out=in_turn[1:])
+        in_turn += int(kept[0])
+        return rows, in_turn
     keep: list[np.ndarray] = []
     times: list[np.ndarray] = []
     now: int | None = None
@@ -202,7 +246,7 @@ def _plausible(
                 keep.pop()
                 times.pop()
         rejected = None
-        steps = np.diff(stamps[begin : begin + count]) & 0xFFFFFFFF
+        steps = np.diff(stamps[begin : begin + count]).astype(np.int64)
         # The False behind the end stops the search in a run without any jump. Of one with a jump
         # the frames in front of it are kept.
         whole = int(np.argmin(np.append(steps < _LONGEST_JUMP, False))) + 1
@@ -216,10 +260,10 @@ def _plausible(
 
 def _inside(first: np.ndarray, length: np.ndarray, count: int) -> np.ndarray:
     """Whether each of `count` frames is in a run."""
-    edges = np.zeros(count + 1, np.int64)
+    edges = np.zeros(count + 1, np.int8)
     edges[first] += 1
     np.subtract.at(edges, first + length, 1)
-    return np.cumsum(edges[:-1]) > 0
+    return np.cumsum(edges[:-1], dtype=np.int8) > 0
 
 
 def _goes_on(before: int, stamp: int) -> bool:
