@@ -70,7 +70,7 @@ def with_second_method(
     Asked of linear models whose inputs do not follow the response: of output error where
     disturbances colour its residuals and take a good part of an output, of filter error where the
     answer to the inputs, by itself, asks for other values, or where the disturbance narrows an
-    interval or takes a good part of an output.
+    interval by a fiftieth.
 
     Args:
         problem: what was fitted.
@@ -128,13 +128,8 @@ def _is_doubtful(problem: Problem, first: Fit) -> bool:
 
 def _is_disturbed(first: Fit) -> bool:
     """Whether disturbances colour output error's residuals and take a good part of an output."""
-    return first.coloured and _least_explained(first) < _WELL_EXPLAINED
-
-
-def _least_explained(first: Fit) -> float:
-    """The least VAF of an output, simulated; 1 without any."""
     vafs = [m.vaf for m in first.metrics.values()]
-    return min((v if math.isfinite(v) else -math.inf for v in vafs), default=1.0)
+    return first.coloured and bool(vafs) and not min(vafs) >= _WELL_EXPLAINED
 
 
 def _may_be_misled(first: Fit) -> bool:
@@ -142,10 +137,6 @@ def _may_be_misled(first: Fit) -> bool:
     a say in one of them: a wrong one then misleads."""
     if first.adequacy.ahead or any(f.present for f in first.feedback):
         return False
-    # By which spectrum a disturbance moved an output, neither its innovations nor the inputs tell:
-    # of two time constants one is found, with white innovations, and the parameters make up for it.
-    if _least_explained(first) < _WELL_EXPLAINED:
-        return True
     at = first.reached
     e = evaluate(*at)
     inputs = through_inputs(at, e)
