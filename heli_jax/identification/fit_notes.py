@@ -1,5 +1,6 @@
 """What a fit says in sentences: of its optimum, of what its method assumes, of its numbers."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from heli_jax.dynamics.disturbance import disturbances_of
@@ -9,6 +10,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.identifiability.disturbances import of_disturbances
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import (
@@ -21,6 +23,9 @@ from heli_jax.identification.uncertainty.estimates import (
 from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.wandering_angles import wandering_notes
+
+_NEAR_ZERO = 0.2
+"""of an estimate, below which a start says nothing of its sign"""
 
 
 class Numbers(NamedTuple):
@@ -105,7 +110,34 @@ def fit_notes(
         *_correlation_notes(correlated),
         *delay_notes(problem, numbers.of_interest),
         *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
+        *(sign_notes(problem, numbers.of_interest) if bool(best.converged) else []),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),
+    ]
+
+
+def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[str]:
+    """Which parameters surely have the other sign than they began with, where they began with a
+    value and not next to zero.
+
+    Args:
+        problem: with the starts.
+        estimates: by name.
+    """
+    turned = []
+    for name, free in problem.free.items():
+        e = estimates[name]
+        # A delay says by itself what it means to be negative.
+        if name in problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
+            continue
+        surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
+        if surely and abs(free.start) > _NEAR_ZERO * abs(e.value):
+            turned.append(f"{name} ({free.start:.3g} to {e.value:.3g})")
+    if not turned:
+        return []
+    return [
+        f"{listed(turned)} ended with the other sign than the start's: where that sign is known, "
+        "an input or an output has the wrong one in the log, or an axis points the other way "
+        "(`invert: true`)."
     ]
 
 

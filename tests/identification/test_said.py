@@ -80,6 +80,20 @@ def test_an_estimate_that_leaves_its_prior_is_told():
     assert not any("contradict" in note for note in agreed.notes)
 
 
+def test_an_effect_that_ends_with_the_other_sign_is_told():
+    flight = record(1, 0.0, 0.02)
+    turned = Flight(dt=DT, inputs={"d": -flight.inputs["d"]}, outputs=dict(flight.outputs))
+    free = {"L": Free(-1.0), "B": Free(2.0, sign="any")}
+    found = fit(problem(turned, **free))
+    assert found.estimates["B"].value == pytest.approx(-3.0, rel=0.1)
+    [note] = [n for n in found.notes if "the other sign than the start's" in n]
+    assert note.startswith("B (2 to -")
+    assert not any("the other sign" in n for n in fit(problem(flight, **free)).notes)
+    # Next to zero a start says nothing of a sign.
+    free["B"] = Free(0.1, sign="any")
+    assert not any("the other sign" in n for n in fit(problem(turned, **free)).notes)
+
+
 def unknowns(*names: str, **priors: float) -> tuple[Unknown, ...]:
     return tuple(Unknown(n, 1.0, True, 1.0, priors.get(n, 0.0)) for n in names)
 
