@@ -46,10 +46,8 @@ def test_nine_parameters_are_recovered_with_throttle(heave):
 def test_without_throttle_the_pair_is_named(heave):
     result = heave["identify"](heave["records"](0.002, count=4))
     assert max(abs(e) for e in errors(heave, result).values()) < 4
-    pairs = {frozenset((p.first, p.second)) for p in result.verdict.pairs}
-    assert "Ir * K_throttle is determined far better" in result.verdict.text or (
-        frozenset(("Ir", "K_throttle")) in pairs
-    )
+    assert set(result.verdict.undetermined) == {"Ir", "K_throttle"}
+    assert [c.name for c in result.verdict.combinations] == ["Ir * K_throttle"]
 
 
 @pytest.mark.slow
