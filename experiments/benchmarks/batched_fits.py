@@ -24,7 +24,9 @@ from heli_jax.numerics.cores import cores
 
 jax.config.update("jax_enable_x64", True)
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml")
-N, DT, FUSED, XLA, TURNS = 3000, 0.02, 1000, 64, 3
+N, DT, FUSED, XLA = 3000, 0.02, 1000, 64
+TURNS = 3
+"""of which the best counts"""
 
 
 def fitted(**how: Any) -> Fit:
@@ -74,7 +76,7 @@ def main() -> None:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from script import asked
+    from script import Size, asked
 
-    asked(__doc__, "some minutes")
+    TURNS = asked(__doc__, "some minutes", Size("turns", 3, 1, "how often each is timed")).turns
     main()

@@ -32,7 +32,8 @@ from heli_jax.identification.unknowns.layout import Layout, Noise, layout_of
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_enable_compilation_cache", False)
-RUNS = 3
+TURNS = 3
+"""of which the best counts"""
 
 
 class Timed(NamedTuple):
@@ -41,7 +42,7 @@ class Timed(NamedTuple):
     cold: float
     """[s], traced and compiled"""
     warm: float
-    """[s], the best of `RUNS`"""
+    """[s], the best of `TURNS`"""
     cost: float
     gradient: np.ndarray
     fisher: np.ndarray
@@ -53,7 +54,7 @@ def timed(layout: Layout, arguments: tuple[Any, ...]) -> Timed:
         return at.r @ at.r, at.J.T @ at.r, at.J.T @ at.J
 
     cold, program = _seconds(lambda: jax.jit(likelihood).lower(*arguments).compile())
-    run = [_seconds(lambda: jax.block_until_ready(program(*arguments))) for _ in range(1 + RUNS)]
+    run = [_seconds(lambda: jax.block_until_ready(program(*arguments))) for _ in range(1 + TURNS)]
     cost, gradient, fisher = jax.device_get(run[-1][1])
     return Timed(cold, min(seconds for seconds, _ in run[1:]), float(cost), gradient, fisher)
 
@@ -88,8 +89,8 @@ def compared(taus: bool) -> None:
 
 
 if __name__ == "__main__":
-    from script import asked
+    from script import Size, asked
 
-    asked(__doc__, "some minutes")
+    TURNS = asked(__doc__, "some minutes", Size("turns", 3, 1, "how often each is timed")).turns
     compared(taus=False)
     compared(taus=True)

@@ -9,7 +9,6 @@ counts least; each pair is run in turn, and the figures are the medians of the t
 ratios. Compilation is from the trace to the machine code.
 """
 
-import argparse
 import ctypes
 import math
 import os
@@ -42,6 +41,8 @@ jax.config.update("jax_enable_x64", True)
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "x-cell-60.yaml")
 MODEL = models.helicopter("consistent")
 N, DT, SUBSTEPS = 500, 0.02, 4
+TURNS = 9
+"""by which each pair is timed"""
 VEHICLES, BLOCK = 1024, 128
 JACOBIAN_BLOCK = 8
 """Vehicles side by side in a Jacobian, each with its twelve directions: what the caches hold."""
@@ -362,9 +363,6 @@ def check_derivative(
 
 
 def main() -> None:
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
     run = hover_and_steps()
     rows: list[tuple[str, tuple[float, float, float], str]] = []
     seconds: dict[str, float] = {}
@@ -373,19 +371,21 @@ def main() -> None:
     ours, seconds[f"{size}, sum of roll^2"] = compile_time(batch(run), Ixx)
     theirs = in_c(run)
     np.testing.assert_allclose(ours(Ixx), theirs(), rtol=1e-9)
-    rows.append((f"{size} / C", in_turn(lambda: ours(Ixx), theirs, 9), "<= 3"))
+    rows.append((f"{size} / C", in_turn(lambda: ours(Ixx), theirs, TURNS), "<= 3"))
     begin = time.process_time()
     as_one = fused(run)
     seconds[f"{size}, one program"] = time.process_time() - begin
     np.testing.assert_allclose(as_one(), theirs(), rtol=1e-9)
-    rows.append((f"{size}, one program / C", in_turn(as_one, theirs, 9), "<= 1"))
+    rows.append((f"{size}, one program / C", in_turn(as_one, theirs, TURNS), "<= 1"))
 
     check_right_hand_side(run)
     for name, alone in (("a sample", by_samples), ("a run", by_one_call)):
         for kind, numbers, target in (("NumPy", NUMPY, "<= 0.002"), ("Python", PYTHON, "")):
             np.testing.assert_allclose(alone(run, numbers), ours(Ixx)[0], rtol=1e-3)
             a, b, ratio = in_turn(
-                lambda: ours(Ixx), lambda alone=alone, numbers=numbers: alone(run, numbers), 5
+                lambda: ours(Ixx),
+                lambda alone=alone, numbers=numbers: alone(run, numbers),
+                min(TURNS, 5),
             )
             scaled = (a, VEHICLES * b, ratio / VEHICLES)
             title = f"{size} / as many solve_ivp, one call {name}, numbers of {kind}"
@@ -406,7 +406,7 @@ def main() -> None:
         jacobian, seconds[f"{name}, outputs' Jacobian"] = compile_time(slope, at)
         if at is z:
             check_derivative(forward, jacobian, z)
-        times = in_turn(lambda f=jacobian, at=at: f(at), lambda f=forward, at=at: f(at), 9)
+        times = in_turn(lambda f=jacobian, at=at: f(at), lambda f=forward, at=at: f(at), TURNS)
         rows.append((f"Jacobian, {len(FREE)} parameters, {name} / outputs", times, "<= 15"))
 
     evaluations = VEHICLES * (N - 1) * SUBSTEPS * 4
@@ -424,7 +424,7 @@ def main() -> None:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from script import asked
+    from script import Size, asked
 
-    asked(__doc__, "some minutes")
+    TURNS = asked(__doc__, "some minutes", Size("turns", 9, 1, "how often each is timed")).turns
     main()

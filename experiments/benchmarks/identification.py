@@ -50,6 +50,8 @@ jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).parent
 VEHICLE = load_vehicle(HERE.parents[1] / "configs" / "vehicles" / "bench-30.yaml")
 N, DT, BATCH, BLOCK, SUBSTEPS = 6000, 0.02, 1024, 128, 4
+TURNS = 15
+"""by which each pair is timed"""
 
 
 def closed_form(v: dict[str, float]) -> tuple[list[float], np.ndarray]:
@@ -76,12 +78,12 @@ def bench_record() -> Flight:
     return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
 
 
-def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], runs: int = 15) -> tuple[float, ...]:
+def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], times: int = 1) -> tuple[float, ...]:
     """Best times of both [s], taken in turn, and their ratio."""
     ours()
     theirs()
     best = [np.inf, np.inf]
-    for _ in range(runs):
+    for _ in range(times * TURNS):
         for i, f in enumerate((ours, theirs)):
             begin = time.perf_counter()
             jax.block_until_ready(f())
@@ -116,8 +118,8 @@ def fit_against_scipy(flight: Flight) -> tuple[tuple[float, ...], tuple[float, .
     z = start_vector(layout, data, problem)
     noise = Noise(({"roll": np.asarray(2e-3)},), np.zeros(()))
     assert np.allclose(np.exp(optimise(layout, data, noise, z).z), np.exp(theirs.x), rtol=1e-3)
-    optimum = ratios(lambda: optimise(layout, data, noise, z).z, scipys, runs=60)
-    return optimum, ratios(lambda: fit(problem), scipys, runs=15)
+    optimum = ratios(lambda: optimise(layout, data, noise, z).z, scipys, times=4)
+    return optimum, ratios(lambda: fit(problem), scipys)
 
 
 def rls_against_numpy(flight: Flight) -> tuple[float, ...]:
@@ -221,7 +223,7 @@ def main() -> None:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from script import asked
+    from script import Size, asked
 
-    asked(__doc__, "some minutes")
+    TURNS = asked(__doc__, "some minutes", Size("turns", 15, 1, "how often each is timed")).turns
     main()
