@@ -168,6 +168,7 @@ _COMMON_IN_SI = {
     ("Hz", "rad/s"): 6.283185307179586,
 }
 """by unit and the SI unit it is wanted in"""
+_COMMON_SI = dict(_COMMON_IN_SI.keys())
 
 
 def factor(unit: str, si: str) -> float:
@@ -314,6 +315,10 @@ def as_text(exponents: Mapping[str, int]) -> str:
 
 def is_plain(unit: str) -> bool:
     """Whether `unit` is a plain ratio: `1`, `%`, `stick`."""
+    if unit in _COMMON:
+        return unit == "1"
+    if (si := _COMMON_SI.get(unit)) is not None:
+        return si == "1"
     return not dict(_parse(unit).dimensionality)
 
 
