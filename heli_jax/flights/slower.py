@@ -14,8 +14,6 @@ from heli_jax.flights.resample import interpolate
 SLOWER = 1.5
 """grid steps; an output whose usual step is longer is slower than the grid. Up to here a straight
 line makes at most three samples of two."""
-
-
 _NEAR = 0.75
 """grid steps, to which a sample is moved along its slope"""
 OWN = 1.1

@@ -43,7 +43,7 @@ def scaled(channel: str, series: Series, si: str, full: float | None = None) -> 
     if stated and fits(stated, si):
         return Guess(channel, stated, remarks=(f"unit by {source}",))
     if _is_sbus(channel, values):
-        return _of_sbus(channel, si)
+        return _about(channel, si, ("counts of S.BUS", "", "a count"), _SBUS_REST, _SBUS_STOP)
     if _PULSES[0] < low and high < _PULSES[1] and high - low > 20:
         return _of_pulses(channel, values, si)
     if _are_counts(channel, values, si):
@@ -84,14 +84,6 @@ def _is_sbus(channel: str, values: np.ndarray) -> bool:
     return abs(rests - _SBUS_REST) < 0.5 * _TRIM and high < _MIDDLE - _TRIM and low > _PULSES[0]
 
 
-def _of_sbus(channel: str, si: str) -> Guess:
-    remark = f"GUESS: counts of S.BUS, {_SBUS_REST:g} at rest"
-    if si == "1":
-        remark = f"{remark}, {_SBUS_STOP:g} to the stop"
-        return Guess(channel, "1", 1.0 / _SBUS_STOP, _SBUS_REST, (remark,))
-    return Guess(channel, si, EDIT, _SBUS_REST, (f"{remark}; scale: {si} for a count",))
-
-
 def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
     # Most records begin with the stick at rest; where this one does not, receivers' middle. One
     # that begins within a manoeuvre, stick held, does not come back to that place for long.
@@ -100,11 +92,17 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
     is_still = np.ptp(begin) < small
     is_middle = abs(first - _MIDDLE) < _TRIM or np.mean(np.abs(values - first) < small) > _LONG
     rest = first if is_still and is_middle else _MIDDLE
-    remark = f"GUESS: pulse widths, {rest:g} us at rest"
+    return _about(channel, si, ("pulse widths", " us", "a microsecond"), rest, _FULL_PULSE)
+
+
+def _about(channel: str, si: str, words: tuple[str, str, str], rest: float, stop: float) -> Guess:
+    """Of numbers that rest at one and end `stop` from it; `words`: what they are, their unit, and
+    one of them."""
+    what, unit, one = words
+    remark = f"GUESS: {what}, {rest:g}{unit} at rest"
     if si == "1":
-        remark = f"{remark}, {_FULL_PULSE:g} us to the stop"
-        return Guess(channel, "1", 1.0 / _FULL_PULSE, rest, (remark,))
-    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
+        return Guess(channel, "1", 1.0 / stop, rest, (f"{remark}, {stop:g}{unit} to the stop",))
+    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for {one}",))
 
 
 def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
