@@ -1,7 +1,8 @@
 """Large logs: how long their columns take beside the libraries of their formats, and the memory.
 
-It makes the files in a temporary folder: CSV and Parquet of 50 columns at 1 kHz, DataFlash, and a
-blackbox. Every reader has a process of its own, in turns with the other library's:
+It makes the files in a temporary folder: CSV and Parquet of 50 columns at 1 kHz, DataFlash, and
+blackbox (`bbl`: many flights of 2 MB; `one.bbl`: a single one, of a twentieth of the size). Every
+reader has a process of its own, in turns with the other library's:
 
     python experiments/benchmarks/logs.py --minutes 10 --megabytes 50
 
@@ -73,12 +74,13 @@ def write_dataflash(path: Path, megabytes: float) -> None:
     path.write_bytes(head + rows.tobytes())
 
 
-def write_blackbox(path: Path, megabytes: float) -> None:
-    """Flights of 2 MB, one made frame by frame and then repeated, as a card holds them."""
+def write_blackbox(path: Path, megabytes: float, single: bool) -> None:
+    """Flights of 2 MB, one made frame by frame and then repeated, as a card holds them, or a
+    `single` one."""
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.flights.log_writers import blackbox
 
-    rng, count = np.random.default_rng(0), 30_000
+    rng, count = np.random.default_rng(0), int(15_000 * megabytes) if single else 30_000
     kinds = [(3, 1, 0), (4, 2, 8), (3, 3, 0), (8, 1, 6), (6, 1, 9), (3, 2, 7), (6, 1, 0)]
     names, predictors, encodings, columns = [], [], [], []
     for group, (width, predictor, encoding) in enumerate(kinds):
@@ -90,7 +92,7 @@ def write_blackbox(path: Path, megabytes: float) -> None:
             columns.append(np.cumsum(rng.integers(-size, size + 1, count)))
     clock = [np.arange(count), 2000 * np.arange(count)]
     flight = blackbox(names, np.array([*clock, *columns]).T, predictors, encodings)
-    path.write_bytes(flight * max(1, round(megabytes * 1e6 / len(flight))))
+    path.write_bytes(flight * (1 if single else max(1, round(megabytes * 1e6 / len(flight)))))
 
 
 def ours(path: Path) -> None:
@@ -183,7 +185,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10, help="of the tables, at 1 kHz")
     parser.add_argument("--megabytes", type=float, default=50, help="of DataFlash and blackbox")
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--only", nargs="+", default=["csv", "parquet", "bin", "bbl"])
+    parser.add_argument("--only", nargs="+", default=["csv", "parquet", "bin", "bbl", "one.bbl"])
     parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -193,7 +195,7 @@ def main() -> None:
         child(options.child[0], Path(options.child[1]))
         return
     others = {"csv": ["fingerprint", "pyarrows"], "parquet": ["fingerprint", "pyarrows"]}
-    others |= {"bin": ["pymavlinks"], "bbl": []}
+    others |= {"bin": ["pymavlinks"], "bbl": [], "one.bbl": []}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if {"csv", "parquet"} & set(options.only):
@@ -201,7 +203,9 @@ def main() -> None:
         if "bin" in options.only:
             write_dataflash(folder / "log.bin", options.megabytes)
         if "bbl" in options.only:
-            write_blackbox(folder / "log.bbl", options.megabytes)
+            write_blackbox(folder / "log.bbl", options.megabytes, single=False)
+        if "one.bbl" in options.only:
+            write_blackbox(folder / "log.one.bbl", options.megabytes / 10, single=True)
         print("file         MB  reader       seconds   MB/s  to library  processor  memory/file")
         for ending in options.only:
             path = folder / f"log.{ending}"

@@ -1,6 +1,6 @@
 """Numbers of a blackbox log in the fewest bits: decoded, most take a quarter of 32."""
 
-from collections import deque
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,48 +21,36 @@ def narrowed(column: np.ndarray) -> np.ndarray:
     return column
 
 
-def columns_of(values: np.ndarray, signed: tuple[bool, ...]) -> list[np.ndarray]:
-    """Frames (N, F) int32 as columns (N,), each in the fewest bits.
-
-    Args:
-        values: modulo 2^32.
-        signed: by field; one without a sign uses the top bit for its size.
-    """
-    columns = []
-    for i, has_sign in enumerate(signed):
-        column = np.ascontiguousarray(values[:, i])
-        columns.append(narrowed(column if has_sign else column.view(np.uint32)))
-    return columns
-
-
 class Rows:
-    """Numbers of frames as written, in the order of the file: packed until they are taken.
+    """Numbers of M frames as written, in the order of the file, by field: packed.
 
-    Most are differences, of a byte each. As 32 bits the frames of a log are five times its size.
+    Most are differences, of a byte each, and many are zero throughout. As 32 bits the frames of a
+    log are five times its size.
     """
 
     def __init__(self, width: int) -> None:
         self.width, self.size = width, 0
-        self._pieces: deque[list[np.ndarray]] = deque()
+        # By field its pieces, each the numbers or the one number that all of them are.
+        self._pieces: list[list[np.ndarray]] = [[] for _ in range(width)]
+        self._edges = [0]
 
     def append(self, values: np.ndarray) -> None:
         """Add frames (M, F) int32."""
-        if len(values):
-            self._pieces.append(columns_of(values, (True,) * self.width))
-            self.size += len(values)
+        if not len(values):
+            return
+        for i, pieces in enumerate(self._pieces):
+            packed = narrowed(np.ascontiguousarray(values[:, i]))
+            pieces.append(packed[:1].copy() if np.all(packed == packed[0]) else packed)
+        self.size += len(values)
+        self._edges.append(self.size)
 
-    def take(self, count: int) -> np.ndarray:
-        """The next `count` frames (count, F) int32, which are given away."""
-        taken, at = np.empty((count, self.width), np.int32), 0
-        self.size -= count
-        while at < count:
-            piece = self._pieces[0]
-            n = min(count - at, piece[0].size)
-            for i, column in enumerate(piece):
-                taken[at : at + n, i] = column[:n]
-            if n == piece[0].size:
-                self._pieces.popleft()
-            else:
-                self._pieces[0] = [column[n:] for column in piece]
-            at += n
-        return taken
+    def column(self, i: int) -> np.ndarray:
+        """The numbers (M,) int32 of the i-th field."""
+        numbers = np.empty(self.size, np.int32)
+        for piece, (begin, end) in zip(self._pieces[i], pairwise(self._edges), strict=True):
+            numbers[begin:end] = piece
+        return numbers
+
+    def frames(self) -> np.ndarray:
+        """All frames (M, F) int32."""
+        return np.stack([self.column(i) for i in range(self.width)], axis=1)

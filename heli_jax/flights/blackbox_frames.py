@@ -140,7 +140,7 @@ class _Walk:
             if letter in MAIN:
                 self.frames.packed[letter] = rows
             else:
-                self.frames.rows[letter] = rows.take(rows.size)
+                self.frames.rows[letter] = rows.frames()
             self.frames.starts[letter] = np.concatenate(
                 [np.zeros(0, np.uint32), *self.starts[letter]]
             )
