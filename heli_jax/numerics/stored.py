@@ -124,10 +124,18 @@ def _named(function: Callable[..., Any]) -> bytes:
 def _surroundings() -> bytes:
     """What a program hangs on beside the function and its arguments."""
     sources = hashlib.sha256()
-    package = Path(__file__).parents[1]
-    for path in sorted(package.rglob("*.py")):
-        sources.update(str(path.relative_to(package)).encode())
-        sources.update(path.read_bytes())
+    package = str(Path(__file__).parents[1])
+    # By `os`, since a path for each of the files takes twice as long as to read them.
+    of_package = sorted(
+        os.path.join(folder, name)
+        for folder, _, names in os.walk(package)
+        for name in names
+        if name.endswith(".py")
+    )
+    for path in of_package:
+        sources.update(path.removeprefix(package).encode())
+        with open(path, "rb", buffering=0) as source:
+            sources.update(source.read())
     return f"{sources.hexdigest()} {versions.versions()} {os.cpu_count()}\n".encode()
 
 

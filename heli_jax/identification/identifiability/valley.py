@@ -153,7 +153,8 @@ class Valley(NamedTuple):
         i = layout.free.index(name)
         if not transforms.inside(self.problem.free[name], value):
             return None
-        limits = (data.sign[i], data.low[i], data.high[i])
+        # From NumPy: to index an array of JAX's is a program of its own to load.
+        limits = tuple(np.asarray(of)[i] for of in (data.sign, data.low, data.high))
         with np.errstate(all="ignore"):
             z = float(transforms.to_coordinate(layout.kinds[i], jnp.asarray(value), *limits))
         return z if math.isfinite(z) else None

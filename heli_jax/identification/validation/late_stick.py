@@ -11,7 +11,6 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -41,6 +40,8 @@ _BLOCK = 1.0
 """[s] over which rows may be correlated"""
 _MOST = 3
 """parameters that are named"""
+_SEEN = 1e-3
+"""of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
 
 
 class LateStick(NamedTuple):
@@ -172,7 +173,9 @@ def slow_sticks(
 
 
 def _largest(moved: Mapping[str, tuple[float, float]]) -> list[tuple[str, tuple[float, float]]]:
-    return sorted(moved.items(), key=lambda item: -abs(item[1][0]))[:_MOST]
+    """Those that move most, and none that stay where they are but for rounding."""
+    first, *others = sorted(moved.items(), key=lambda item: -abs(item[1][0]))[:_MOST]
+    return [first, *(item for item in others if abs(item[1][0]) >= _SEEN)]
 
 
 def _stepped(flights: Sequence[Flight]) -> tuple[str, ...]:
@@ -227,9 +230,11 @@ def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
     for flight in data.flights:
         part = abs(seconds) / float(flight.dt)
         inputs = {}
-        for n, u in naming.asdict(flight.inputs).items():
+        for n, samples in naming.asdict(flight.inputs).items():
+            # By NumPy: each step of it would be a program of JAX's to load.
+            u = np.asarray(samples)
             first, last = (u[:1], u[:-1]) if seconds > 0 else (u[1:], u[-1:])
-            beside = jnp.concatenate([first, last])
+            beside = np.concatenate([first, last])
             inputs[n] = (1.0 - part) * u + part * beside if n in names else u
         flights.append(flight._replace(inputs=type(flight.inputs)(**inputs)))
     return data._replace(flights=jax.device_put(tuple(flights)))
