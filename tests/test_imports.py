@@ -123,7 +123,7 @@ def test_imports_point_one_way(name):
 ROOMS = (
     "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns",
     "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
-    "agreement", "fit_notes", "assemble", "further_starts", "fit", "likelier_hold",
+    "agreement", "fit_notes", "judgement", "assemble", "further_starts", "fit", "likelier_hold",
     "second_method", "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 

@@ -30,7 +30,7 @@ def noise_guess(signal: np.ndarray) -> float:
     them. Robust against the corners of a response (median of absolute values).
     """
     # A gap makes NaN of the differences across it alone: no sample has to be filled in.
-    d, at = np.diff(signal, 3) / np.sqrt(20.0), np.flatnonzero(np.isfinite(signal))
+    d, at = _third_differences(signal, 1), np.flatnonzero(np.isfinite(signal))
     d, signal = d[np.isfinite(d)], signal[at]
     # Where gaps leave few samples in a row, as of a slow sensor on a fast grid, from one sample to
     # the next wherever they stand.
@@ -39,8 +39,7 @@ def noise_guess(signal: np.ndarray) -> float:
     # Of three samples and fewer, the signal itself bounds its noise.
     if not d.size:
         d = signal - np.median(signal)
-    # The median of |x| of a normal x is 0.674 sd; 1 + 9 + 9 + 1 = 20.
-    guess = float(np.median(np.abs(d)) / 0.6744897501960817)
+    guess = _noise_sd(d)
     # A record without noise: rows divided by zero would be infinite.
     floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
     return max(guess, floor, 1e-300)
@@ -87,13 +86,12 @@ def wanders(signal: np.ndarray) -> bool:
         signal = known[np.r_[True, ~repeated]]
     elif known.size < 0.5 * signal.size:
         signal = known
-    d = np.diff(signal, 3)
+    d = _third_differences(signal, 1)
     pairs = np.isfinite(d[1:]) & np.isfinite(d[:-1])
     if np.sum(pairs) < _FEWEST:
         return False
     # Corners of the motion must not outweigh the noise.
-    most = 4.0 * np.sqrt(20.0) * noise_guess(signal)
-    d = np.clip(d, -most, most)
+    d = _without_corners(d, noise_guess(signal))
     first, second = d[:-1][pairs], d[1:][pairs]
     square = 0.5 * float(np.sum(first**2) + np.sum(second**2))
     related = float(np.sum(first * second)) / square if square else _WHITE
@@ -110,27 +108,32 @@ def rises_when_slower(signal: np.ndarray, every: int) -> bool:
         signal: (N,), NaN where nothing is measured.
         every: samples from one to the next at the lower rate, at least 2.
     """
-    fast, slow = _third_differences(signal, 1), _third_differences(signal, every)
+    differences = (_third_differences(signal, 1), _third_differences(signal, every))
+    fast, slow = (d[np.isfinite(d)] for d in differences)
     if min(fast.size, slow.size) < _FEWEST:
         return False
-    powers = [float(np.mean(_without_corners(d) ** 2)) for d in (fast, slow)]
+    powers = [float(np.mean(_without_corners(d, _noise_sd(d)) ** 2)) for d in (fast, slow)]
     spread = _POWER_SPREAD * np.sqrt(1.0 / fast.size + 1.0 / slow.size)
     return bool(powers[1] > powers[0] * np.exp(3.0 * spread))
 
 
 def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
-    """Of samples so far apart, without those in which one is missing; of white noise they have its
-    sd."""
+    """Of samples so far apart, NaN where one is missing; of white noise they have its sd."""
     y = signal
     for _ in range(3):
         y = y[every:] - y[:-every]
-    return y[np.isfinite(y)] / np.sqrt(20.0)
+    return y / np.sqrt(20.0)  # 1 + 9 + 9 + 1
 
 
-def _without_corners(d: np.ndarray) -> np.ndarray:
-    """Differences clipped at four times their sd by the median of what is large or small."""
-    most = 4.0 * float(np.median(np.abs(d))) / 0.6744897501960817
-    return np.clip(d, -most, most)
+def _noise_sd(d: np.ndarray) -> float:
+    """The sd of normal numbers by the median of their sizes, 0.674 of it, which corners of the
+    motion do not move."""
+    return float(np.median(np.abs(d)) / 0.6744897501960817)
+
+
+def _without_corners(d: np.ndarray, sd: float) -> np.ndarray:
+    """Differences clipped at four times their sd."""
+    return np.clip(d, -4.0 * sd, 4.0 * sd)
 
 
 def without_noise(signal: np.ndarray) -> bool:

@@ -70,11 +70,24 @@ def deviations(J: np.ndarray) -> np.ndarray:
     Infinite for a coordinate without effect, and for those that take part in a direction without:
     what leaves no trace in the rows is not known, rather than known exactly.
     """
+    return combined_deviations(J, np.eye(J.shape[1]), 1e-10, _TAKES_PART)
+
+
+def combined_deviations(
+    J: np.ndarray, combinations: np.ndarray, no_effect: float, takes_part: float
+) -> np.ndarray:
+    """Standard deviations (k,) of combinations of coordinates from whitened rows.
+
+    Args:
+        J: the rows (n, q).
+        combinations: (k, q).
+        no_effect: part of the largest singular value below which a direction has no effect.
+        takes_part: part of such a direction from which on a combination is lost with it.
+    """
     J = np.asarray(J, dtype=np.float64)
-    q = J.shape[1]
     # A simulation that diverged tells nothing.
     if not np.isfinite(J).all():
-        return np.full(q, np.inf)
+        return np.full(len(combinations), np.inf)
     # Columns of one size, so that what counts as no effect does not hang on units.
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
@@ -82,7 +95,10 @@ def deviations(J: np.ndarray) -> np.ndarray:
     # Those of its triangle are the same, and it has q rows instead of n.
     _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
     # Fewer rows than unknowns: what is missing are directions without effect.
-    sizes = np.concatenate([sizes, np.zeros(q - sizes.size)])
-    kept = sizes > 1e-10 * sizes[0]
-    sds = np.sqrt(np.sum((right[kept] / sizes[kept, None]) ** 2, axis=0)) / norms
-    return np.where(np.any(np.abs(right[~kept]) > _TAKES_PART, axis=0), np.inf, sds)
+    sizes = np.concatenate([sizes, np.zeros(J.shape[1] - sizes.size)])
+    kept = sizes > no_effect * sizes[0]
+    along = (combinations / norms) @ right.T
+    lengths = np.linalg.norm(combinations / norms, axis=1)
+    lost = np.abs(along[:, ~kept]) > takes_part * lengths[:, None]
+    sds = np.linalg.norm(along[:, kept] / sizes[kept], axis=1)
+    return np.where(lost.any(axis=1), np.inf, sds)

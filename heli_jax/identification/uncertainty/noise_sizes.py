@@ -9,10 +9,9 @@ variances of the innovations): large sizes beside a small reference stay where t
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import combined_deviations, evaluate
 from heli_jax.identification.estimation.filter_error import innovation_sums
 from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.unknowns.layout import Solution
@@ -45,19 +44,6 @@ def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     rows = np.tile(-0.5 * mean, (len(layout.sizes), 1))
     rows[range(len(layout.sizes)), [layout.disturbance_at(name) for name in layout.sizes]] += 1.0
     # The scale itself is known to 1/(2 n) from the innovations' squares.
-    sds = np.sqrt(_deviations(np.asarray(e.J, np.float64), rows) ** 2 + 0.5 / n)
+    sds = combined_deviations(e.J, rows, _NO_EFFECT, _TAKES_PART)
+    sds = np.sqrt(sds**2 + 0.5 / n)
     return dict(zip(layout.sizes, map(float, sds), strict=True))
-
-
-def _deviations(
-    J: Float[np.ndarray, "n q"], rows: Float[np.ndarray, "k q"]
-) -> Float[np.ndarray, " k"]:
-    """Of combinations of the coordinates, from whitened rows."""
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
-    kept = sizes > _NO_EFFECT * sizes[0]
-    along = (rows / norms) @ right.T
-    lost = np.abs(along[:, ~kept]) > _TAKES_PART * np.linalg.norm(rows / norms, axis=1)[:, None]
-    sds = np.linalg.norm(along[:, kept] / sizes[kept], axis=1)
-    return np.where(lost.any(axis=1), np.inf, sds)

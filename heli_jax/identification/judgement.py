@@ -1,0 +1,289 @@
+"""What is concluded of an optimum: whether the model explains its records, and who moved them."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.identification.agreement import (
+    correlated_residuals,
+    pooled_metrics,
+    signals_of,
+    whiteness_of,
+)
+from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
+from heli_jax.identification.fit_notes import Numbers, absent_names
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Signals
+from heli_jax.identification.uncertainty.estimates import delay_doubts
+from heli_jax.identification.uncertainty.standard_errors import StandardErrors
+from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
+from heli_jax.identification.validation.advice import Record, is_unstable
+from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
+    Moved,
+    feedback_trust_notes,
+    held_upright,
+    moved_by_feedback,
+)
+from heli_jax.identification.validation.excitation_test import (
+    WRONG_OPTIMUM,
+    by_excitation,
+    unless_unrelated,
+)
+from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
+from heli_jax.identification.validation.feedback import (
+    Feedback,
+    feedback_notes,
+    feedback_of,
+    untested,
+)
+from heli_jax.identification.validation.late_stick import LateStick, late_stick, with_late_stick
+from heli_jax.identification.validation.metrics import Whiteness, metrics
+from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
+from heli_jax.identification.validation.noisy_inputs import noisy_inputs, with_noisy_inputs
+from heli_jax.identification.validation.unmodelled import (
+    unasked,
+    unmodelled,
+    with_unmodelled,
+)
+from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
+
+# The parameters of a model are a class of the user's: `Any` here stands for them alone.
+
+
+class End(NamedTuple):
+    """Where a search ended, and what its residuals are like."""
+
+    problem: Problem
+    optimum: RelaxedOptimum
+    at: Solution
+    e: Evaluation
+    signals: tuple[Signals, ...]
+    white: dict[str, Whiteness]
+    correlated: dict[str, float]
+    """by pair of outputs"""
+    absent: tuple[str, ...]
+    """the parameters of disturbances that do not show"""
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the optimiser came to an optimum."""
+        return bool(self.optimum.best.converged)
+
+    @property
+    def all_white(self) -> bool:
+        """Whether residuals, or innovations, are white, and those of each output by themselves."""
+        # Outputs whose residuals go together count one piece of news twice, as autocorrelation
+        # does.
+        return not self.correlated and all(w.white for w in self.white.values())
+
+
+def end_of(problem: Problem, search: Search, optimum: RelaxedOptimum, e: Evaluation) -> End:
+    """Where a search ended.
+
+    Args:
+        problem: what was fitted.
+        search: with its layout and data.
+        optimum: where the optimiser ended.
+        e: what it tells.
+    """
+    signals = signals_of(e, problem.training)
+    return End(
+        problem,
+        optimum,
+        Solution(search.layout, search.data, optimum.noise, optimum.best.z),
+        e,
+        signals,
+        whiteness_of(signals, e, problem.training),
+        correlated_residuals(signals),
+        absent_names(search.layout, optimum),
+    )
+
+
+class Judgement(NamedTuple):
+    """What is concluded of an optimum."""
+
+    errors: StandardErrors
+    numbers: Numbers
+    adequacy: Adequacy
+    loop: Loop
+    moved_by_feedback: Mapping[str, Moved]
+    weak_instrument: tuple[str, ...]
+    """the unknowns that instruments tell too little of"""
+    responses: ResponseAgreement | None
+    late_stick: LateStick | None
+    notes: tuple[str, ...]
+
+
+def judge(
+    end: End, errors: StandardErrors, numbers_of: Callable[[StandardErrors], Numbers]
+) -> Judgement:
+    """Whether the model explains its records, and what of the estimates may not be trusted.
+
+    Args:
+        end: where the search ended.
+        errors: how far off the estimates may be.
+        numbers_of: the estimates with such errors. Where the model explains nothing they lose their
+            intervals.
+    """
+    problem, at, J, arrived = end.problem, end.at, end.e.J, end.arrived
+    layout, numbers = at.layout, numbers_of(errors)
+    feedback, closed_loop = _feedback(end, numbers)
+    moved = moved_by_feedback(at, J) if arrived else {}
+    held = bool(moved) and held_upright(at)
+    weak = weak_by_instrument(problem, at, J) if arrived else ()
+    responses = layout.estimator.response_agreement(layout, at.data, at.noise, at.z)
+    instruments = _instruments(end, responses)
+    params = params_of(problem, {k: numbers.of_interest[k] for k in layout.free})
+    adequacy, ahead = _adequacy(end, params, responses)
+    verdict = unless_explains_nothing(errors.verdict, adequacy)
+    explains = verdict is errors.verdict
+    if arrived and not explains:
+        errors = errors._replace(verdict=verdict, limits={})
+        numbers = numbers_of(errors)
+    lacking, late = (), None
+    named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
+    if arrived and explains and not (ahead or instruments or any(f.present for f in feedback)):
+        in_colour = errors.coloured and not layout.estimator.noise_spectrum
+        sds, flights = {n: sd for n, (_, sd) in named.items()}, labels(problem.training)
+        lacking = unmodelled(at, end.e, sds, coloured=in_colour, flights=flights)
+        adequacy = with_unmodelled(adequacy, lacking, unasked(at))
+        late = late_stick(problem, at, end.e, named)
+        adequacy = with_late_stick(adequacy, late)
+    if arrived and not (ahead or instruments):
+        adequacy = with_noisy_inputs(adequacy, noisy_inputs(problem, at, end.e, named))
+    estimates = {k: numbers.of_interest[k] for k in layout.free}
+    adequacy = adequacy.doubted(delay_doubts(problem, estimates))
+    held = held and WRONG_OPTIMUM not in adequacy.advice
+    if adequacy.by_chance:
+        # Of an optimum of chance nothing is to be told, of who holds the machine either.
+        moved, held = {}, False
+    loop = Loop(feedback, instruments, held)
+    mentioned = any(not f.by_amplitude for f in lacking)
+    notes = (
+        *closed_loop,
+        *feedback_trust_notes(moved, loop),
+        *weak_note(weak),
+        *adequacy.sentences,
+        *_missing(end, adequacy, mentioned=mentioned),
+    )
+    return Judgement(errors, numbers, adequacy, loop, moved, weak, responses, late, notes)
+
+
+def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:
+    """Whether the model explains its records, and whether that was asked some seconds ahead."""
+    problem, against = end.problem, _against_expected(end)
+    ahead = against is not None and is_unstable(problem, params)
+    pooled = pooled_metrics(end.signals)
+    adequacy = (
+        by_responses(responses, pooled)
+        or by_excitation(problem, end.at, pooled)
+        or (_ahead(end, params) if ahead else _over_records(end, params, against))
+    )
+    if end.at.layout.estimator.noise_spectrum:
+        adequacy = unless_unrelated(problem, adequacy)
+    return adequacy, ahead
+
+
+def _instruments(end: End, responses: ResponseAgreement | None) -> tuple[str, ...]:
+    """The inputs that were taken by their instrument."""
+    if responses is not None:
+        return responses.instruments
+    by_instrument = end.at.data.flights[0].by_instrument is not None
+    return instruments_of(end.problem) if by_instrument else ()
+
+
+def _against_expected(end: End) -> dict[str, float] | None:
+    """What a perfect model's simulation would leave, None without any disturbance."""
+    layout = end.at.layout
+    # With every disturbance gone the simulation has to explain the record by itself, as with output
+    # error.
+    if layout.disturbance and set(layout.disturbance) <= set(end.absent):
+        return None
+    at = end.at
+    return layout.estimator.against_expected(layout, at.data, at.noise, end.e, at.z)
+
+
+def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
+    """Whether inputs follow the outputs, and what is to be said of it."""
+    # Whether feedback does harm depends on the residuals: with white innovations the direct method
+    # is unbiased in a closed loop too.
+    problem, estimates = end.problem, numbers.of_interest if end.arrived else {}
+    # A late log looks like feedback: each input at the time at which it acted.
+    feedback = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
+    notes = feedback_notes(problem, feedback, all(w.white for w in end.white.values()))
+    return feedback, (*notes, *untested(problem))
+
+
+def _missing(end: End, adequacy: Adequacy, *, mentioned: bool) -> list[str] | tuple[()]:
+    """What inputs still explain of the residuals (innovations)."""
+    # Where the model is inadequate its own sentences say more.
+    if end.all_white or not adequacy.adequate:
+        return ()
+    return missing_dynamics(
+        tuple(
+            Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
+            for s, flight in zip(end.signals, end.problem.training, strict=True)
+        ),
+        sensors=is_kinematic(end.problem.model),
+        mentioned=mentioned,
+    )
+
+
+def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:
+    """The vehicle with the estimates in place.
+
+    Args:
+        problem: with the vehicle at its start values.
+        estimates: by parameter.
+    """
+    # Parameters alone: offsets, gains and shifts belong to the log, and a model that flies by
+    # itself has none of them.
+    values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
+    return naming.replace(problem.vehicle, **values)
+
+
+def _ahead(end: End, params: Any) -> Adequacy:
+    """Of an unstable model under filter error, whose simulation says nothing over a whole record:
+    by what is predicted some seconds ahead."""
+    problem, records, error, expected = end.problem, [], {}, {}
+    for label, flight, prediction in zip(
+        labels(problem.training), problem.training, predictions_ahead(end.at), strict=True
+    ):
+        records.append(Record(label, flight.dt, flight.outputs, prediction.predicted))
+        for n, v in prediction.predicted.items():
+            missed = float(np.nansum(np.square(flight.outputs[n] - v)))
+            error[n] = error.get(n, 0.0) + missed
+            expected[n] = expected.get(n, 0.0) + float(np.nansum(prediction.variance[n]))
+    agreement = {}
+    for n in error:
+        both = [(r.measured[n], r.simulated[n]) for r in records if n in r.measured]
+        measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
+        agreement[n] = metrics(measured, predicted)
+    against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
+    evidence = Evidence(tuple(records), agreement, end.white, against, ahead=SECONDS)
+    return assess(problem, params, evidence)
+
+
+def _over_records(end: End, params: Any, against: dict[str, float] | None) -> Adequacy:
+    """By what is simulated from the beginning of each record to its end."""
+    problem, signals = end.problem, end.signals
+    records = tuple(
+        Record(s.flight, flight.dt, s.measured, s.simulated)
+        for s, flight in zip(signals, problem.training, strict=True)
+    )
+    ahead = tuple(None if s.innovations is None else dict(s.innovations) for s in signals)
+    unknowns = end.at.layout.determined
+    evidence = Evidence(records, pooled_metrics(signals), end.white, against, unknowns, ahead)
+    return assess(problem, params, evidence)
