@@ -49,6 +49,39 @@ def test_a_pilot_who_holds_the_bank_angle_is_found():
     assert one.input == "da"
 
 
+def seen(seed, gain, noise, frequency, machine, rate=100.0):
+    """A machine in gusts whose stick follows the response of 0.25 s ago as somebody sees it that
+    the log's sensor knows nothing of; a minute at 500 Hz, then logged.
+
+    `machine`: damping [1/s], effect of the stick, and its lag [s].
+    """
+    rng, h, n, (damping, effect, lag) = np.random.default_rng(seed), 2e-3, 30_000, machine
+    own = scipy.signal.lfilter(*scipy.signal.butter(2, 2 * frequency * h), rng.standard_normal(n))
+    own *= (0.005 if gain else 0.1) / own.std()
+    gust = 0.4 * np.sqrt(2 * h / 1.5) * rng.standard_normal(n)
+    w, u, x, g = np.zeros(n), np.zeros(n), 0.0, 0.0
+    for k in range(n - 1):
+        u[k] = own[k] + gain * w[max(k - 125, 0)]
+        x += h * (u[k] - x) / lag
+        g += -h / 1.5 * g + gust[k]
+        w[k + 1] = w[k] + h * (-damping * w[k] + effect * x + g)
+    every = round(1 / (rate * h))
+    measured = w[::every] + noise * rng.standard_normal(w[::every].size)
+    return Flight(dt=1 / rate, inputs={"u": u[::every]}, outputs={"w": measured})
+
+
+def test_slow_feedback_shows_through_a_noisy_sensor():
+    found = [feedback(seen(s, 0.15, 0.7, 1.0, (0.7, -14.0, 0.1))) for s in range(6)]
+    assert sum(one[0].present for one in found) >= 5
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0])
+def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback(rate):
+    # What the stick does within a sample moves the machine, and the stick goes on from there.
+    records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), rate) for s in range(6)]
+    assert sum(feedback(record)[0].present for record in records) <= 1
+
+
 def logged_late(seed, samples, n=2000):
     """A stick that nobody moves by the response, logged late."""
     flight = record(seed, 0.0, n=n, gust=0.1)

@@ -1,7 +1,9 @@
 """Whether inputs follow the response: feedback, by a pilot or a controller.
 
-Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
-multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
+Innovations are what a record's own past cannot foretell of its outputs, nor its inputs until the
+output is measured: the residuals of a multivariable ARX model of the record itself, so that a poor
+model of the machine is no alarm. The inputs until then in parts of a sample: an output that answers
+to how a stick moved within a sample would else pass for news, which the stick then goes on from.
 Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
 13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
 rest is correlated with sums of past innovations. The variance of such a correlation between two
@@ -37,6 +39,10 @@ LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""
 _RATE = 50.0
 """samples a second at most: no feedback that a machine flies by is faster than a quarter of that"""
+_SLOW_RATE = 10.0
+"""samples a second at which slow feedback, as a pilot's, shows through a sensor's noise"""
+_PARTS = 5
+"""of a sample at a lower rate, at most, into which the inputs within it are taken apart"""
 _LONGEST = 2.0
 """lag up to which an input may follow [s]"""
 _MOST = 20_000
@@ -92,29 +98,48 @@ def feedback(
         together: how many flights are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    tested = _tested(flight, earlier or {})
-    if isinstance(tested, str):
-        return ()
-    free, innovations, inputs, outputs, steps, dt = tested
-    blocks = lag_blocks(max(1, min(round(_LONGEST / dt), len(innovations) // 10)))
+    tested = [_tested(flight, earlier or {}, rate) for rate in _rates(flight)]
+    each = [one for one in tested if not isinstance(one, str)]
+    label, found = flight.name or "flight 1", {}
+    for one in each:
+        for name in one.free:
+            made = _dependence(one, name, together * len(each))
+            late = one.steps.get(name, 0) * flight.dt
+            now = made._replace(flight=label, earlier=late)
+            before = found.get(name, now)
+            found[name] = min(before, now, key=lambda f: (f.p_value, f.correlation))
+    return tuple(found.values())
+
+
+def _rates(flight: Flight) -> tuple[float, ...]:
+    """Samples a second at which a flight is looked at."""
+    # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
+    # a sample, and how it moved there, is not known, and an output that answers to it would pass
+    # for news.
+    frames = min([0.5, *map(_frames, flight.inputs.values())]) / flight.dt
+    fast = float(np.clip(frames, _SLOW_RATE, _RATE))
+    return (fast, _SLOW_RATE) if fast > _SLOW_RATE else (fast,)
+
+
+def _frames(u: np.ndarray) -> float:
+    """How often an input has a new value while it moves, of its samples."""
+    at = np.flatnonzero(np.diff(u) != 0.0)
+    return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
+
+
+def _dependence(tested: "_Tested", name: str, together: int) -> Feedback:
+    """Of one input the past innovations that it follows most surely."""
+    blocks = lag_blocks(max(1, min(round(_LONGEST / tested.dt), len(tested.innovations) // 10)))
     # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-    tests = together * len(inputs) * len(outputs) * len(blocks)
-    dependent = []
-    for name, values in free.items():
-        each = correlations_with_sums(values, innovations, blocks)
-        # Of several that are sure beyond all numbers the correlation decides.
-        k, b = min(
-            np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
-        )
-        p, correlation, output = (
-            float(each.p_value[k, b]),
-            float(each.correlation[k, b]),
-            outputs[k],
-        )
-        lag, label = (blocks[b][0] * dt, blocks[b][1] * dt), flight.name or "flight 1"
-        late = steps.get(name, 0) * flight.dt
-        dependent.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
-    return tuple(dependent)
+    tests = together * len(tested.inputs) * len(tested.outputs) * len(blocks)
+    each = correlations_with_sums(tested.free[name], tested.innovations, blocks)
+    # Of several that are sure beyond all numbers the correlation decides.
+    k, b = min(
+        np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
+    )
+    p, correlation = float(each.p_value[k, b]), float(each.correlation[k, b])
+    lag = (blocks[b][0] * tested.dt, blocks[b][1] * tested.dt)
+    return Feedback("", name, tested.outputs[k], correlation, lag, min(1.0, tests * p))
 
 
 class _Tested(NamedTuple):
@@ -130,12 +155,13 @@ class _Tested(NamedTuple):
     dt: float
 
 
-def _tested(flight: Flight, earlier: Mapping[str, float]) -> _Tested | str:
-    """What of a flight is correlated, or in words why nothing is."""
+def _tested(flight: Flight, earlier: Mapping[str, float], rate: float) -> _Tested | str:
+    """What of a flight is correlated at so many samples a second [Hz] at most, or in words why
+    nothing is."""
     # Half of a record at most: a delay beyond is none that it could show.
     most = flight.n_samples // 2
     steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
-    inputs, outputs, dt = _decimated(flight, steps)
+    inputs, outputs, parts, dt = _decimated(flight, steps, rate)
     if not outputs:
         most = percent(1 - _SEEN, 0)
         return f"every output stays where it is or lacks more than {most} of its samples"
@@ -147,29 +173,13 @@ def _tested(flight: Flight, earlier: Mapping[str, float]) -> _Tested | str:
     if not free:
         return STEPS
     y = np.stack(list(outputs.values()), axis=1)
-    u = np.stack(list(inputs.values()), axis=1)
-    # From the past of all signals together. What one output alone cannot foretell may well be the
-    # answer to an input, and would pass for feedback.
+    # From all signals together. What one output alone cannot foretell may well be the answer to an
+    # input, and would pass for feedback. A sample's own inputs stand beside the outputs before it.
+    u = np.concatenate([parts[1:], parts[-1:]])
     innovations = arx_residuals(y, np.concatenate([y, u], axis=1))
     if innovations is None:
         return "too few samples stand in a row without a missing one"
     return _Tested(free, innovations, tuple(inputs), tuple(outputs), steps, dt)
-
-
-def innovations_of(flight: Flight) -> Float[np.ndarray, "N p"] | None:
-    """What a record's own past cannot foretell of its outputs (N, p), 0 where that is not known;
-    None where the record is too short to tell.
-
-    Args:
-        flight: inputs and outputs as measured.
-    """
-    tested = _tested(flight, {})
-    if isinstance(tested, str):
-        return None
-    # Back at the flight's own rate, and before the past is long enough.
-    every = round(tested.dt / flight.dt)
-    values = np.repeat(np.nan_to_num(tested.innovations), every, axis=0)[: flight.n_samples]
-    return np.pad(values, ((0, flight.n_samples - len(values)), (0, 0)))
 
 
 def why_untested(problem: Problem) -> str:
@@ -177,7 +187,7 @@ def why_untested(problem: Problem) -> str:
     reasons = {
         label: tested
         for label, f in zip(labels(problem.training), problem.training, strict=True)
-        if isinstance(tested := _tested(f, {}), str)
+        if isinstance(tested := _tested(f, {}, _rates(f)[0]), str)
     }
     kinds = list(dict.fromkeys(reasons.values()))
     if len(kinds) < 2:
@@ -232,7 +242,7 @@ def untested(problem: Problem) -> list[str]:
     """A sentence for the outputs of which feedback cannot be told, since too much is missing."""
     flights, lacking = problem.training, {}
     for label, flight in zip(labels(flights), flights, strict=True):
-        tested = _decimated(flight, {})[1]
+        tested = _decimated(flight, {}, _RATE).outputs
         gappy = [n for n, y in flight.outputs.items() if n not in tested and np.isnan(y).any()]
         if gappy:
             # Flights that lack the same in one sentence: parts of a run do.
@@ -359,40 +369,57 @@ def _rests(u: Float[np.ndarray, " N"]) -> float:
     return float(np.sum(runs[runs >= _LONG_REST])) / u.size
 
 
-def _decimated(
-    flight: Flight, earlier: Mapping[str, int]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
-    """Inputs that move and outputs that are mostly seen, averaged down to a moderate rate.
+class _Decimated(NamedTuple):
+    """Signals at a moderate rate, by name."""
+
+    inputs: dict[str, np.ndarray]
+    """those that move (N,)"""
+    outputs: dict[str, np.ndarray]
+    """those that are mostly seen (N,)"""
+    parts: Float[np.ndarray, "N m"]
+    """of the inputs: means over parts of a sample"""
+    dt: float
+
+
+def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Decimated:
+    """A flight averaged down.
 
     Args:
+        flight: as measured.
         earlier: by how many samples an input is taken earlier than logged, where it is.
+        rate: samples a second at most [Hz].
     """
-    every = max(1, int(np.ceil(1.0 / (flight.dt * _RATE) - 1e-9)))
+    every = max(1, int(np.ceil(1.0 / (flight.dt * rate) - 1e-9)))
+    edges = np.rint(np.linspace(0, every, min(every, _PARTS) + 1)).astype(np.int64)
 
     def thinned(x: np.ndarray) -> np.ndarray:
         # Means of blocks and not every n-th sample: what is faster than the lower rate would come
         # back as something slow.
-        whole = x[: x.size // every * every].reshape(-1, every)
-        return whole.mean(axis=1)  # NaN where one of them is missing
+        return x.reshape(-1, every).mean(axis=1)  # NaN where one of them is missing
+
+    def within(x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(x.reshape(-1, every), edges[:-1], axis=1) / np.diff(edges)
 
     # What an input does after the end of its log is not known: all signals end there.
     cut = max(earlier.values(), default=0)
 
     def taken(x: np.ndarray, first: int) -> np.ndarray:
-        return thinned(x[first : x.size - cut + first])
+        # Of a very long record a part will do, and its regressors fit into memory.
+        part = x[first : x.size - cut + first]
+        return part[: min(part.size // every, _MOST) * every]
 
     inputs = {n: taken(u, earlier.get(n, 0)) for n, u in flight.inputs.items()}
-    outputs = {n: taken(y, 0) for n, y in flight.outputs.items()}
-    # Of a very long record a part will do, and its regressors fit into memory.
-    inputs = {n: u[:_MOST] for n, u in inputs.items()}
-    outputs = {n: y[:_MOST] for n, y in outputs.items()}
+    inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
+    parts = [within(u) for u in inputs.values()]
+    outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
     # A record of less than one block leaves none.
-    return (
-        {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0},
+    return _Decimated(
+        {n: thinned(u) for n, u in inputs.items()},
         {
             n: y
             for n, y in outputs.items()
             if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
         },
+        np.concatenate(parts, axis=1) if parts else np.zeros((0, 0)),
         flight.dt * every,
     )
