@@ -394,7 +394,7 @@ def _info(options: argparse.Namespace) -> int:
     if options.json:
         print(log_output.as_json(flights))
     else:
-        log_output.print_flights(flights, options.channels)
+        log_output.print_flights(flights, options.channels, options.flight is not None)
     return DONE
 
 

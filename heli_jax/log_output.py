@@ -39,12 +39,15 @@ _NUMBER = 10
 """columns of the screen for a number"""
 
 
-def print_flights(flights: Sequence[LogInfo], pattern: str | None = None) -> None:
+def print_flights(
+    flights: Sequence[LogInfo], pattern: str | None = None, chosen: bool = False
+) -> None:
     """The flights of one log on standard output.
 
     Args:
         flights: of one file, at least one.
         pattern: of the channels' names, as a shell has them; all that are few enough without one.
+        chosen: whether they were asked for, and the file may hold others.
     """
     log = flights[0]
     rows = "" if log.topics else f", {log.n_rows} rows"
@@ -55,7 +58,8 @@ def print_flights(flights: Sequence[LogInfo], pattern: str | None = None) -> Non
     print(f"{name}: {words}" if len(name) + len(words) + 2 <= width else f"{name}\n{words}")
     print(f"sha256 {log.sha256}")
     for flight in flights:
-        for line in _flight_lines(flight, len(flights), pattern, width):
+        count = flight.flight[1] if chosen else len(flights)
+        for line in _flight_lines(flight, count, pattern, width):
             print("\n".join(_lines(line, width)))
 
 

@@ -519,6 +519,7 @@ def test_small_units_at_the_end_of_a_name(name: str, stem: str, unit: str) -> No
         ("servoRaw.servo2", "pitch"),
         ("rcin_3", "collective"),
         ("RC_Channel_4", "yaw"),
+        ("Kanal2_us", "pitch"),
         # Columns of an array are counted from 0.
         ("rc[0]", "roll"),
         ("chan12_raw", None),

@@ -20,6 +20,7 @@ from heli_jax.config.schema import (
     OutputConfig,
     TimeConfig,
 )
+from heli_jax.config.unfiltered_noise import unfiltered_cautions
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -111,6 +112,7 @@ def _read_flight(
     first, *others = _treated(experiment, flights, f, where)
     cautions = (
         *filter_cautions(first.source, everything.outputs),
+        *unfiltered_cautions(first, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
         *pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),

@@ -15,7 +15,14 @@ from heli_jax.errors import InputError
 from heli_jax.flights import progress
 from heli_jax.flights.blackbox_columns import narrowed
 from heli_jax.flights.blackbox_frames import Frames, find_frames
-from heli_jax.flights.blackbox_header import HOME, MARK, FrameLayout, Header, read_header
+from heli_jax.flights.blackbox_header import (
+    HOME,
+    LAST_TIME,
+    MARK,
+    FrameLayout,
+    Header,
+    read_header,
+)
 from heli_jax.flights.blackbox_main import MainFrames, main_frames, other_frames
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.table import wrong
@@ -121,23 +128,23 @@ def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic
     if letter not in head.layouts or not frames.starts[letter].size:
         return None
     layout, home = head.layouts[letter], None
+    if LAST_TIME in layout.predictors:
+        _leave_out(frames, letter, ~_follows(frames, letter, main))
     if HOME in layout.predictors:
         home, known = _home(frames, head, main)
         if not known.all():  # a position is the distance from a home that is not known yet
-            frames.rows[letter], frames.starts[letter] = (
-                frames.rows[letter][known],
-                frames.starts[letter][known],
-            )
+            _leave_out(frames, letter, ~known)
             home = home[known]
+    if not frames.starts[letter].size:
+        return None
     values = other_frames(frames, letter, head, main, home)
+    # They stand between main frames: the time of the one before, where they have none.
+    last = np.maximum(np.searchsorted(main.starts, frames.starts[letter]) - 1, 0)
+    times, clock = main.times[last], "time of the main frame before"
     if "time" in layout.names:
-        times, clock = values[:, layout.names.index("time")].astype(np.int64), "time"
-        # Of the 32 bits that the firmware writes the main frames know the turns.
-        times = times + ((main.times[0] - times[:1]) >> 32 << 32)
-    else:
-        # They stand between main frames and share the time of the one before.
-        last = np.searchsorted(main.starts, frames.starts[letter]) - 1
-        times, clock = main.times[np.maximum(last, 0)], "time of the main frame before"
+        # 32 bits, of which the main frames know the turns: the time nearest to theirs.
+        stamps, clock = values[:, layout.names.index("time")], "time"
+        times = times + ((stamps - times + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
     names = {"S": "slow", "G": "GPS"}
     columns = {
         name: narrowed(values[:, i].astype(np.int32 if has_sign else np.uint32))
@@ -148,6 +155,20 @@ def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic
     taken = set(head.layouts["I"].names)
     columns = {k if k not in taken else f"{names[letter]}.{k}": v for k, v in columns.items()}
     return Topic(names[letter], times * 1e-6, columns, {}, clock)
+
+
+def _follows(frames: Frames, letter: str, main: MainFrames) -> np.ndarray:
+    """Whether the main frame before each frame (M,) is known: its time is told from that one's."""
+    starts = frames.starts[letter].astype(np.int64)
+    places = (frames.starts["I"], frames.starts["P"], np.asarray(frames.damage, np.int64))
+    before = [np.append(-1, at)[np.searchsorted(at, starts)] for at in places]
+    kept = np.append(-1, main.starts)[np.searchsorted(main.starts, starts)]
+    return np.max(before, axis=0) <= kept
+
+
+def _leave_out(frames: Frames, letter: str, which: np.ndarray) -> None:
+    frames.rows[letter] = frames.rows[letter][~which]
+    frames.starts[letter] = frames.starts[letter][~which]
 
 
 def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, np.ndarray]:

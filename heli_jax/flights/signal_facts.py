@@ -11,6 +11,7 @@ import numpy as np
 
 from heli_jax.flights.marks import Counts, Marked
 from heli_jax.flights.noisy_rails import PILE, rail_below_noise
+from heli_jax.flights.short_holds import goes_on, short_holds
 from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.flights.strays import Strays
 
@@ -41,8 +42,6 @@ _FAILURES = 20
 """runs out of all proportion at most: of more it is the signal's way"""
 _DITHER = 0.01
 """of a usual move, by which a frozen sensor may go to and fro"""
-_TRIFLE = 0.2
-"""of its usual deviation, by which another signal has to move while one is stuck"""
 _DROPS, DROP_SHARE = 5, 0.01
 """visits of a value, and part of the samples at it, from which on they are dropouts"""
 _RUNS = 20
@@ -214,11 +213,11 @@ def facts_of_all[K: Hashable](
             found = [
                 one
                 for one in _stretches(*signals[key], facts[key])
-                if any(_moves_as_usual(*other, one) for other in others)
+                if any(goes_on(*other, one.begin, one.end, STUCK_SECONDS) for other in others)
             ]
-            stretches = _that_count(found, facts[key].size * facts[key].usual)
-            dropouts = _dropouts(*signals[key])
-            facts[key] = replace(facts[key], stretches=stretches, dropouts=dropouts)
+            counted = _that_count(found, facts[key].size * facts[key].usual)
+            drops = _dropouts(*signals[key])
+            facts[key] = replace(facts[key], stretches=counted, dropouts=drops)
         for key in signals.keys() - outputs:
             facts[key] = replace(facts[key], dropouts=_of_stick(*signals[key]))
     return facts
@@ -251,8 +250,9 @@ def _runs_out_of_proportion(
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
     noisy = _turns(moves) >= _TURNS
     least = _longest_by_itself(lengths, moves)
+    short = short_holds(y, begins, noisy, facts.step) & (lengths > 0)
     stuck = []
-    for i in np.flatnonzero(lengths >= least):
+    for i in np.flatnonzero(short | (lengths >= least)):
         first, last = begins[i], begins[i] + lengths[i] - 1
         begin, end = float(s[first]), float(s[last])
         # A simulated signal without noise comes to rest within the last digit.
@@ -260,7 +260,7 @@ def _runs_out_of_proportion(
         rests = before < max(_AT_REST * usual, 10.0 * within)
         drifts = np.ptp(y[first : last + 1]) > within
         # What has no noise may rest for a while without being stuck.
-        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy):
+        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy or short[i]):
             stuck.append(Stuck(begin, end, float(y[first])))
     return stuck
 
@@ -296,13 +296,6 @@ def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
     # Time in longer runs than that: a few sensors' failures, or the way in which the signal moves.
     longer = int(np.count_nonzero(lengths >= _STUCK * usual))
     return max(_STUCK * usual, _TIMES * high) if longer <= _FAILURES else np.inf
-
-
-def _moves_as_usual(seconds: np.ndarray, x: np.ndarray, stuck: Stuck) -> bool:
-    """Whether another signal moves while one is stuck, and not by a trifle."""
-    seen = np.isfinite(x)
-    inside = x[(seconds >= stuck.begin) & (seconds <= stuck.end) & seen]
-    return inside.size > 1 and float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen]))
 
 
 def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:

@@ -173,7 +173,9 @@ MARK = "H Product:Blackbox flight data recorder by Nicholas Sherlock"
 END = b"E\xffEnd of log\x00"
 
 
-def blackbox(names, values, predictors, encodings, *, every=32, step=1, settings=(), slow=()):
+def blackbox(
+    names, values, predictors, encodings, *, every=32, step=1, settings=(), slow=(), gps=()
+):
     """One flight.
 
     Args:
@@ -185,6 +187,7 @@ def blackbox(names, values, predictors, encodings, *, every=32, step=1, settings
         step: iterations between frames.
         settings: lines of the header, (name, value).
         slow: (row, value) of S frames of one field, each before the frame of that row.
+        gps: (row, us behind the last frame, satellites) of G frames, each before that row's frame.
     """
     count = len(names)
     head = [MARK, "H Data version:2", f"H I interval:{every}", f"H P interval:{step}"]
@@ -199,14 +202,21 @@ def blackbox(names, values, predictors, encodings, *, every=32, step=1, settings
     if slow:
         head += ["H Field S name:mode", "H Field S signed:0"]
         head += ["H Field S predictor:0", "H Field S encoding:1"]
+    if gps:
+        head += ["H Field G name:time,GPS_numSat", "H Field G signed:0,0"]
+        head += ["H Field G predictor:10,0", "H Field G encoding:1,1"]
     out = ["\n".join([*head, *(f"H {k}:{v}" for k, v in settings)]).encode() + b"\n"]
     predictors, slow = [6, 2, *predictors], dict(slow)
+    gps = {row: numbers for row, *numbers in gps}
     before = earlier = None
     for row, value in enumerate(np.asarray(values).tolist()):
         if row in slow:
             out.append(b"S" + unsigned(slow[row]))
+        if row in gps:
+            out.append(b"G" + encode(gps[row], [1, 1]))
         if value[0] % every == 0:
-            out.append(b"I" + encode(value, [1, 1, *[0] * count]))
+            stamp = value[1] % 2**32  # the firmware's counter begins anew
+            out.append(b"I" + encode([value[0], stamp, *value[2:]], [1, 1, *[0] * count]))
             before = earlier = value
             continue
         deltas = [

@@ -100,6 +100,26 @@ def test_a_damaged_frame_costs_what_depends_on_it(tmp_path):
     assert "damaged" in log.notes[0]
 
 
+@pytest.mark.parametrize("first", [5_000_000, 2**32 - 100_000])
+def test_positions_have_the_clock_of_the_control_loop(tmp_path, first):
+    values = some_values()
+    values[:, 1] += first - values[0, 1]
+    gps = [(20, 700, 9), (40, 900, 10), (120, 300, 11)]
+    wanted = np.array([values[row - 1, 1] + us for row, us, _ in gps]) * 1e-6
+    data = writers.blackbox(NAMES, values, PREDICTORS, ENCODINGS, gps=gps)
+    (log,) = opened(tmp_path, data)
+    np.testing.assert_allclose(log.channel("gyroADC[0]")[0], values[:, 1] * 1e-6, rtol=1e-12)
+    times, satellites = log.channel("GPS_numSat")
+    np.testing.assert_allclose(times, wanted, rtol=1e-12)
+    assert satellites.tolist() == [9, 10, 11]
+    # The time of a position is told from the frame before it: behind damage that one is lost.
+    damaged = bytearray(data)
+    at = damaged.index(b"P", damaged.index(b"\n", damaged.index(b"H Field G encoding")))
+    del damaged[at : at + 3]
+    (log,) = opened(tmp_path, bytes(damaged))
+    np.testing.assert_allclose(log.channel("GPS_numSat")[0], wanted[1:], rtol=1e-12)
+
+
 def test_several_flights_in_one_file(tmp_path):
     second = writers.blackbox(NAMES, some_values(80, 1), PREDICTORS, ENCODINGS)
     path = tmp_path / "LOG.TXT"

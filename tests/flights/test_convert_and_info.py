@@ -140,6 +140,9 @@ def test_info_is_readable_at_80_columns(tmp_path, capsys, monkeypatch):
     assert "flight 2 of 2" in blackbox
     assert "gyro_lpf1_static_hz = 150" in blackbox
     assert "duration: 0.39" in blackbox
+    # Of the flight that was not asked for nothing is said, and not that it holds no samples.
+    assert main(["info", "two.bbl", "--flight", "2"]) == 0
+    assert "\nflight 2 of 2\n" in capsys.readouterr().out
     ulog = shown["flight.ulg"]
     assert "firmware: PX4 BOARD" in ulog
     assert "IMU_GYRO_CUTOFF = 40.0" in ulog

@@ -80,18 +80,28 @@ def cutoff(filters: Sequence[Filter]) -> float:
     Args:
         filters: low-passes, at least one.
     """
-    sections = [section for f in filters for section in _sections(f)]
     # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
     # quality rises before it falls, so the last crossing counts.
     hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
+    size = gain(filters, hz)
+    return float(hz[np.flatnonzero(size >= np.sqrt(0.5))[-1]])
+
+
+def gain(filters: Sequence[Filter], hz: np.ndarray) -> np.ndarray:
+    """What low-passes one behind the other leave of an amplitude (K,).
+
+    Args:
+        filters: low-passes.
+        hz: frequencies (K,) [Hz].
+    """
     size = np.ones_like(hz)
-    for section in sections:
+    for section in (section for f in filters for section in _sections(f)):
         ratio = 2.0 * np.pi * hz / section.omega
         passed = 1.0 + ratio**2
         if section.order == 2:
             passed = (1.0 - ratio**2) ** 2 + (ratio / section.q) ** 2
         size /= np.sqrt(passed)
-    return float(hz[np.flatnonzero(size >= np.sqrt(0.5))[-1]])
+    return size
 
 
 class _Section(NamedTuple):

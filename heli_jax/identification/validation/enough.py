@@ -26,6 +26,7 @@ from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import misread
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
+from heli_jax.identification.validation.shared_vibration import vibration_alone
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
     saturation,
@@ -119,6 +120,7 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
     present = feedback_notes(problem, feedback)
     if present:
         doubts = [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
+        doubts += [Finding("feedback", "note", s) for s in vibration_alone(problem, feedback)]
         return [*doubts, *aside]
     words = (
         "no input follows what is unforeseen of the response (p-value "
