@@ -124,7 +124,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         for n in names
         if n != clock and _is_known(values[n])
     }
-    notes += arrival_notes(clock, names)
+    notes += arrival_notes(table, clock)
     if time.runs > 1:
         notes += table.notes[-1:]
     if others:
