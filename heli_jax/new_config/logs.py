@@ -14,7 +14,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.clock_faults import require_increasing
 from heli_jax.flights.clock_guess import arrival_notes, is_called_time
 from heli_jax.flights.describe import LogInfo, describe_table
-from heli_jax.flights.log import as_floats
+from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.row_clock import ROWS, CountedTable
@@ -43,6 +43,8 @@ class Log(NamedTuple):
     """what of the log is not looked at"""
     unread: Mapping[str, str] = MappingProxyType({})
     """columns of a table that cannot be asked for, and why, in words"""
+    autopilot: ChannelLog | None = None
+    """the log itself, with the firmware's settings, where topics have clocks of their own"""
 
 
 def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
@@ -86,6 +88,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         flight,
         flight is not None,
         notes,
+        autopilot=first,
     )
 
 
