@@ -71,6 +71,9 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         problem = "its topics have clocks of their own, expected no rate of rows to be stated"
         raise wrong(str(path), problem)
     first, *others = opened
+    if not any(topic.clock for topic in first.topics):
+        problem = "its rows have an order and no times, which no fit can use, expected a log with a"
+        raise wrong(str(path), f"{problem} clock, of ArduPilot one with TimeUS")
     series = {
         name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
         for topic in first.topics

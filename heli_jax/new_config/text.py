@@ -190,7 +190,9 @@ def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
     if not time.uniform or time.gaps:
         longest = max((g.length for g in time.gaps), default=0.0)
-        words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s; fail refuses long ones"
+        gaps = f"{len(time.gaps)} gaps, the longest {longest:.4g} s"
+        gaps = f"a gap of {longest:.4g} s" if len(time.gaps) == 1 else gaps
+        words = f"{gaps}; fail refuses long ones"
         if time.runs > 1:
             words = f"{time.runs} runs, in each of which the time begins anew"
         lines += [
