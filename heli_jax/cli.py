@@ -417,9 +417,9 @@ def _convert(options: argparse.Namespace) -> int:
     for note in converted.notes:
         options.say(Note(f"{options.log}: {note}"))
     columns = converted.columns
-    options.say(
-        f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}"
-    )
+    count = len(columns) - 1
+    of = "1 signal" if count == 1 else f"{count} signals"
+    options.say(f"wrote {columns[convert.TIME].size} samples of {of} to {out}")
     return DONE
 
 

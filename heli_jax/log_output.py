@@ -123,7 +123,11 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) 
         yield f"flight {number} of {of}" + (f" ({count} with samples)" if count < of else "")
     if flight.firmware:
         yield f"firmware: {flight.firmware}"
-    length = "unknown: no topic has times" if math.isnan(flight.duration) else ""
+    length = (
+        "unknown: rows have an order and no times, which no fit can use"
+        if math.isnan(flight.duration)
+        else ""
+    )
     yield f"duration: {length or f'{flight.duration:.6g} s'}"
     # What was lost or assumed stands before the numbers, which are read with that in mind.
     yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
@@ -172,6 +176,8 @@ def _gap_words(clock: TimeInfo) -> str:
     if not clock.gaps:
         return "no gaps"
     longest = max(gap.length for gap in clock.gaps)
+    if len(clock.gaps) == 1:
+        return f"one gap of {longest:.4g} s"
     return f"{len(clock.gaps)} gaps, the longest {longest:.4g} s"
 
 

@@ -128,7 +128,7 @@ def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) 
         if logged is None:
             continue
         if output.filter is None and logged.filters:
-            said.append(_not_modelled(name, logged))
+            said.append(_not_modelled(name, output, logged))
         if logged.unknown:
             said.append(
                 f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}: such "
@@ -156,18 +156,29 @@ def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[str, ...]:
     )
 
 
-def _not_modelled(name: str, logged: LoggedFilters) -> str:
+def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> str:
     filters = logged.filters
     lowpasses = [f for f in filters if f.kind != "notch"]
     what = f"low-passed at {cutoff(lowpasses):.3g} Hz" if lowpasses else "notched"
     late = 1e3 * sum(f.delay for f in filters)
+    # All of the line: of an output that a preset supplies the configuration has none.
+    line = [f'signal: "{output.signal}"', *([f"unit: {output.unit}"] if output.unit else [])]
+    line += [f"{key}: {value:g}" for key, value in _changed(output).items()]
+    line += ["invert: true"] * output.invert
     # The inputs were not: were both filtered alike, the machine would look the same.
     return (
         f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
         f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
-        "that delay for the machine's; state `filter: from log` to model it, or `filter: []` if it "
-        "is of no account"
+        f"that delay for the machine's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
+        "under outputs to model it, or `filter: []` there if it is of no account"
     )
+
+
+def _changed(output: OutputConfig) -> dict[str, float]:
+    """Scale and offset where they do something."""
+    return {
+        k: v for k, v, d in (("scale", output.scale, 1.0), ("offset", output.offset, 0.0)) if v != d
+    }
 
 
 def _short(setting: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.px4_commands import are_commands
 from heli_jax.flights.runs import restarts
 from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import LETTERS, likely_unit, split_unit, time_unit
@@ -64,7 +65,7 @@ def guess_clock(
     numeric = [s.name for s in surveys if s.values is not None]
     # When a sample was taken, before when its message arrived: rostopic writes both.
     for name in numeric:
-        if _is_of_sample(name) and _increases(values[name]):
+        if _says_when_sampled(table, name) and _increases(values[name]):
             return _with_unit(table, name, values[name])
     # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
@@ -97,18 +98,35 @@ def is_called_time(name: str) -> bool:
     return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
 
 
-def arrival_notes(clock: str, names: Sequence[str]) -> tuple[str, ...]:
-    """That a clock was taken in place of another, where the other is that of a message's arrival.
+def arrival_notes(table: Table, clock: str) -> tuple[str, ...]:
+    """Which of two clocks was taken, and why, where one is that of a message's arrival.
 
     Args:
+        table: of rows.
         clock: the column that is taken.
-        names: of a table's columns.
     """
-    other = next((name for name in names if name in _ARRIVALS), None)
-    if other is None or not _is_of_sample(clock):
+    if not _is_of_sample(clock):
+        sampled = clock + "_sample"
+        if sampled not in table.names or not are_commands(table.path, sampled, table.names):
+            return ()
+        words = "is taken for the clock, since commands act from when they are published"
+        return (f"{shown(clock)} {words}; {shown(sampled)} is of the gyro's sample they answer",)
+    other = next((name for name in table.names if name in _ARRIVALS), None)
+    if other is None:
         return ()
     words = "is taken for the clock, since it says when a sample was taken"
     return (f"{shown(clock)} {words}; {shown(other)} says when its message arrived",)
+
+
+def _says_when_sampled(table: Table, name: str) -> bool:
+    """Whether a column is a clock before all others, since it is that of the samples themselves."""
+    if not _is_of_sample(name):
+        return False
+    if not name.casefold().endswith(_SAMPLED):
+        return True
+    # `convert` has put the clock of the topic beside what it copied. And a command acts from when
+    # it was published, 0.4 to 3 ms behind the gyro's sample: as in a ULog itself.
+    return "time" not in table.names and not are_commands(table.path, name, table.names)
 
 
 def _is_of_sample(name: str) -> bool:

@@ -158,7 +158,9 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
             if topic.clock and name not in (topic.clock, f"{topic.name}.{topic.clock}")
         ]
         if not names:
-            raise wrong(log.path, "no topic has times, expected a log with a clock")
+            raise wrong(
+                log.path, "its rows have an order and no times, expected a log with a clock"
+            )
     else:
         names = []
         for pattern in patterns:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from heli_jax.flights.csv_cells import row_of_units
 from heli_jax.flights.csv_fortran import is_fortran, parted
 from heli_jax.flights.table import wrong
 
@@ -222,17 +223,22 @@ def header_line(data: bytes, above: Line | None = None) -> Line | None:
     start, number = 3 if data.startswith(codecs.BOM_UTF8) else 0, 1
     if above is not None:
         start, number = above.after, above.number + 1
-    comment = ""
+    comment = names = Line("", 0, 0)
     while start < min(len(data), _LONGEST_PREAMBLE):
         line = _line(data, start, number)
         # Comments may say anything, a list of names with commas too.
         mark = _COMMENT.match(line.text)
         if line.text.strip() and mark is None:
             # MATLAB's and NumPy's writers of text put the names into a comment.
-            if _names_columns(comment, line.text):
-                return Line(comment, number - 1, start)
-            return line
-        comment = line.text.lstrip().lstrip("#%/").strip() if mark else ""
+            if not _names_columns(comment.text, line.text):
+                return line
+            if _is_of_units(comment, names, line.text):
+                return names
+            return Line(comment.text, comment.number, start)
+        text = line.text.lstrip().lstrip("#%/") if mark else ""
+        # Of a line of units below names the rows begin behind its mark.
+        cells = start + len(line.text.encode()) - len(text.encode())
+        names, comment = comment._replace(after=cells), Line(text.strip(), number, start)
         start, number = line.after, number + 1
     return None
 
@@ -267,6 +273,17 @@ def _names_columns(comment: str, row: str) -> bool:
     if any(comment.count(d) == row.count(d) > 0 for d in DELIMITERS):
         return True
     return is_of_blanks(comment, row)
+
+
+def _is_of_units(comment: Line, above: Line, row: str) -> bool:
+    """Whether a comment holds the units of columns that the comment right above it names."""
+    if above.number != comment.number - 1 or not _names_columns(above.text, row):
+        return False
+    delimiter = next((d for d in DELIMITERS if comment.text.count(d) == row.count(d) > 0), None)
+    return all(
+        (row_of_units(line.text.split(delimiter)) is not None) == is_units
+        for line, is_units in ((comment, True), (above, False))
+    )
 
 
 def first_row(data: bytes, at: int) -> str | None:

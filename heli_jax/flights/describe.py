@@ -277,11 +277,7 @@ def describe_table(
             *table.notes,
             *_other_lengths(surveys),
             *clock_notes(table),
-            *(
-                counter_notes(surveys)
-                if clock is None
-                else arrival_notes(clock.column, table.names)
-            ),
+            *(counter_notes(surveys) if clock is None else arrival_notes(table, clock.column)),
             *numbering_notes(clock.numbering if clock else ""),
             *marks,
         ),

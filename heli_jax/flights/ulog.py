@@ -14,6 +14,7 @@ import numpy as np
 
 from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples
+from heli_jax.flights.px4_commands import is_command
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
@@ -31,8 +32,6 @@ _TYPES = {
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
     "bool": "<i1", "char": "<i1",
 }  # fmt: skip
-_COMMANDS = ("actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint")
-"""how topics are called that hold what the autopilot commands"""
 # At most five digits of a length: what claims more is damage, and would be laid out field by field.
 _FIELD = re.compile(r"([A-Za-z_]\w*)(?:\[(\d{1,5})\])? ([A-Za-z_]\w*)")
 # Kinds of messages by letter. Newer firmware may add others, which are passed over by their length.
@@ -285,7 +284,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
 
 def _clock(name: str, rows: np.ndarray) -> str:
     names = rows.dtype.names or ()
-    if "timestamp_sample" in names and not name.startswith(_COMMANDS):
+    if "timestamp_sample" in names and not is_command(name):
         stamps = rows["timestamp_sample"]
         # Some modules leave the field at zero, or publish one sample twice.
         if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):

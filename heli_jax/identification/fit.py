@@ -20,6 +20,7 @@ from heli_jax.identification.estimation.disturbance_search import disturbance_or
 from heli_jax.identification.estimation.drawn_starts import draw
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
+from heli_jax.identification.estimation.likely_gusts import likely_gusts
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
@@ -59,7 +60,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.expected_accuracy import guessed_gusts
+from heli_jax.identification.validation.expected_accuracy import guessed_gusts, unstated_gusts
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.input_units import wrong_units
@@ -125,6 +126,15 @@ def first_guess(problem: Problem) -> FirstGuess:
     return FirstGuess(layout, data, noise, z, e)
 
 
+def _with_likely_gusts(problem: Problem) -> FirstGuess:
+    """The first guess, with gusts of the greatest likelihood where nobody stated their size."""
+    guess = first_guess(problem)
+    if not (unstated_gusts(problem) and guess.layout.disturbance):
+        return guess
+    z, e = likely_gusts(Solution(*guess[:4]), guess.e)
+    return guess._replace(z=z, e=e)
+
+
 def _require_problem(problem: Any) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(
@@ -139,7 +149,7 @@ def check(problem: Problem) -> Check:
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
     _require_problem(problem)
-    guess = first_guess(problem)
+    guess = _with_likely_gusts(problem)
     noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
@@ -159,7 +169,7 @@ def check(problem: Problem) -> Check:
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += tuple(of_disturbances(guess.layout, guess.e))
     notes += other_hold(problem, at, guess.e, skip=not_identifiable)
-    notes += [gusts] if (gusts := guessed_gusts(problem)) else []
+    notes += [gusts] if (gusts := guessed_gusts(problem, at)) else []
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
@@ -213,11 +223,12 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     if not estimator_of(problem.method).rows_by_flight:
         # Which part says most is asked of the simulation, whatever the fit goes by.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
-    guess = first_guess(problem)
-    ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    guess = _with_likely_gusts(problem)
+    at = Solution(*guess[:4])
+    ranking = rank_windows(problem, at, guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    gusts = guessed_gusts(problem)
+    gusts = guessed_gusts(problem, at)
     notes = (*ranking.notes, gusts) if gusts else ranking.notes
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 

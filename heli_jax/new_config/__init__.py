@@ -9,6 +9,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import tables, text
+from heli_jax.new_config.filtered import filter_settings, filtered_outputs
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.model_choice import chosen_model, other_models
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
@@ -67,9 +68,14 @@ def write_config(
     if paths and signals is not None:
         # The vehicle file has them.
         signals = signals._replace(known={})
-    used = _used(preset, chosen.model, read, signals)
     others = () if model is not None else other_models(chosen.name)
     free = _free(chosen, constants, paths)
+    from_preset = tuple(only_turn(chosen.model).values())
+    outputs = _outputs(preset, chosen.model, from_preset, read, signals)
+    filtered = filtered_outputs(preset, chosen.model, read, from_preset) if preset else {}
+    if signals is not None:
+        named = {c: filter_settings(read, c) for c in outputs}
+        signals = signals._replace(filtered={c: words for c, words in named.items() if words})
     content = text.configuration(
         chosen=chosen,
         log=_relative(Path(log), out),
@@ -80,9 +86,10 @@ def write_config(
         vehicle=place,
         free=free,
         held={} if place is not None else _held(chosen, free),
-        rate=_rate(read, used, signals),
+        rate=_rate(read, outputs),
         others=[f"{name}: {meaning}" for name, meaning in others],
-        preset_outputs=tuple(only_turn(chosen.model).values()),
+        preset_outputs=from_preset,
+        filtered=filtered,
     )
     for path, words in {out: content, **paths}.items():
         with whole_file(path, str(path)) as temporary:
@@ -114,23 +121,31 @@ def write_config(
     return Written((out, *paths), tuple(notes))
 
 
-def _used(preset: str | None, model: Any, log: Log, signals: text.Signals | None) -> Sequence[str]:
-    """The log's channels that the configuration takes."""
+def _outputs(
+    preset: str | None,
+    model: Any,
+    asked: Sequence[str],
+    log: Log,
+    signals: text.Signals | None,
+) -> Sequence[str]:
+    """The log's channels that the configuration takes for outputs, `asked` of the preset, all
+    unless given; for inputs where it takes none."""
     if signals is not None:
-        guesses = (*signals.inputs.values(), *signals.outputs.values())
-        return [g.channel for g in guesses if g is not None]
+        taken = signals.outputs or signals.inputs
+        return [g.channel for g in taken.values() if g is not None]
     assert preset is not None
-    needed = (*naming.names(model.Inputs), *naming.names(model.Outputs))
-    return channels_of_preset(preset, tuple(log.series), needed)
+    known = tuple(log.series)
+    found = channels_of_preset(preset, known, asked or naming.names(model.Outputs))
+    return found or channels_of_preset(preset, known, naming.names(model.Inputs))
 
 
-def _rate(log: Log, used: Sequence[str], signals: text.Signals | None) -> float | None:
+def _rate(log: Log, outputs: Sequence[str]) -> float | None:
     """The grid's rate [Hz]: of topics with clocks of their own, or of a table whose rows are not
     the outputs' own; None where the rows themselves are the grid."""
+    # By the outputs: a stick that was logged more slowly is held or interpolated on any grid, and
+    # one that were to follow it would throw samples of the outputs away.
     if log.time is None:
-        return common_rate(log.series, used)
-    assert signals is not None  # presets are of logs with topics
-    outputs = [g.channel for g in signals.outputs.values() if g is not None]
+        return common_rate(log.series, outputs)
     return rate_of_outputs(log.series, outputs)
 
 

@@ -14,7 +14,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.clock_faults import require_increasing
 from heli_jax.flights.clock_guess import arrival_notes, is_called_time
 from heli_jax.flights.describe import LogInfo, describe_table
-from heli_jax.flights.log import as_floats
+from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.row_clock import ROWS, CountedTable
@@ -43,6 +43,8 @@ class Log(NamedTuple):
     """what of the log is not looked at"""
     unread: Mapping[str, str] = MappingProxyType({})
     """columns of a table that cannot be asked for, and why, in words"""
+    autopilot: ChannelLog | None = None
+    """the log itself, with the firmware's settings, where topics have clocks of their own"""
 
 
 def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
@@ -69,6 +71,9 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         problem = "its topics have clocks of their own, expected no rate of rows to be stated"
         raise wrong(str(path), problem)
     first, *others = opened
+    if not any(topic.clock for topic in first.topics):
+        problem = "its rows have an order and no times, which no fit can use, expected a log with a"
+        raise wrong(str(path), f"{problem} clock, of ArduPilot one with TimeUS")
     series = {
         name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
         for topic in first.topics
@@ -86,6 +91,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         flight,
         flight is not None,
         notes,
+        autopilot=first,
     )
 
 
@@ -124,7 +130,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         for n in names
         if n != clock and _is_known(values[n])
     }
-    notes += arrival_notes(clock, names)
+    notes += arrival_notes(table, clock)
     if time.runs > 1:
         notes += table.notes[-1:]
     if others:

@@ -25,14 +25,14 @@ def two_digits(rate: float) -> float:
     return float(f"{rate:.2g}")
 
 
-def common_rate(series: Mapping[str, Series], used: Collection[str]) -> float | None:
-    """The slowest clock of the channels that are used [Hz], 100 at most; None of none.
+def common_rate(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
+    """The slowest clock of the outputs that are used [Hz], 100 at most; None of none.
 
     Args:
         series: of the log by channel.
-        used: names of channels.
+        outputs: names of channels.
     """
-    rates = [1.0 / usual_step(series[n].times) for n in used if n in series]
+    rates = [1.0 / usual_step(series[n].times) for n in outputs if n in series]
     rates = [rate for rate in rates if rate >= _SLOW] or rates
     return two_digits(min(_FASTEST, *rates)) if rates else None
 

@@ -10,6 +10,7 @@ from heli_jax import naming
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
 from heli_jax.flights.describe import TimeInfo
 from heli_jax.flights.row_clock import ROWS
+from heli_jax.new_config.filtered import Filtered
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
@@ -55,6 +56,8 @@ class Signals(NamedTuple):
     """whether no output has a sensor's noise"""
     ranges: Mapping[str, tuple[float, float]] = {}
     """least and largest number of each channel that is left"""
+    filtered: Mapping[str, str] = {}
+    """by channel the settings by which the autopilot filtered it"""
 
 
 def configuration(
@@ -71,6 +74,7 @@ def configuration(
     rate: float | None = None,
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
+    filtered: Mapping[str, Filtered] = {},
 ) -> str:
     """The configuration as text.
 
@@ -88,6 +92,7 @@ def configuration(
             those of several topics.
         others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
+        filtered: those of the preset's outputs that the autopilot filtered.
 
     """
     lines = [
@@ -106,7 +111,7 @@ def configuration(
     if preset is not None:
         lines += [
             "    # window: auto               # or [first, last] s: the parts that say most",
-            *_preset(preset, preset_outputs),
+            *_preset(preset, preset_outputs, filtered),
         ]
     else:
         assert signals is not None
@@ -185,7 +190,9 @@ def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
     if not time.uniform or time.gaps:
         longest = max((g.length for g in time.gaps), default=0.0)
-        words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s; fail refuses long ones"
+        gaps = f"{len(time.gaps)} gaps, the longest {longest:.4g} s"
+        gaps = f"a gap of {longest:.4g} s" if len(time.gaps) == 1 else gaps
+        words = f"{gaps}; fail refuses long ones"
         if time.runs > 1:
             words = f"{time.runs} runs, in each of which the time begins anew"
         lines += [
@@ -220,7 +227,8 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
         lines += _signal(name, signal, meaning)
     lines.append("      outputs:")
     for name, signal in signals.outputs.items():
-        lines += _signal(name, signal, naming.meaning(chosen.model.Outputs, name))
+        settings = "" if signal is None else signals.filtered.get(signal.channel, "")
+        lines += _signal(name, signal, naming.meaning(chosen.model.Outputs, name), settings)
     if not signals.outputs and not signals.wandering:
         return [*lines, *_unknown(chosen.model), *_ranges(signals.ranges)]
     lines += _left_out(signals.wandering)
@@ -252,17 +260,27 @@ def _time(time: TimeInfo) -> str:
     return f"      time: {{{counter}rate: {time.counted:.10g}{runs}}}{said}"
 
 
-def _preset(preset: str, outputs: Sequence[str]) -> list[str]:
+def _preset(preset: str, outputs: Sequence[str], filtered: Mapping[str, Filtered]) -> list[str]:
     known = "# heli-jax info shows the channels"
-    if not outputs:
+    if not outputs and not filtered:
         return [f"    signals: {{preset: {preset}}}   {known}"]
-    return [
-        f"    signals:                     {known}",
-        f"      preset: {preset}",
-        "      # Without the angle, which the autopilot integrates from its gyros: its error",
-        "      # wanders, and filter-error takes it for white noise.",
-        f"      preset_outputs: [{', '.join(outputs)}]",
-    ]
+    lines = [f"    signals:                     {known}", f"      preset: {preset}"]
+    if outputs:
+        lines += [
+            "      # Without the angle, which the autopilot integrates from its gyros: its error",
+            "      # wanders, and filter-error takes it for white noise.",
+            f"      preset_outputs: [{', '.join(outputs)}]",
+        ]
+    if filtered:
+        lines.append("      outputs:                   # with the autopilot's filters in the model")
+    for name, (signal, settings) in filtered.items():
+        keys = [f"signal: {_value(signal.channel)}", f"unit: {_value(signal.unit)}"]
+        keys += [f"offset: {signal.offset:g}"] * bool(signal.offset)
+        keys += [f"scale: {signal.scale:g}"] * (signal.scale != 1.0)
+        keys += ["invert: true"] * signal.invert
+        lines.append(f"        # {name}: {_comment(settings)}")
+        lines.append(f"        {name}: {{{', '.join(keys)}, filter: from log}}")
+    return lines
 
 
 def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
@@ -327,8 +345,10 @@ def _instruments(excitations: Mapping[str, str]) -> list[str]:
     ]
 
 
-def _signal(name: str, guess: Guess | None, meaning: str) -> list[str]:
+def _signal(name: str, guess: Guess | None, meaning: str, settings: str = "") -> list[str]:
     words = [f"        # {name}: {_comment(meaning)}"] if meaning else []
+    if settings:
+        words.append(f"        # filtered by the autopilot: {_comment(settings)}")
     if guess is None:
         # A constant that nobody knows moves nothing: the user says which channel it is.
         return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so"]
@@ -337,6 +357,8 @@ def _signal(name: str, guess: Guess | None, meaning: str) -> list[str]:
         keys.append(f"offset: {guess.offset:g}")
     if guess.scale != 1.0:
         keys.append(f"scale: {_number(guess.scale)}")
+    if settings:
+        keys.append("filter: from log")
     remarks = "; ".join(map(_comment, guess.remarks))
     return [
         *words,

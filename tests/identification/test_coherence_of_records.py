@@ -157,3 +157,21 @@ def test_few_samples_are_not_taken_for_coarse_steps():
     )
     [found] = quantisation([("one", short)], [{"phi": 1.0}])
     assert "the record has only 10 samples of phi" in found.sentence
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_machine_in_gusts_is_seen_to_follow_at_half_the_rate_too(every):
+    # 60 s: at 50 Hz there were eight segments, whose coherence had to pass 0.8.
+    rng, n = np.random.default_rng(5), 6000
+    u = np.repeat(rng.choice([-0.2, 0.2], n // 20), 20)
+    slow = scipy.signal.butter(1, 2.0, fs=100.0, output="sos")
+    gust = scipy.signal.sosfilt(slow, rng.standard_normal(n))
+    y = scipy.signal.sosfilt(slow, u)
+    y += 0.76 * np.std(y) / np.std(gust) * gust
+    signals = {"u": u[::every], "v": np.zeros(n)[::every]}
+    record = replace(
+        flight(n=n // every), dt=0.01 * every, inputs=signals, outputs={"phi": y[::every]}
+    )
+    [found] = band(record)
+    assert found.severity == "ok"
+    assert found.criterion == "partial coherence with an output, 0.60"

@@ -13,6 +13,9 @@ from heli_jax.numerics.stored import stored
 
 _DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
 """by which the coarse search moves sigma_w"""
+_FINER, _ROUNDS = 0.2, 3
+"""decades between the points of a finer search, and how often it is done: a round reaches 0.4
+decades up and 0.6 down"""
 _TAUS = 3
 """correlation times between a few samples and a part of the record, from which a search that ran
 to an end is begun again; with the decades as many points as the coarse search has"""
@@ -44,6 +47,7 @@ def one_noise_guess(
     noise: Noise,
     z0: Float[Array, " q"],
     names: tuple[str, ...],
+    width: float = 1.0,
 ) -> Float[Array, " q"]:
     """z0 with the named parameters of disturbances moved together, by the same factors of every
     sigma and of every tau, to the greatest likelihood on a coarse grid about it.
@@ -54,6 +58,7 @@ def one_noise_guess(
         noise: of the measurements.
         z0: where the grid has its middle.
         names: of the parameters; those that are no unknowns stay.
+        width: of the grid, in decades between its points.
     """
     # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
     steps = {
@@ -68,11 +73,30 @@ def one_noise_guess(
     grid = grid.reshape(-1, len(used))
     points = np.tile(np.asarray(z0), (grid.shape[0], 1))
     for name, kind in kinds.items():
-        points[:, layout.disturbance_at(name)] += grid[:, used.index(kind)]
+        points[:, layout.disturbance_at(name)] += width * grid[:, used.index(kind)]
     costs = np.asarray(costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
     # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)
+
+
+def finer_noise_guess(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z: of the coarse search.
+    """
+    # As many points as the coarse search has: what was compiled for it serves here too.
+    for _ in range(_ROUNDS):
+        for d in disturbances_of(layout.model):
+            if {d.sigma, d.tau} & set(layout.disturbance):
+                z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau), _FINER)
+    return z
 
 
 def noise_guesses_by_tau(

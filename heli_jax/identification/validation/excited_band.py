@@ -25,8 +25,8 @@ _SEGMENTS = 8
 """half-overlapping segments make an average, two more for every further input"""
 _SHORTEST, _LONGEST = 64, 4096
 """samples of a segment"""
-_MANY, _LONG = 24, 400
-"""segments that are better, where each still has so many samples"""
+_MANY, _LONG, _LASTING = 24, 400, 4.0
+"""segments that are better, where each still has so many samples or lasts for so many seconds"""
 _CHANCE = 0.01
 """probability that any frequency of any input and output without coherence shows more"""
 _WIDTH, _BINS = 0.25, 3
@@ -97,7 +97,9 @@ def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
         return None
     # Many segments where they can be long still, since few show little of a disturbed machine; else
     # as few as make an average.
-    length = _length(sizes, _MANY + more, _LONG) or _length(sizes, _SEGMENTS + more, _SHORTEST)
+    # By seconds too: at 50 Hz a record shows what the same record shows at 100 Hz.
+    least = max(_SHORTEST, min(_LONG, round(_LASTING / dt)))
+    length = _length(sizes, _MANY + more, least) or _length(sizes, _SEGMENTS + more, _SHORTEST)
     if length == 0:
         return None
     long = [p for p in seen.parts if p.n_samples >= length]

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Solution, unpack
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
 """of a noise that nobody stated"""
@@ -42,23 +44,36 @@ def too_good(
     )
 
 
-def guessed_gusts(problem: Problem) -> str:
-    """A sentence where the disturbances' size is the guess that a search begins with; else empty.
+def unstated_gusts(problem: Problem) -> list[str]:
+    """The names of the sizes of disturbances that nobody stated; none without process noise.
 
     Args:
         problem: with its vehicle, where a size may be stated.
     """
     if not estimator_of(problem.method).process_noise:
-        return ""
+        return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]
-    stated = [n for n in sizes if _is_stated(float(getattr(problem.vehicle, n)))]
-    guessed = [n for n in sizes if n not in stated]
+    return [n for n in sizes if not _is_stated(float(getattr(problem.vehicle, n)))]
+
+
+def guessed_gusts(problem: Problem, at: Solution) -> str:
+    """A sentence where the disturbances' size is what the record says at the start values; else
+    empty.
+
+    Args:
+        problem: with its vehicle, where a size may be stated.
+        at: the start values.
+    """
+    guessed = unstated_gusts(problem)
     if not guessed:
         return ""
+    taken = unpack(at.layout, at.data, at.z).noise
+    units = {n: naming.unit(problem.model.Params, n) or "" for n in guessed}
+    sizes = " and ".join(f"{n} of {float(taken[n]):.2g} {units[n]}".rstrip() for n in guessed)
     return (
-        f"Nobody stated {' and '.join(guessed)}: gusts as large as the whole motion are taken, so "
-        "the expected sds are the widest there are. In calm air a fit, which estimates the gusts, "
-        "was 75 times surer; method: output-error shows the other end."
+        f"Nobody stated {' and '.join(guessed)}: the expected sds are for {sizes}, the likeliest "
+        "at the start values, where whatever these do not explain is taken for gusts. A fit "
+        "estimates it; method: output-error shows the other end, no gusts at all."
     )
 
 
