@@ -187,6 +187,20 @@ def test_what_readers_of_logs_say_is_said_once(tmp_path, monkeypatch):
     assert said == ["a.csv: two rows were left out", "b.csv: in ms"]
 
 
+def test_a_page_names_the_studys_command_and_its_point(config, tmp_path, monkeypatch):
+    """Not the worker's, which nobody typed."""
+    asked = "heli-jax fit bench.yaml --over fit.free.Ixx.start=0.02,0.03"
+    monkeypatch.setattr("sys.argv", asked.split())
+    study = read_study(config, (), ["fit.free.Ixx.start=0.02,0.03"])
+    assert study is not None
+    task = studies._tasks(study, reports=True)[1]
+    monkeypatch.setattr("sys.argv", ["/opt/heli_jax/studies/worker.py"])
+    page = fit_point(task).files["report.html"].decode()
+    assert f">{asked}</pre>" in page
+    assert "Of a study the fit at fit.free.Ixx.start = 0.03<" in page
+    assert "worker.py" not in page
+
+
 def test_an_answer_that_is_cut_off_is_none():
     stream = io.BytesIO()
     files = {"fit.json": b"{}\n", "figures/a.png": bytes(range(256))}
