@@ -210,5 +210,7 @@ def main(count: int, folder: Path) -> None:
 if __name__ == "__main__":
     from script import Size, asked
 
-    options = asked(__doc__, "hours", Size("runs", 200, 2, "records"), out="runs/monte-carlo")
+    options = asked(
+        __doc__, "five minutes", Size("runs", 200, 2, "records"), out="runs/monte-carlo"
+    )
     main(options.runs, options.out)

@@ -216,3 +216,7 @@ def problem(
         method="filter-error",
         fixed_noise=() if taus else ("tau_w",),
     )
+
+
+if __name__ == "__main__":
+    print(__doc__, "\nA part of the scripts beside it: by itself it does nothing.")

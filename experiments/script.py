@@ -48,3 +48,7 @@ def asked(doc: str | None, takes: str, *sizes: Size, out: str | None = None) -> 
     where = f"; writes to {options.out}" if out is not None else ""
     print(f"{asked_for or 'one study'}; at full size {takes} on two cores{where}", file=sys.stderr)
     return options
+
+
+if __name__ == "__main__":
+    print(__doc__, "\nA part of the scripts beside it: by itself it does nothing.")

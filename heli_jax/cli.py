@@ -18,6 +18,7 @@ from heli_jax import (
     terminal,
 )
 from heli_jax.errors import InputError
+from heli_jax.interrupts import resumable
 from heli_jax.stages import Note
 
 if TYPE_CHECKING:
@@ -355,14 +356,11 @@ def _sweep(options: argparse.Namespace) -> int:
 
     from heli_jax import config as configuration
     from heli_jax import simulation_output, sweep_workflow
+    from heli_jax.sweeps.store import FINISHED
 
     experiment = configuration.load(config, options.set)
 
-    def interrupted() -> str:
-        kept = f"what is finished is kept: --out {out} --resume goes on"
-        return f"interrupted; {kept if out.exists() else 'nothing was written'}"
-
-    options.interrupts.words = interrupted
+    options.interrupts.words = lambda: resumable(out, FINISHED)
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with (

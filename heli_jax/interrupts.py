@@ -138,6 +138,20 @@ def as_function() -> Iterator[Interrupts]:
         signal.signal(signal.SIGINT, before)
 
 
+def resumable(out: Path, finished: str) -> str:
+    """The sentence of the end of work that --resume goes on with.
+
+    Args:
+        out: its directory.
+        finished: a pattern of files in it, of which there are none before a part is finished.
+    """
+    if not out.exists():
+        return "interrupted; nothing was written"
+    if any(out.glob(finished)):
+        return f"interrupted; what is finished is kept: --out {out} --resume goes on"
+    return f"interrupted; nothing was finished yet: --out {out} --resume begins with the first"
+
+
 def _words(written: tuple[Path, ...]) -> str:
     # The last moments of a command, when its results are there and it prints a summary.
     names = ", ".join(map(str, written))

@@ -13,6 +13,7 @@ import numpy as np
 from heli_jax import cli_options, run_directory
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
+from heli_jax.interrupts import resumable
 from heli_jax.numbers import rounded, terse
 from heli_jax.terminal_table import print_table, tell
 
@@ -56,15 +57,12 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
         say: for words as the work goes on.
     """
     from heli_jax import simulation_output
+    from heli_jax.studies import directory
     from heli_jax.studies import run as studies
 
     out = Path(options.out) if options.out else run_directory.default_directory(study.path)
 
-    def interrupted() -> str:
-        kept = f"what is finished is kept: --out {out} --resume goes on"
-        return f"interrupted; {kept if out.exists() else 'nothing was written'}"
-
-    options.interrupts.words = interrupted
+    options.interrupts.words = lambda: resumable(out, directory.FINISHED)
     # Workers of dask have to be told; our own processes end with this one.
     options.interrupts.unwinds = bool(options.scheduler)
     shown = simulation_output.sweep_progress("study", "fits", quiet=options.quiet)

@@ -182,8 +182,7 @@ def _fit_run(
     if out is not None and _long_intervals(config):
         _keep(FitRun(config, problem, fitted, rls, began=began), out, progress)
     try:
-        with stage("what else was asked for", name="further analyses"):
-            further = _supplementary(config, problem, fitted, progress)
+        further = _supplementary(config, problem, fitted, progress)
     except InputError:
         if out is not None and _long_intervals(config):
             shutil.rmtree(out, ignore_errors=True)
@@ -217,8 +216,9 @@ def _long_intervals(config: Experiment) -> bool:
 def _keep(run: FitRun, out: str | Path, progress: Say) -> None:
     """Write a fit before further intervals are sought, so that an interrupt does not lose it."""
     words = "The further intervals that were asked for are not in it: the run was interrupted."
-    fitted = replace(run.fit, notes=(*run.fit.notes, words))
-    with stage("writing the fit", name="report"):
+    # Its own times: the run's go on.
+    fitted = replace(run.fit, notes=(*run.fit.notes, words), timing=dict(run.fit.timing))
+    with stage("writing the fit", name="report before further intervals"):
         write_report(replace(run, fit=fitted), out)
     progress(f"the fit is in {out}; what else was asked for comes into it")
 
@@ -315,36 +315,37 @@ def _supplementary(
     """Further intervals and model selection, where the configuration asks for them."""
     options = config.config.fit
     assert options is not None
-    methods = options.intervals
+    asked = options.intervals
     further: Intervals | None = None
-    choice = None
+    choice = methods = None
     try:
-        if methods.profile or methods.bootstrap or methods.nuts:
+        if asked.profile or asked.bootstrap or asked.nuts:
             further = intervals(
                 fitted,
-                profiles=methods.profile,
-                runs=methods.bootstrap,
-                draws=methods.nuts,
+                profiles=asked.profile,
+                runs=asked.bootstrap,
+                draws=asked.nuts,
                 seed=options.seed,
                 progress=progress,
             )
     except ValueError as e:
         raise InputError(f"{config.path}: fit: {e}") from e
+    # Each its own stage, as profiles, bootstrap and NUTS are: any of them may be what takes long.
     if options.compare:
-        choice = compare_models(config, problem, progress=progress)
-    return SupplementaryAnalyses(
-        choice, further, methods=_by_methods(config, problem, fitted, progress)
-    )
+        with stage("other models"):
+            choice = compare_models(config, problem, progress=progress)
+    if options.also:
+        with stage("other methods"):
+            methods = _by_methods(config, problem, fitted, progress)
+    return SupplementaryAnalyses(choice, further, methods=methods)
 
 
 def _by_methods(
     config: Experiment, problem: Problem, fitted: Fit, progress: Say
-) -> MethodComparison | None:
-    """The same problem by the methods of `fit.also`; None where there are none."""
+) -> MethodComparison:
+    """The same problem by the methods of `fit.also`."""
     options = config.config.fit
     assert options is not None
-    if not options.also:
-        return None
     return compare_methods(
         fitted,
         configuration.by_other_methods(config, problem),

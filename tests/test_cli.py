@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import cli
+from heli_jax import cli, interrupts
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 
@@ -492,6 +492,18 @@ def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
     assert (out, err) == ("", f"heli-jax: interrupted; {words}\n")
     assert process.returncode == 130
     assert [path.name for path in tmp_path.iterdir()] == (["done.csv"] if done else [])
+
+
+def test_an_interrupt_says_that_something_is_kept_only_where_it_is(tmp_path):
+    out = tmp_path / "study"
+    assert interrupts.resumable(out, "fits/*") == "interrupted; nothing was written"
+    out.mkdir()
+    goes_on = f"--out {out} --resume"
+    said = interrupts.resumable(out, "fits/*")
+    assert said == f"interrupted; nothing was finished yet: {goes_on} begins with the first"
+    (out / "fits" / "0").mkdir(parents=True)
+    said = interrupts.resumable(out, "fits/*")
+    assert said == f"interrupted; what is finished is kept: {goes_on} goes on"
 
 
 def test_an_interrupt_while_the_command_is_imported(tmp_path):

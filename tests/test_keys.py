@@ -40,6 +40,14 @@ def test_the_schema_takes_what_is_shipped(path: Path) -> None:
         ("onboard", {"servos": {"on": ["lat"]}}, True),
         ("onboard", {"servos": [{"on": ["lat"]}], "gyro": {"on": {"ped": "r"}}}, True),
         ("onboard", {"servos": {"on": "lat"}}, False),
+        # What an editor writes for a key that may be left out.
+        ("onboard", {"gyro": {"on": None}, "rate_loop": {"on": None}}, True),
+        ("onboard", {"delays": {"inputs": None}}, False),
+        ("disturbance", {"axis": "roll", "on": None, "sigma_w": None, "tau_w": None}, True),
+        ("fit.start", "equation error", False),
+        ("fit.compare", 1, False),
+        ("flights", [{"log": "a.ulg", "signals": {"preset": "px4-helicopter"}}], True),
+        ("flights", [{"log": "a.ulg", "signals": {"preset": "px4"}}], False),
     ],
 )
 def test_the_schema_and_the_checker_of_configurations_agree(

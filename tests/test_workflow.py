@@ -198,3 +198,17 @@ def test_a_check_for_other_programs(config, capsys):
     np.testing.assert_allclose(list(sd.values()), np.sqrt(np.diag(check.verdict.covariance)))
     assert list(sd) == ["Ixx", "If"]
     assert found["noise_sd"] == {"flight 1/roll": 0.002}
+
+
+def test_the_time_of_a_run_is_told_part_by_part(config):
+    """What takes long is known by its name, and nothing is left out."""
+    asked = {"fit.intervals": {"profile": ["Ixx"]}}
+    out = config.parent / "told"
+    heli_jax.run_fit(heli_jax.load_config(config, asked), out)
+    seconds = json.loads((out / "fit.json").read_text())["timing_s"]
+    kept = {"profile likelihood", "report before further intervals"}
+    assert kept < seconds.keys()
+    assert min(seconds[name] for name in kept) > 0
+    total = seconds.pop("total")
+    del seconds["compilation (of these)"]
+    assert sum(seconds.values()) == pytest.approx(total, rel=0.03)

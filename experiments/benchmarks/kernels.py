@@ -24,3 +24,7 @@ def compiled(source: str, more: tuple[str, ...] = ()) -> Any:
 
 def pointer(a: np.ndarray) -> Any:
     return a.ctypes.data_as(ctypes.c_void_p)
+
+
+if __name__ == "__main__":
+    print(__doc__, "\nA part of the scripts beside it: by itself it does nothing.")

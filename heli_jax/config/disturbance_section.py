@@ -15,7 +15,9 @@ def _has_unit(value: Any) -> bool:
 
 def _size_choice(value: Any) -> Any:
     """One number above zero, or one for each of several disturbances by name; in SI, or as {value,
-    unit}."""
+    unit}; None as if it were left out."""
+    if value is None:
+        return None
     if isinstance(value, dict) and not _has_unit(value):
         return {str(k): _size(v) for k, v in value.items()}
     return _size(value)
@@ -39,6 +41,8 @@ def _plain(value: Any) -> str:
 
 
 def _on_choice(value: Any) -> Any:
+    if value is None:
+        return None
     names = [value] if isinstance(value, str) else value
     if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
         raise ValueError(f"expected a state, or a list of them such as [p, q], got {value!r:.60}")
@@ -61,7 +65,9 @@ class DisturbanceConfig(Section):
     axis: str | None = None
     """one of the model's axes: roll, pitch, yaw, heave, ..."""
     # Any, since the validators before it have said what it may be, here and below.
-    on: Annotated[Any, BeforeValidator(_on_choice, json_schema_input_type=str | list[str])] = None
+    on: Annotated[
+        Any, BeforeValidator(_on_choice, json_schema_input_type=str | list[str] | None)
+    ] = None
     """states or axes, each with a disturbance of its own"""
     # Two poles for a push that is smoother than a lag of white noise; both have the same time
     # constant.

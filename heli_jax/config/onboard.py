@@ -34,6 +34,11 @@ def _names_or_pairs(value: object) -> object:
     )
 
 
+def _chosen(value: object) -> object:
+    # An editor writes null for what may be left out.
+    return None if value is None else _names_or_pairs(value)
+
+
 def _one_or_several(value: object) -> object:
     # One kind of servo is the usual case and needs no list.
     return [value] if isinstance(value, dict) else value
@@ -43,8 +48,10 @@ def _one_or_several(value: object) -> object:
 # What an editor is told of it is the type beside the validator.
 Names = Annotated[Any, BeforeValidator(_names, json_schema_input_type=list[str])]
 NamesOrPairs = Annotated[
-    Any,
-    BeforeValidator(_names_or_pairs, json_schema_input_type=list[str] | dict[str, str] | None),
+    Any, BeforeValidator(_names_or_pairs, json_schema_input_type=list[str] | dict[str, str])
+]
+Chosen = Annotated[
+    Any, BeforeValidator(_chosen, json_schema_input_type=list[str] | dict[str, str] | None)
 ]
 # The most states that `with_delays` takes: refused here, where the key has a place.
 Order = Annotated[int, Field(ge=1, le=8)]
@@ -68,7 +75,7 @@ class ServosConfig(Section):
 class RateLoopConfig(Section):
     """A flybarless unit (`with_rate_loop`)."""
 
-    on: NamesOrPairs = None
+    on: Chosen = None
     """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
     integral: StrictBool = True
     """whether it has the term Ki"""
@@ -81,7 +88,7 @@ class RateLoopConfig(Section):
 class GyroConfig(Section):
     """A gyro on the tail (`with_gyro`)."""
 
-    on: NamesOrPairs = None
+    on: Chosen = None
     """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
     heading_hold: StrictBool = True
     """whether the pedal commands a rate that is held; otherwise it damps alone"""

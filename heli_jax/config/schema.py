@@ -263,10 +263,13 @@ class ShootingConfig(Section):
     range; null: free"""
 
 
+StartMethod = Literal["given", "equation-error", "frequency-error"]
+
+
 class StartMethodConfig(Section):
     """Where the starts of the free parameters come from."""
 
-    method: Literal["given", "equation-error", "frequency-error"] = "given"
+    method: StartMethod = "given"
     """equation-error: by regression of the records themselves, for linear models; frequency-error:
     by a fit in frequency, from the starts that are given"""
     stepwise: bool = False
@@ -307,7 +310,7 @@ class FitConfig(Section):
     """what is estimated, by the names of the model"""
     start: Annotated[
         StartMethodConfig,
-        BeforeValidator(_start_method, json_schema_input_type=str | StartMethodConfig),
+        BeforeValidator(_start_method, json_schema_input_type=StartMethod | StartMethodConfig),
     ] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
     # Any, since the validator before it has said what it may be.

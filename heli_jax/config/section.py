@@ -23,6 +23,9 @@ class Section(BaseModel):
         for written, number in _numbers(value, made):
             if isinstance(written, bool) and number is not written:
                 raise ValueError(f"expected a number, got {str(written).lower()}")
+            # And a 1 is no true there.
+            if isinstance(number, bool) and not isinstance(written, bool | str):
+                raise ValueError(f"expected true or false, got {written}")
             if isinstance(written, str):
                 kind = "true or false" if isinstance(number, bool) else "a number"
                 raise ValueError(f"expected {kind} without quotes, got the text {written!r:.60}")

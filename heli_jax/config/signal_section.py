@@ -8,7 +8,7 @@ from heli_jax.config.section import Section
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.origins import scale_problem
-from heli_jax.flights.preset import preset
+from heli_jax.flights.preset import preset, presets
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -122,10 +122,16 @@ class CcpmConfig(Section):
         )
 
 
+def _of_those_that_ship(schema: dict[str, Any]) -> None:
+    """Names the presets in the JSON schema, for editors to offer."""
+    text = next(option for option in schema["anyOf"] if option["type"] == "string")
+    text["enum"] = list(presets())
+
+
 class PresetConfig(Section):
     """What of the signals comes from a table or from a geometry (docs/logs.md)."""
 
-    preset: str | None = None
+    preset: Annotated[str | None, Field(json_schema_extra=_of_those_that_ship)] = None
     """the table of an autopilot; what `inputs` and `outputs` name goes before it"""
     preset_outputs: list[str] | None = None
     """the outputs to take from it; all that it can supply unless given"""

@@ -1,7 +1,10 @@
 """What made a page: the command, when, and the configuration; and the files beside the page."""
 
+import contextlib
 import shlex
 import sys
+from collections.abc import Iterator
+from contextvars import ContextVar
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +20,32 @@ class Origin(NamedTuple):
     """the configuration in full, as YAML"""
     files: tuple[str, ...] = ()
     """beside the page, by their names relative to it"""
+    point: str = ""
+    """of a study's fit: the keys of the study with their values here"""
+
+
+_asker: ContextVar[tuple[str, str] | None] = ContextVar("heli_jax_asker", default=None)
+"""the command and the point of a study, where this process works for another"""
+
+
+@contextlib.contextmanager
+def made_for(command: str, point: str) -> Iterator[None]:
+    """What is made meanwhile was asked for by another process.
+
+    Args:
+        command: what was typed there, as of `command`.
+        point: as of `Origin`.
+    """
+    token = _asker.set((command, point))
+    try:
+        yield
+    finally:
+        _asker.reset(token)
+
+
+def command() -> str:
+    """What was typed to start this process, as a shell would take it."""
+    return _command(sys.argv)
 
 
 def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
@@ -27,7 +56,8 @@ def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
         files: beside the page, by their names relative to it.
     """
     now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-    return Origin(_command(sys.argv), now, config, files)
+    typed, point = _asker.get() or (command(), "")
+    return Origin(typed, now, config, files, point)
 
 
 def _command(words: list[str]) -> str:

@@ -15,6 +15,9 @@ from heli_jax.sweeps.description import differences
 from heli_jax.yaml_file import as_yaml
 
 FITS = "fits"
+# Without what is being written, whose name begins with a dot.
+FINISHED = f"{FITS}/[!.]*/fit.json"
+"""what there is of every fit that is finished"""
 _DESCRIPTION = "study.json"
 _LONGEST_NAME = 80
 _LIMIT_BYTES = 1_000_000_000

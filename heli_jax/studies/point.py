@@ -27,6 +27,8 @@ class Task(NamedTuple):
     """by key of the study its value here"""
     reports: bool = False
     """whether the page and its figures are made, which takes seconds"""
+    command: str = ""
+    """by which the study was asked for: a worker has another of its own"""
 
 
 class Outcome(NamedTuple):
@@ -74,9 +76,13 @@ def _fitted(task: Task) -> Outcome:
     # Here, since the process that asks and writes needs neither.
     from heli_jax import workflow
     from heli_jax.config.experiment import from_content
+    from heli_jax.report.origin import made_for
 
     run = workflow.run_fit(from_content(task.content, Path(task.path)))
-    with tempfile.TemporaryDirectory(prefix="heli_jax-study-") as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="heli_jax-study-") as folder,
+        made_for(task.command, _in_words(task.point)),
+    ):
         place = Path(folder) / "fit"
         if task.reports:
             workflow.write_report(run, place)
@@ -88,6 +94,12 @@ def _fitted(task: Task) -> Outcome:
             if file.is_file()
         }
     return Outcome(files, notes=tuple(workflow.log_notes(run.problem)))
+
+
+def _in_words(point: dict[str, Any]) -> str:
+    """Keys and values, as the Dataset's axes have them."""
+    texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in point.items()}
+    return ", ".join(f"{key} = {text}" for key, text in texts.items())
 
 
 # Any: a FitRun, whose module takes a second to import.

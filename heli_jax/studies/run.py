@@ -15,6 +15,7 @@ from heli_jax.config.experiment import from_content
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
 from heli_jax.numerics.cores import cores
+from heli_jax.report.origin import command
 from heli_jax.stages import Note
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
@@ -130,7 +131,7 @@ def _tasks(study: Study, reports: bool) -> list[Task]:
         except InputError as e:
             at = ", ".join(f"{key} = {value!r:.60}" for key, value in point.items())
             raise InputError(f"{e} (study, at {at})") from e
-        tasks.append(Task(path, study.content_at(point), point, reports))
+        tasks.append(Task(path, study.content_at(point), point, reports, command()))
     return tasks
 
 

@@ -25,6 +25,8 @@ from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
+FINISHED = "sweep.zarr/status/c/*"
+"""what there is in a sweep's directory of every chunk that is finished"""
 # What stands where nothing was written: not a number, and for the status (unsigned) 'not run', by
 # which an unfinished chunk is known. Seeds (signed) are written before it and need no such
 # mark.

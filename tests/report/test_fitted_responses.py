@@ -9,6 +9,7 @@ from heli_jax.analysis.flight_responses import Settings
 from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import frequency
 from heli_jax.report.drawings import Analysis, drawings
+from heli_jax.report.figures.match import match
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import fitted_responses
 from heli_jax.report.html import render
@@ -70,6 +71,19 @@ def test_they_are_drawn_told_and_written(sound, shown):
     (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]
     model, data = (content[s]["numbers"]["phase_bandwidth"] for s in ("model", "data"))
     assert data["lower95"] < model["value"] < data["upper95"]
+
+
+def test_bins_without_coherence_make_no_room_for_themselves(shown):
+    """Above a sweep's last frequency the gain is that of the noise over a stick at rest."""
+    (pair,) = shown.pairs
+    limits = [match(each, "dB", "")[0].get_ylim() for each in (pair, _with_noise(pair))]
+    assert np.max(np.abs(np.subtract(*limits))) < 6.0
+
+
+def _with_noise(pair):
+    H, coherence, sd = (np.array(each) for each in (pair.H, pair.coherence, pair.sd))
+    H[-3:], coherence[-3:], sd[-3:] = 1e6 * np.nanmax(np.abs(H)), 0.2, 1.0
+    return pair._replace(H=H, coherence=coherence, sd=sd)
 
 
 def test_flights_that_are_too_short_say_so(sound):

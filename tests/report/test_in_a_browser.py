@@ -1,5 +1,6 @@
 """The pages in a real browser: console, zoom, hover, keyboard, narrow screens, printing."""
 
+import csv
 import json
 import re
 import zlib
@@ -171,9 +172,9 @@ def test_charts_answer_to_keys(window, report):
 
 def test_tables_copy_as_csv_and_latex(window, report):
     window.open(report)
-    csv = window.value("heliTables.csv(document.querySelector('table'))")
-    assert csv.startswith("parameter,estimate,sd,")
-    assert re.search(r"^If,1\.\d+e-4,", csv, flags=re.M)
+    copied = window.value("heliTables.csv(document.querySelector('table'))")
+    assert copied.startswith("parameter,estimate,sd,")
+    assert re.search(r"^If,1\.\d+e-4,", copied, flags=re.M)
     tex = window.value("heliTables.tex(document.querySelector('table'))")
     assert r"\begin{tabular}{lrr" in tex
     assert r"$\cdot 10^{-4}$" in tex
@@ -186,6 +187,31 @@ def test_tables_copy_as_csv_and_latex(window, report):
     window.value("document.querySelector('.copy button').click()")
     window.until("document.querySelector('.copy textarea')?.value.startsWith('parameter')")
     assert not window.problems
+
+
+def test_a_copied_table_is_numbers_to_a_spreadsheet(window, report):
+    window.open(report)
+    first = window.value("heliTables.csv(document.querySelector('table'))")
+    [estimate, *_] = csv.DictReader(first.splitlines())
+    texts = {"parameter", "unit", "at bound"}
+    numbers = {k: float(v) for k, v in estimate.items() if k not in texts and v}
+    interval = [numbers[k] for k in numbers if k.endswith((", from", ", to"))]
+    assert interval[0] < numbers["estimate"] < interval[1]
+    part = numbers["sd"] / numbers["estimate"]
+    assert numbers["sd / value [%]"] == pytest.approx(100 * part, rel=0.1)
+    table = """
+        <thead><tr><th><th>fit<th>a<th>rmse<th>mixed<tbody>
+        <tr><th>x<td>−1.2·10⁻³ ± 0.1·10⁻³<td>6 (5 to 7), 1 Hz<td>8.7 deg<td>1 of 2
+        <tr><th>y<td>not determined<td>–<td>2 m/s<td>3"""
+    of_others = window.value(
+        "heliTables.csv(Object.assign(document.createElement('table'), "
+        f"{{ innerHTML: `{table}` }}))"
+    )
+    assert list(csv.reader(of_others.splitlines())) == [
+        ["", "fit", "fit, sd", "a", "a, from", "a, to", "a, also", "rmse", "rmse, unit", "mixed"],
+        ["x", "-1.2e-3", "0.1e-3", "6", "5", "7", "1 Hz", "8.7", "deg", "1 of 2"],
+        ["y", "not determined", "", "", "", "", "", "2", "m/s", "3"],
+    ]
 
 
 def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):

@@ -13,6 +13,7 @@ import yaml
 from heli_jax import cli, load_fit, run_study
 from heli_jax.config.study import read_study
 from heli_jax.errors import InputError
+from heli_jax.studies import directory
 from heli_jax.studies import run as studies
 from heli_jax.studies.point import Outcome, fit_point
 from heli_jax.studies.worker import read_outcome, write_outcome
@@ -82,6 +83,7 @@ def test_interrupted_and_resumed_it_is_the_same_dataset(config, tmp_path, monkey
 
     def kill(progress):
         if progress.done == 2:
+            assert len(list(killed.glob(directory.FINISHED))) == 2
             raise Killed
 
     with pytest.raises(Killed):
@@ -185,6 +187,20 @@ def test_what_readers_of_logs_say_is_said_once(tmp_path, monkeypatch):
     said = []
     studies._compute([None] * 2, [tmp_path / "0", tmp_path / "1"], studies.Options(say=said.append))
     assert said == ["a.csv: two rows were left out", "b.csv: in ms"]
+
+
+def test_a_page_names_the_studys_command_and_its_point(config, tmp_path, monkeypatch):
+    """Not the worker's, which nobody typed."""
+    asked = "heli-jax fit bench.yaml --over fit.free.Ixx.start=0.02,0.03"
+    monkeypatch.setattr("sys.argv", asked.split())
+    study = read_study(config, (), ["fit.free.Ixx.start=0.02,0.03"])
+    assert study is not None
+    task = studies._tasks(study, reports=True)[1]
+    monkeypatch.setattr("sys.argv", ["/opt/heli_jax/studies/worker.py"])
+    page = fit_point(task).files["report.html"].decode()
+    assert f">{asked}</pre>" in page
+    assert "Of a study the fit at fit.free.Ixx.start = 0.03<" in page
+    assert "worker.py" not in page
 
 
 def test_an_answer_that_is_cut_off_is_none():

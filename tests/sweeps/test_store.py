@@ -68,6 +68,8 @@ def test_xarray_reads_the_store_by_itself(whole):
     assert json.loads(found.attrs["description"])["design"]["n"] == 300
     np.testing.assert_array_equal(found["a"], DESIGN.values(0, 300)["a"])
     assert not found["status"].any()
+    # By which an interrupt knows whether anything is kept.
+    assert len(list(whole.glob(stores.FINISHED))) == 10
     assert np.isfinite(found["rms"]).all()
 
 

@@ -9,7 +9,33 @@
   const ascii = text => text
     .replace(/·10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)/g, (_, power) => "e" + plain(power)).replace(/−(?=[\d.])/g, "-");
 
-  const csv = table => rows(table).map(r => r.map(ascii).map(quoted).join(",")).join("\n") + "\n";
+  // A spreadsheet counts with cells that are numbers and nothing else: what a cell has beside its
+  // number gets a column of its own, by the names behind the column's.
+  const NUMBER = "([+-]?(?:\\d[\\d.]*(?:e-?\\d+)?|∞))", PLAIN = new RegExp(`^${NUMBER}$`);
+  const FORMS = [["N"], ["N %", " [%]"], ["N to N", ", from", ", to"], ["N ± N", "", ", sd"],
+    ["N \\(N to N\\)(?:, (.*))?", "", ", from", ", to", ", also"], ["N ([^\\d(]+)", "", ", unit"]]
+    .map(([form, ...names]) => ({ form: new RegExp(`^${form.replaceAll("N", NUMBER)}$`), names }));
+  // Without a second number a plain one may stand among them: it has no sd, or no unit.
+  const alone = names => names.length > 1 && names[0] === "";
+
+  function parts(head, cells) {
+    const numbers = cells.filter(c => /\d/.test(c));
+    const is = ({ form, names }) => numbers.every(c => form.test(c) || (alone(names) && PLAIN.test(c)));
+    const found = numbers.length ? FORMS.find(is) : undefined;
+    if (!found || !found.names.length) return [[head, ...cells]];
+    return found.names.map((name, i) => [head + name,
+      ...cells.map(c => found.form.exec(c)?.[i + 1] ?? (i ? "" : c))]);
+  }
+
+  function csv(table) {
+    let all = rows(table).map(r => r.map(ascii).map(c => c === "–" ? "" : c));
+    if (table.tHead) {
+      const [first, ...others] = all[0].map((_, k) => all.map(r => r[k]));
+      const columns = [first, ...others.flatMap(([head, ...cells]) => parts(head, cells))];
+      all = all.map((_, i) => columns.map(column => column[i]));
+    }
+    return all.map(r => r.map(quoted).join(",")).join("\n") + "\n";
+  }
   const quoted = text => /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 
   const LATEX = { "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "_": "\\_", "%": "\\%", "&": "\\&",

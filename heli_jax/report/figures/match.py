@@ -21,6 +21,8 @@ _DB = 20.0 / np.log(10.0)
 _Z95 = 1.959963984540054
 _WIDE = 0.5
 """relative random error past which a bin says little, and is not drawn"""
+_FEW = 3
+"""bins with coherence below which all of them make the axes' limits"""
 _GAINS, _PHASES = 12.0, 90.0
 """[dB], [deg] that the panels of the error show at most to either side"""
 
@@ -89,9 +91,13 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
     _bars(axes[0], w, gain, relative, _DATA)
     reach = np.degrees(np.minimum(relative, np.pi))
     axes[1].errorbar(w, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
+    # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
+    # where there is room, and makes none.
+    rule = pair.coherence[known] >= COHERENT
+    rule = rule if np.count_nonzero(rule) >= _FEW else np.ones_like(rule)
     if w.size:
-        axes[0].set_ylim(np.min(gain) - 6.0, np.max(gain) + 6.0)
-        axes[1].set_ylim(np.min(angle) - 45.0, np.max(angle) + 45.0)
+        axes[0].set_ylim(np.min(gain[rule]) - 6.0, np.max(gain[rule]) + 6.0)
+        axes[1].set_ylim(np.min(angle[rule]) - 45.0, np.max(angle[rule]) + 45.0)
 
 
 _DATA = "data, 95 % intervals"
