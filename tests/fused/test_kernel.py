@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.kernel import Kernel
 from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.traced import traced
+from heli_jax.simulation.accumulate import Steps
 
 LANES, N = 8, 5
 RECORD = np.array([0.3, -0.7, 1.1, 0.2, -0.4])
@@ -530,6 +532,18 @@ def test_what_is_unforeseen_is_named_with_its_line():
             compiled(step, [np.ones(LANES), 1.0], np.ones(LANES))
         assert f"the operation {name}" in str(refused.value)
         assert "(at test_kernel.py:" in str(refused.value)
+
+
+def test_a_key_of_random_numbers_is_named_with_its_line():
+    def making(shared, records, element):
+        def step(carry, k):
+            key = jax.random.key(0)
+            return carry + jax.random.uniform(jax.random.fold_in(key, k))
+
+        return Steps(element, 3, step, lambda carry: carry)
+
+    with pytest.raises(UnsupportedError, match=r"random_seed, .* \(at test_kernel\.py:\d+\)"):
+        traced(making, (), np.zeros(4), np.zeros(()))
 
 
 def _never(_):
