@@ -36,9 +36,13 @@ def translating() -> Iterator[None]:
     except (UnsupportedError, CudaError):
         raise
     except Exception as e:
-        said = " ".join(str(e).split())
-        words = f"this model, whose translation failed ({type(e).__name__}: {said[:200]})"
-        raise UnsupportedError(words) from e
+        raise UnsupportedError(f"this model, whose translation failed ({said(e)})") from e
+
+
+def said(error: Exception) -> str:
+    """What an error says, in one line."""
+    words = " ".join(str(error).split())
+    return f"{type(error).__name__}: {words[:200]}"
 
 
 class Value(NamedTuple):

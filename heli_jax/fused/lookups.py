@@ -15,7 +15,7 @@ from heli_jax.fused.operands import (
     elements,
     scalar,
 )
-from heli_jax.fused.operations import OPERATIONS, converted
+from heli_jax.fused.operations import OPERATIONS, converted, within
 
 _SORTED = 16
 """elements that are sorted at most: more than a hundred exchanges"""
@@ -45,12 +45,10 @@ def gathered(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
         full: list[Any] = [None] * len(table.shape)
         inside = None
         for axis, index in zip(axes, indices, strict=True):
-            most = table.shape[axis] - 1
-            low, high = constant(0, index.dtype), constant(most, index.dtype)
-            within = OPERATIONS["clamp"](code, low, index, high)
-            same = code.compare("icmp eq", within, index)
+            place = within(code, index, table.shape[axis] - 1)
+            same = code.compare("icmp eq", place, index)
             inside = same if inside is None else code.operation("and", inside, same)
-            full[axis] = converted(code, within, new_dtype=INDEX)
+            full[axis] = converted(code, place, new_dtype=INDEX)
         for d, k in of_rest.items():
             full[k] = constant(at[d], INDEX)
         value = at_place(code, table, tuple(full))

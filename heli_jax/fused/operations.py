@@ -334,3 +334,22 @@ OPERATIONS: dict[str, Operation] = {
     "convert_element_type": converted,
 }
 """by the primitive's name; numbers of equal shape, element by element"""
+
+
+def within(code: Code, index: Value, most: int) -> Value:
+    """An index between 0 and the most, whatever it was."""
+    # A short type may not have the most; then none of its numbers is beyond.
+    high = min(most, int(np.iinfo(index.dtype).max))
+    return _clamped(code, constant(0, index.dtype), index, constant(high, index.dtype))
+
+
+def in_type(code: Code, values: np.ndarray[Any, Any], dtype: Any) -> np.ndarray[Any, Any]:
+    """An array of Values in another type; as they are where it is None."""
+    if dtype is None:
+        return values
+    result = np.empty(values.shape, object)
+    for at in np.ndindex(values.shape):
+        # Any: an element, of which NumPy's types make an array as well.
+        value: Any = values[at]
+        result[at] = converted(code, value, new_dtype=dtype)
+    return result

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.convolutions import convolved
 from heli_jax.fused.lookups import gathered, padded, searched
 from heli_jax.fused.operands import (
     INDEX,
@@ -20,7 +21,8 @@ from heli_jax.fused.operands import (
     elements,
     scalar,
 )
-from heli_jax.fused.operations import OPERATIONS, converted
+from heli_jax.fused.operations import OPERATIONS, converted, in_type, within
+from heli_jax.fused.writes import updated
 
 
 def _moved(
@@ -59,11 +61,9 @@ def _taken(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand
     sizes = params["slice_sizes"]
     indices = []
     for start, size, length in zip(starts, sizes, operand.shape, strict=True):
-        start = converted(code, start, new_dtype=INDEX)
-        # Within the array whatever is asked for, as JAX has it.
-        indices.append(
-            OPERATIONS["clamp"](code, constant(0, INDEX), start, constant(length - size, INDEX))
-        )
+        # Within the array whatever is asked for, as JAX has it; in its own type first, of which
+        # the largest numbers, made of what is infinite, are others in a shorter one.
+        indices.append(converted(code, within(code, start, length - size), new_dtype=INDEX))
     if isinstance(operand, Stored):
         return _moved(
             operand,
@@ -209,56 +209,10 @@ def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]]
     return made
 
 
-def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
-    """scatter, of windows of length one along the axes that are indexed: `.at[i, j].set(v)`."""
-
-    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-        result, where, new = (elements(code, v) for v in inputs)
-        numbers = params["dimension_numbers"]
-        axes = tuple(numbers.scatter_dims_to_operand_dims)
-        if set(axes) != set(numbers.inserted_window_dims) or numbers.operand_batching_dims:
-            raise UnsupportedError("windows of an array that are written at computed places")
-        batch, windows = where.shape[:-1], set(numbers.update_window_dims)
-        of_batch = [d for d in range(new.ndim) if d not in windows]
-        # One place after the other: what stands twice is added twice.
-        new = np.moveaxis(new, of_batch, range(len(batch)))
-        for at in np.ndindex(batch):
-            places = list(zip(where[at], axes, strict=True))
-            if "CLIP" in str(params["mode"]):
-                places = [(_within(code, i, result.shape[axis] - 1), axis) for i, axis in places]
-            result = _put_one(code, operation, result, places, new[at])
-        return result
-
-    return made
-
-
-def _within(code: Code, index: Value, most: int) -> Value:
-    low, high = constant(0, index.dtype), constant(most, index.dtype)
-    return OPERATIONS["clamp"](code, low, index, high)
-
-
-def _put_one(
-    code: Code, operation: str | None, old: Elements, places: list[tuple[Value, int]], new: Any
-) -> Elements:
-    """With a window written; nowhere if it is beyond the array."""
-    result, axes = np.empty(old.shape, object), [axis for _, axis in places]
-    for at in np.ndindex(old.shape):
-        # Any: an element, of which NumPy's types make an array as well.
-        before: Any = old[at]
-        window = tuple(i for d, i in enumerate(at) if d not in axes)
-        value: Any = new[window] if isinstance(new, np.ndarray) else new
-        if operation is not None:
-            value = OPERATIONS[operation](code, before, value)
-        for index, axis in places:
-            here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
-            value = code.choose(here, value, before)
-        result[at] = value
-    return result
-
-
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
-    a, b = (elements(code, v) for v in inputs)
+    dtype = params.get("preferred_element_type")
+    a, b = (in_type(code, elements(code, v), dtype) for v in inputs)
     (of_a, of_b), (batch_a, _) = params["dimension_numbers"]
     if batch_a:
         return _products(code, a, b, params)
@@ -318,10 +272,10 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "reduce_prod": _reduction("mul"),
     "reduce_and": _reduction("and"),
     "reduce_or": _reduction("or"),
+    "reduce_xor": _reduction("xor"),
     "dot_general": _product,
-    "scatter": _put(None),
-    "scatter-add": _put("add"),
-    "scatter_add": _put("add"),
+    "dynamic_update_slice": updated,
+    "conv_general_dilated": convolved,
     "cumsum": _running("add"),
     "cumprod": _running("mul"),
     "cummax": _running("max"),

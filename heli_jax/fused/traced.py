@@ -4,10 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
+from heli_jax.fused.place import place_of
 from heli_jax.fused.program import Argument, Run
 from heli_jax.numerics.hoist import hoisted
 
@@ -104,6 +106,7 @@ def traced(
 
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
     carried, stay = (jax.tree.leaves(part) for part in shape)
+    _check_numbers(closed.jaxpr, [*carried, *stay])
     rows = [np.asarray(v) for v in jax.tree.leaves(records)]
     own_records = [False] * len(rows) if own_records is None else list(own_records)
     n_shared = len(jax.tree.leaves(shared))
@@ -125,6 +128,19 @@ def traced(
         parts["steps"],
     )
     return Traced(run, parts["results"], closed)
+
+
+def _check_numbers(jaxpr: Any, results: Sequence[Any]) -> None:
+    """Refuse what is no number, such as a key of random ones, with the line that makes it."""
+    made = {v: equation for equation in jaxpr.eqns for v in equation.outvars}
+    for variable, result in zip(jaxpr.outvars, results, strict=True):
+        if not jnp.issubdtype(result.dtype, jax.dtypes.extended):
+            continue
+        equation = None if hasattr(variable, "val") else made.get(variable)
+        name = "random_seed" if equation is None else equation.primitive.name
+        error = UnsupportedError(f"the operation {name}, whose key is no number")
+        error.place = None if equation is None else place_of(equation)
+        raise error
 
 
 def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:

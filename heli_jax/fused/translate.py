@@ -4,14 +4,16 @@ Small arrays are taken apart into their elements; long ones, such as the inputs 
 memory, and what is computed of them is computed of the elements that are asked for.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.code import Code, UnsupportedError, Value, constant, said
 from heli_jax.fused.lookups import in_order
 from heli_jax.fused.loops import loop
 from heli_jax.fused.operands import (
@@ -28,6 +30,7 @@ from heli_jax.fused.operands import (
 from heli_jax.fused.operations import OPERATIONS
 from heli_jax.fused.place import place_of
 from heli_jax.fused.shapes import SHAPED
+from heli_jax.fused.writes import COMBINED, Combined, scattered
 
 _UNROLLED = 16
 """Passes of a loop that are written out where it cannot stay a loop."""
@@ -38,6 +41,7 @@ _NESTED = {
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
     "core_call": "call_jaxpr",
+    "eval_jaxpr": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
     "remat": "jaxpr",
@@ -63,7 +67,7 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
     """
     known: dict[Any, Operand] = {}
     for variable, value in zip(jaxpr.constvars, consts, strict=True):
-        known[variable] = value if isinstance(value, Stored) else np.asarray(value)
+        known[variable] = value if isinstance(value, Stored) else _at_hand(value)
     known |= dict(zip(jaxpr.invars, operands, strict=True))
 
     def read(atom: Any) -> Operand:
@@ -76,16 +80,44 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
         except UnsupportedError as e:
             e.place = e.place or place_of(equation)
             raise
+        except Exception as e:
+            # However unforeseen: said with the line of the model where it lies.
+            error = UnsupportedError(f"the operation {_named(equation)[0]} here ({said(e)})")
+            error.place = place_of(equation)
+            raise error from e
         known |= dict(zip(equation.outvars, outputs, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]:
+def _at_hand(value: Any) -> Any:
+    """What is known now, as NumPy has it; keys of random numbers are JAX's alone."""
+    if jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended):
+        return value
+    return np.asarray(value)
+
+
+def _named(equation: Any) -> tuple[str, dict[str, Any]]:
+    """An operation's name and its parameters."""
     name, params = equation.primitive.name, equation.params
-    if "_prim" in params:
-        # Such as jnp.searchsorted, of which the primitive is the same for all.
-        of = params["_prim"]
-        name, params = type(of).__name__, {**getattr(of, "params", {}), **params}
+    if "_prim" not in params:
+        return name, params
+    # Such as jnp.searchsorted, of which the primitive is the same for all.
+    of = params["_prim"]
+    return type(of).__name__, {**getattr(of, "params", {}), **params}
+
+
+def _made_of(of: Any, equation: Any) -> Any:
+    """The jaxpr of the operations that JAX makes one of its own of, such as jnp.ldexp."""
+    arguments = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+
+    def expanded(*flat: Any) -> Any:
+        return jax.tree.leaves(of.expand(*jax.tree.unflatten(of.in_tree, flat)))
+
+    return jax.make_jaxpr(expanded)(*arguments)
+
+
+def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]:
+    name, params = _named(equation)
     if name in _NESTED:
         inner = params[_NESTED[name]]
         closed = hasattr(inner, "consts")
@@ -100,13 +132,16 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         return _while(code, params, inputs)
     if name == "cond":
         return _branches(code, params, inputs)
+    if "callback" in name:
+        # Not even where all is known: Python would be called for a branch that nobody takes.
+        raise UnsupportedError(f"the operation {name}")
     known = not any(isinstance(v, Stored) or v.dtype == object for v in inputs)
     if known and not (name in OPERATIONS and all(v.shape == () for v in inputs)):
         # Known now: JAX itself computes it, whatever it is; single numbers LLVM folds as well.
         with jax.ensure_compile_time_eval():
             results = equation.primitive.bind(*inputs, **params)
         results = results if equation.primitive.multiple_results else [results]
-        return [np.asarray(r) for r in results]
+        return [_at_hand(r) for r in results]
     if name in OPERATIONS:
         dtype = np.dtype(equation.outvars[0].aval.dtype)
         return [_elementwise(code, name, params, inputs, dtype)]
@@ -118,9 +153,29 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
     if name == "unstack":
         rows = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
         return [rows[k, ...] for k in range(len(rows))]
+    if name in COMBINED:
+        return [scattered(code, inputs, params, _combined(name, params))]
     if name in SHAPED:
         return [SHAPED[name](code, inputs, params)]
+    if hasattr(params.get("_prim"), "expand"):
+        made_of = _made_of(params["_prim"], equation)
+        return translate(code, made_of.jaxpr, made_of.consts, inputs)
     raise UnsupportedError(f"the operation {name}")
+
+
+def _combined(name: str, params: dict[str, Any]) -> Combined:
+    """How what is written into an array is joined with what stands there."""
+    function, consts = params.get("update_jaxpr"), params.get("update_consts", ())
+    if name != "scatter" or function is None:
+        return COMBINED[name]
+
+    # `.at[i].apply(f)`: what is given to be written does not count.
+    def applied(code: Code, old: Value, new: Value) -> Value:
+        operands = [_filled(v, np.empty(())) for v in (old, new)]
+        (made,) = translate(code, function, consts, operands)
+        return scalar(code, made)
+
+    return applied
 
 
 def _elementwise(
@@ -262,32 +317,41 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
     of_test, of_body = inputs[:n_test], inputs[n_test : n_test + n_body]
     carry, body, test = inputs[n_test + n_body :], params["body_jaxpr"], params["cond_jaxpr"]
 
-    def holds(carried: list[Operand]) -> Value:
+    def holds(carried: list[Operand]) -> Elements:
         (going,) = translate(code, test.jaxpr, test.consts, [*of_test, *carried])
-        return scalar(code, going)
+        return elements(code, going)
+
+    def some(carried: list[Operand]) -> Value:
+        # Of vmap the loop has an answer for each of what it maps over.
+        each = [code.any(v) for v in holds(carried).ravel()]
+        return functools.reduce(lambda a, b: code.operation("or", a, b), each)
 
     def once(_: Value, carried: list[Operand]) -> list[Operand]:
         going = holds(carried)
         new = translate(code, body.jaxpr, body.consts, [*of_body, *carried])
-        return new if going.shared else _where(code, going, new, carried)
+        together = going.shape == () and going.item().shared
+        return new if together else _where(code, going, new, carried)
 
     # Entered at least once, as all loops here: what it then carries is not taken if it should not
     # have been.
-    entered = code.any(holds(carry))
+    entered = some(carry)
     if code.taken is not None:
         entered = code.operation("and", entered, code.taken)
     results = loop(
         code,
         # Never again where it should not have been entered: such a loop may have no end.
-        lambda carried: code.operation("and", entered, code.any(holds(carried))),
+        lambda carried: code.operation("and", entered, some(carried)),
         carry,
         once,
     )
-    return _where(code, entered, results, carry)
+    return _where(code, _filled(entered, np.empty(())), results, carry)
 
 
-def _where(code: Code, which: Value, yes: list[Operand], no: list[Operand]) -> list[Operand]:
-    return [
-        _elementwise(code, "select_n", {}, [_filled(which, new), old, new], dtype_of(old))
-        for old, new in zip(no, yes, strict=True)
-    ]
+def _where(code: Code, which: Elements, yes: list[Operand], no: list[Operand]) -> list[Operand]:
+    """One of two, by truth values of the first axes."""
+    results = []
+    for old, new in zip(no, yes, strict=True):
+        rest = (1,) * (len(new.shape) - which.ndim)
+        each = np.broadcast_to(which.reshape((*which.shape, *rest)), new.shape)
+        results.append(_elementwise(code, "select_n", {}, [each, old, new], dtype_of(old)))
+    return results

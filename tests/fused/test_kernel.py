@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.kernel import Kernel
 from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.traced import traced
+from heli_jax.simulation.accumulate import Steps
 
 LANES, N = 8, 5
 RECORD = np.array([0.3, -0.7, 1.1, 0.2, -0.4])
@@ -218,6 +220,70 @@ LOOKUPS = {
         jnp.zeros(5).at[np.array([1, 3, 1])].add(jnp.stack([v, s[0], 2 * v])) @ np.arange(5.0)
         + jnp.zeros(5).at[_place(v, 4)].set(v, mode="clip")[4]
         + jnp.sum(jnp.zeros((3, 2)).at[np.array([0, 2]), 1].set(v) @ np.array([1.0, 3.0]))
+    ),
+    "windows written": jax.jit(
+        lambda v, s, u: (
+            jnp.zeros(5).at[1:3].set(jnp.stack([v, s[0]])) @ np.arange(5.0)
+            + jnp.ones(5).at[1].multiply(v).at[2:4].min(v).at[4].max(s[0]) @ np.arange(5.0)
+            + jnp.ones((3, 4)).at[1:, 1:3].subtract(v).at[0].add(s[0]).sum(0) @ np.arange(4.0)
+            + (v * jnp.ones(4)).at[1].apply(jnp.sin) @ np.arange(4.0)
+            + jax.lax.dynamic_update_slice(jnp.zeros(5), jnp.stack([v, s[0]]), (_place(v, 3),))
+            @ np.arange(5.0)
+            + jnp.zeros(4).at[_place(v, 3)].set(v) @ np.arange(4.0)
+        )
+    ),
+    "convolutions": jax.jit(
+        lambda v, s, u: (
+            jnp.convolve(jnp.stack([v, s[0], 2 * v]), np.array([0.2, 0.3])) @ np.arange(4.0)
+            + jnp.correlate(jnp.stack([v, s[0], 2 * v]), jnp.stack([s[0], v]), mode="same")
+            @ np.arange(3.0)
+            + jnp.sum(
+                jax.lax.conv_general_dilated(
+                    jnp.outer(jnp.stack([v, s[0], v, 1 + v]), _POINTS[:5])[None, None],
+                    _PLANE[None, None, :2, :3],
+                    (2, 1),
+                    [(1, 0), (-1, 2)],
+                    (2, 1),
+                    (1, 2),
+                )[0, 0]
+                * np.arange(1.0, 5.0)[:, None]
+            )
+        )
+    ),
+    "made of others": jax.jit(
+        lambda v, s, u: (
+            jnp.ldexp(v, _place(v))
+            + sum(m * 0.5 + e.astype(float) for m, e in [jnp.frexp(v)])
+            + jax.lax.custom_root(
+                lambda y: y + y**3 - v,
+                v,
+                lambda f, y: jax.lax.fori_loop(0, 20, lambda _, y: y - f(y) / (1 + 3 * y * y), y),
+                lambda g, y: y / g(jnp.ones_like(y)),
+            )
+        )
+    ),
+    "indices of what is infinite": jax.jit(
+        lambda v, s, u: (
+            jnp.asarray(_TABLE)[(v / 0.0).astype(int)]
+            + u[(v / 0.0).astype(jnp.int64)]
+            + jnp.sum(jax.lax.dynamic_slice(_TABLE, ((v / 0.0).astype(jnp.int64),), (2,)))
+        )
+    ),
+    "a loop of a batch": jax.jit(
+        lambda v, s, u: jnp.sum(
+            jax.vmap(lambda r: jax.lax.while_loop(lambda c: c < r * v, lambda c: c + 0.3, 0.0 * v))(
+                np.arange(4.0)
+            )
+        )
+    ),
+    "counts": jax.jit(
+        lambda v, s, u: (
+            jnp.bincount(jnp.stack([_place(v), _place(v, 3)]), length=5).astype(float)
+            @ np.arange(5.0)
+            + jnp.dot(
+                jnp.stack([_place(v), _place(v, 3)]), np.arange(2), preferred_element_type=v.dtype
+            )
+        )
     ),
     "shapes": lambda v, s, u: (
         jax.lax.pad(jnp.stack([v, 2 * v, 3 * v]), 1.5 * v, [(1, -1, 2)])[1:5] @ np.arange(4.0)
@@ -450,3 +516,35 @@ def test_reduced_precision_is_not_passed_over():
             [np.ones(LANES), 1.0],
             np.ones(LANES),
         )
+
+
+def test_what_is_unforeseen_is_named_with_its_line():
+    def drawn(s, u, x, k):
+        return x + jax.random.uniform(jax.random.fold_in(jax.random.key(3), k))
+
+    def called(s, u, x, k):
+        # Not called while it is translated, though all that it is given is known.
+        return x + jax.pure_callback(_never, jax.ShapeDtypeStruct((), float), jnp.zeros(()))
+
+    for step, name in ((drawn, "random_fold_in"), (called, "pure_callback")):
+        with pytest.raises(UnsupportedError) as refused:
+            # JAX's own run is not come to.
+            compiled(step, [np.ones(LANES), 1.0], np.ones(LANES))
+        assert f"the operation {name}" in str(refused.value)
+        assert "(at test_kernel.py:" in str(refused.value)
+
+
+def test_a_key_of_random_numbers_is_named_with_its_line():
+    def making(shared, records, element):
+        def step(carry, k):
+            key = jax.random.key(0)
+            return carry + jax.random.uniform(jax.random.fold_in(key, k))
+
+        return Steps(element, 3, step, lambda carry: carry)
+
+    with pytest.raises(UnsupportedError, match=r"random_seed, .* \(at test_kernel\.py:\d+\)"):
+        traced(making, (), np.zeros(4), np.zeros(()))
+
+
+def _never(_):
+    raise AssertionError("called while it was translated")
