@@ -204,6 +204,7 @@ def add_keys_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--schema", metavar="FILE", help="write the JSON schema, by which editors complete YAML"
     )
+    command.add_argument("--fit", action="store_true", help="what stands in fit.json instead")
 
 
 def count(text: str) -> int:

@@ -29,6 +29,8 @@ def keys(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         run_directory.require_place(place, f"--schema {place}")
         reference.write_schema(place)
         say(f"wrote {place}")
+    elif options.fit:
+        reference.print_fit_keys(options.pattern, as_json=options.json)
     elif options.json:
         print(reference.as_json(options.pattern))
     else:

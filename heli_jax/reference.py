@@ -1,4 +1,5 @@
-"""`heli-jax keys`: what may stand in a configuration, in the terminal and as a JSON schema."""
+"""`heli-jax keys`: what may stand in a configuration, in the terminal and as a JSON schema; what
+stands in fit.json."""
 
 import json
 import shutil
@@ -40,6 +41,31 @@ def as_json(pattern: str | None) -> str:
     return json.dumps([key._asdict() for key in matches], indent=1)
 
 
+def print_fit_keys(pattern: str | None, *, as_json: bool) -> None:
+    """The keys of fit.json with what stands there.
+
+    Args:
+        pattern: as `print_keys`.
+        as_json: as a list for other programs.
+
+    Raises:
+        InputError: no key holds it.
+    """
+    from heli_jax.report import fit_format
+
+    matches = fit_format.fit_keys() if pattern is None else fit_format.matching(pattern)
+    if as_json:
+        print(json.dumps([key._asdict() for key in matches], indent=1))
+        return
+    if not matches:
+        raise InputError(
+            f"keys --fit: expected a text that some key or its meaning holds, got {pattern}"
+        )
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    for key in matches:
+        print(*_wrapped(f"{key.path}: {key.kind}", key.meaning, width), sep="\n")
+
+
 def write_schema(path: Path) -> None:
     """The JSON schema in a file, which editors are told of.
 
@@ -57,13 +83,12 @@ def _lines(key: Key, width: int) -> list[str]:
     default = "has to be there" if key.default is None else f"default {key.default}"
     # A default of null says that the key may be left out, and no more.
     default = "optional" if key.default == "null" else default
-    head = textwrap.wrap(
-        f"{key.path}: {key.kind}; {default}",
-        width,
-        subsequent_indent="    ",
-        break_on_hyphens=False,
-    )
+    return _wrapped(f"{key.path}: {key.kind}; {default}", key.meaning, width)
+
+
+def _wrapped(head: str, meaning: str, width: int) -> list[str]:
     indent = "    "
-    return head + textwrap.wrap(
-        key.meaning, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+    lines = textwrap.wrap(head, width, subsequent_indent=indent, break_on_hyphens=False)
+    return lines + textwrap.wrap(
+        meaning, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
     )

@@ -1,6 +1,7 @@
 """The reference of a configuration against the classes that check it, and JSON's own checker."""
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import yaml
 from heli_jax import cli, yaml_file
 from heli_jax.config.keys import json_schema, keys
 from heli_jax.config.schema import Config
+from heli_jax.report import fit_format
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = sorted([*(ROOT / "configs").glob("*.yaml"), *(ROOT / "configs/logs").glob("*.yaml")])
@@ -88,3 +90,26 @@ def test_keys_in_the_terminal(
     assert "no such key" in capsys.readouterr().err
     assert cli.main(["keys", "--schema", str(tmp_path / "s.json")]) == 0
     assert yaml.safe_load((tmp_path / "s.json").read_text())["$schema"]
+
+
+def test_the_keys_of_fit_json(capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [key.path for key in fit_format.fit_keys()]
+    assert len(set(paths)) == len(paths)
+    assert cli.main(["keys", "--fit", "NAME.prior_share"]) == 0
+    shown = capsys.readouterr().out
+    assert "parameters.NAME.prior_share: number" in shown
+    assert "share of the prior in the posterior precision" in shown
+    assert cli.main(["keys", "--fit", "no such key"]) == 2
+    assert "no such key" in capsys.readouterr().err
+    assert cli.main(["keys", "--fit", "--json", "status"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["path"] == "status"
+
+
+def test_a_key_that_is_not_described_is_found() -> None:
+    names = dict.fromkeys(fit_format.FitFile.__annotations__)
+    assert fit_format.undescribed(names) == []
+    assert fit_format.undescribed({**names, "other": 1}) == [".other"]
+    wrong = {**names, "metrics": {"p": {"vaf": 1.0, "of": 2}}, "record": [{"tpoic": ""}]}
+    assert fit_format.undescribed(wrong) == [".metrics.p.of", ".record[].tpoic"]
+    del names["seed"]
+    assert fit_format.undescribed(names) == ["no seed"]

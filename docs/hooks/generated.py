@@ -112,6 +112,16 @@ def _keys() -> str:
     return "\n\n".join(parts)
 
 
+def _fit_keys() -> str:
+    from heli_jax.report.fit_format import Key, fit_keys
+
+    def entry(key: Key) -> str:
+        words = f"<br>{_cell(key.meaning)}" if key.meaning else ""
+        return f"`{key.path}`\n:   {_cell(key.kind)}{words}"
+
+    return "\n\n".join(map(entry, fit_keys()))
+
+
 def _commands() -> str:
     from heli_jax import cli
 
@@ -231,6 +241,7 @@ _API = {
 
 _PARTS: dict[str, Callable[[], str]] = {
     "keys": _keys,
+    "fit-keys": _fit_keys,
     "commands": _commands,
     "configurations": _configurations,
     "linear-models": _linear_models,

@@ -1,0 +1,569 @@
+"""The keys of fit.json, from the classes that it is made of: what each holds.
+
+A number that is not finite is null in the file, whatever its kind.
+"""
+
+import ast
+import inspect
+import itertools
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, TypedDict
+
+from heli_jax.analysis.attitude_responses import HandlingPair
+from heli_jax.analysis.handling_qualities import Number
+from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.identification.equation_error.first_guess import Equation, StartValue
+from heli_jax.identification.equation_error.stepwise import Step
+from heli_jax.identification.estimation.multistart import StartRow
+from heli_jax.identification.identifiability.verdict import Combination, Pair
+from heli_jax.identification.model_selection import Candidate, Nested
+from heli_jax.identification.result import Estimate, SecondMethod, Status
+from heli_jax.identification.uncertainty.nuts import Convergence
+from heli_jax.identification.uncertainty.profile_likelihood import Profile
+from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.closed_loop_trust import Moved
+from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.report.card import Gate
+
+
+class Key(NamedTuple):
+    """One key of fit.json."""
+
+    path: str
+    """in full: `parameters.NAME.sd`"""
+    kind: str
+    """what stands there, in words"""
+    meaning: str
+    """empty where the name says it all"""
+
+
+class VerdictContent(TypedDict):
+    """What the data determine, with all that it was read off."""
+
+    text: str
+    """in a sentence"""
+    identifiable: bool
+    """whether they determine every free parameter"""
+    rank: int
+    """directions that are determined, priors included"""
+    rank_without_priors: int
+    condition_number: float
+    singular_values: list[float]
+    """of the whitened sensitivities in relative coordinates: one over the sd of a direction"""
+    null_directions: list[dict[str, float]]
+    """by parameter, in relative coordinates, along which nothing changes"""
+    determined_combinations: list[Combination]
+    """what is determined where not every parameter is"""
+    strong_pairs: list[Pair]
+    """parameters that the data hardly tell apart"""
+    without_effect: list[str]
+    """parameters that no output shows"""
+    resting_on_priors: list[str]
+    """parameters that the priors determine, and not the data"""
+    exchangeable_nuisances: list[str]
+    """nuisances, as `flight 1/bias p`, that make up for what is not determined"""
+    exchangeable_parameters: list[list[str]]
+    """pairs whose values may be exchanged: the data do not tell which is which"""
+    other_solutions: list[dict[str, float]]
+    """other values of the free parameters that fit as well [SI]"""
+    names: list[str]
+    """the order of `correlation` and `covariance_log`"""
+    correlation: list[list[float]]
+    covariance_log: list[list[float]]
+    """in relative coordinates (a logarithm, or the value over a scale); what is not determined is
+    left out of it"""
+
+
+class AdequacyAgainst(TypedDict):
+    """The limits of the version that wrote the file."""
+
+    explained_at_least: float
+    or_other_than_white_noise_at_most: float
+    or_power_over_what_the_disturbance_makes_at_most: float
+
+
+class AdequacyToo(TypedDict):
+    """Beside the fields of the class."""
+
+    adequate: bool | None
+    """null where the optimiser did not arrive"""
+    summary: str
+    """the answer in a few words, as the first line has it"""
+    against: AdequacyAgainst
+
+
+class Fixed(TypedDict):
+    """Beside the fields of the class."""
+
+    value: float | list[float] | None
+    """the estimate; null where it is not determined; of what flights state a number of each"""
+    fixed: bool
+    """whether flights state it, and it was not free; then there is nothing else"""
+
+
+class Residuals(TypedDict):
+    """What is left of the measurements."""
+
+    white: bool
+    overconfident: bool
+    """whether intervals count samples as news that repeat each other"""
+    note: str
+    """what follows where they are not white"""
+    by_output: dict[str, Whiteness]
+    """by `flight/output`; under filter error of the innovations"""
+
+
+class FeedbackToo(TypedDict):
+    """Beside the fields of the class."""
+
+    present: bool
+    """whether the input follows the response: the p value is below the level"""
+    level: float
+
+
+class ResponsesToo(TypedDict):
+    """Beside the fields of the class."""
+
+    averages: dict[str, float]
+    """independent ones by output"""
+    usual_J: float
+    """Tischler's limit of a good fit"""
+
+
+class CandidatesCompared(TypedDict):
+    """Models compared."""
+
+    candidates: list[Candidate]
+    """best AIC first"""
+    nested: list[Nested]
+    """likelihood-ratio tests"""
+    sentences: list[str]
+
+
+class MethodResult(TypedDict):
+    """The same problem by a method."""
+
+    status: str
+    """as above, or refused"""
+    verdict: str
+    reason: str | None
+    """why it was refused, or is no result"""
+    seconds: float
+    parameters: dict[str, Estimate]
+    difference_joint_sd: dict[str, float]
+    """from the first method's estimate, in their joint standard deviation"""
+    notes: list[str]
+
+
+class MethodsCompared(TypedDict):
+    """Methods side by side."""
+
+    results: dict[str, MethodResult]
+    sentences: list[str]
+
+
+class Nuts(TypedDict):
+    """Whether the draws may be believed."""
+
+    rhat: float
+    """the largest"""
+    effective: float
+    """independent draws, the fewest"""
+    divergent: int
+    trusted: bool
+    by_parameter: dict[str, Convergence]
+
+
+class IntervalsContent(TypedDict, total=False):
+    """95 % intervals by several methods."""
+
+    by_parameter: dict[str, dict[str, list[float]]]
+    """by parameter and method (gaussian, profile, bootstrap, nuts) both ends"""
+    profiles: dict[str, Profile]
+    sentences: list[str]
+    bootstrap_failures: int
+    """of a bootstrap: refits that did not arrive"""
+    nuts: Nuts
+    """of NUTS"""
+
+
+class Compatibility(TypedDict):
+    """Of `heli-jax compatibility`."""
+
+    compatible: bool
+    verdict: str
+    doubts: list[str]
+    shows: dict[str, str]
+    """by error of a sensor whether it shows"""
+
+
+class Continuous(TypedDict):
+    """The transfer function of the recursive least squares."""
+
+    num: list[float]
+    """coefficients, highest power of s first"""
+    den: list[float]
+    exact: bool
+    """whether it is that of the discrete one with a zero-order hold"""
+    note: str
+
+
+class BaselineContent(TypedDict):
+    """The recursive least squares, from an input to an output of one flight."""
+
+    flight: str
+    input: str
+    output: str
+    order: int
+    forgetting: float
+    theta: list[float]
+    """coefficients of the difference equation"""
+    poles: list[list[float]]
+    """real and imaginary part of each"""
+    continuous: Continuous
+    combinations: dict[str, float]
+    """of the paper's equation 23"""
+    metrics: dict[str, Metrics]
+    """of its simulation"""
+    trusted: bool
+    sentences: list[str]
+
+
+class QualityToo(TypedDict):
+    """Beside the fields of the class."""
+
+    unit: str
+
+
+class Qualities(TypedDict, total=False):
+    """What a response says, of the model or of the data."""
+
+    numbers: dict[str, Number | None]
+    """by name; null is not determined"""
+    sentences: list[str]
+    sign: int
+    """-1 where the response was turned over"""
+    band_rad_s: list[float]
+    """in which it is known"""
+
+
+class HandlingToo(TypedDict):
+    """Beside the fields of the class."""
+
+    model: Qualities | None
+    data: Qualities | None
+    """null where no response was asked for"""
+
+
+class Stepwise(TypedDict):
+    """The terms that stepwise regression chose."""
+
+    selected: list[str]
+    steps: list[Step]
+    f_ratios: dict[str, float]
+
+
+class EquationErrorContent(TypedDict):
+    """First guesses by equation error."""
+
+    values: dict[str, StartValue]
+    equations: list[Equation]
+    smoothing_half_width_s: float
+    not_measured: list[str]
+    """states that nothing measured shows"""
+    stepwise: Stepwise | None
+    sentences: list[str]
+
+
+class FrequencyErrorContent(TypedDict):
+    """First guesses by frequency error."""
+
+    status: Status
+    seconds: float
+    values: dict[str, StartValue]
+    sentences: list[str]
+    notes: list[str]
+
+
+class SignalSource(TypedDict, total=False):
+    """Where a signal of the model came from."""
+
+    signal: str
+    """the channel of the log; without one a constant stands there"""
+    constant: float
+    unit: str
+    scale: float
+    offset: float
+    invert: bool
+    origin: str
+    """what was made of it on the way, in words"""
+
+
+class SignalSources(TypedDict):
+    """By name of the model's signal."""
+
+    inputs: dict[str, SignalSource]
+    outputs: dict[str, SignalSource]
+
+
+class FlightSource(TypedDict, total=False):
+    """Where a flight came from; one that was given in memory has no path and no signals."""
+
+    path: str | None
+    sha256: str | None
+    """of the whole file"""
+    flight: str
+    hold_out: bool
+    """whether it served for validation alone"""
+    n_samples: int
+    dt: float
+    """[s]"""
+    window: list[float]
+    """[s] from the log's beginning"""
+    log_first_time: float
+    """[s] in the log's own count"""
+    notes: list[str]
+    signals: SignalSources
+
+
+class HoldContent(TypedDict):
+    """What an input does between samples."""
+
+    hold: Literal["zero-order", "linear"]
+    reason: str
+
+
+class FitFile(TypedDict):
+    """fit.json."""
+
+    status: Status
+    """whether the optimiser arrived, and whether the data determine what was asked"""
+    model: str
+    method: str
+    instruments: list[str]
+    """inputs that were taken by a logged excitation"""
+    n_samples: int
+    """measured numbers that were fitted"""
+    identifiable: bool
+    """whether the data and the priors determine every free parameter"""
+    adequate: bool | None
+    """whether the model explains the record; null where that was not judged"""
+    adequacy: Adequacy
+    null_directions: list[dict[str, float]]
+    """as in `verdict`"""
+    determined_combinations: list[Combination]
+    """as in `verdict`"""
+    verdict: VerdictContent
+    """at the estimates"""
+    verdict_before: VerdictContent
+    """at the start values"""
+    parameters: dict[str, Estimate]
+    """the free ones, and those that flights state [SI]"""
+    constants: dict[str, float]
+    """the vehicle's numbers that the fit took as known [SI]"""
+    nuisance: dict[str, Estimate]
+    """gains, delays, disturbances, initial states, biases; of one flight as `flight/name`"""
+    noise_sd: dict[str, float]
+    """of the measurements, by `flight/output` [SI]"""
+    metrics: dict[str, Metrics]
+    """by output, of the flights that were fitted, simulated"""
+    validation: dict[str, Metrics]
+    """the same of flights held out"""
+    validation_free_run: dict[str, Metrics]
+    """the same in one piece, where windows were asked for"""
+    one_step: dict[str, Metrics]
+    """predicted one sample ahead, of the flights that were fitted"""
+    one_step_validation: dict[str, Metrics]
+    """the same of flights held out"""
+    acceptance: list[Gate]
+    """the lines of the acceptance card"""
+    models: CandidatesCompared | None
+    methods: MethodsCompared | None
+    intervals: IntervalsContent | None
+    record: list[Finding]
+    """whether the log is enough"""
+    compatibility: Compatibility | None
+    log_likelihood: float
+    unknowns: int
+    """estimated numbers, those of the noise included"""
+    aic: float
+    bic: float
+    covariance: Literal["white", "coloured residuals"]
+    """what the intervals take the residuals for"""
+    residuals: Residuals
+    feedback: list[Feedback]
+    """by flight and input that moves freely"""
+    moved_by_feedback: dict[str, Moved]
+    """by parameter, in a closed loop without an instrument"""
+    held_upright: bool
+    """whether somebody must have held the machine, which is unstable"""
+    disturbed_loop: bool
+    """whether gusts that the method does not know came in by feedback"""
+    second_method: SecondMethod | None
+    """a method that does not bear estimates out"""
+    untrusted: list[str]
+    """parameters that a fit in a closed loop cannot be trusted on, or a second method does not bear
+    out"""
+    distrust: str
+    """the same in a sentence; empty where all is trusted"""
+    responses: ResponseAgreement | None
+    """of a fit of frequency responses"""
+    baseline_rls: BaselineContent | None
+    handling_qualities: list[HandlingPair]
+    equation_error_start: EquationErrorContent | None
+    frequency_error_start: FrequencyErrorContent | None
+    starts: list[StartRow]
+    """where each start led"""
+    steps: int
+    """of the optimiser, to the best optimum"""
+    notes: list[str]
+    """what a reader has to know of the fit"""
+    timing_s: dict[str, float]
+    """by what was done, and in all"""
+    versions: dict[str, str]
+    """of Python and the libraries"""
+    data: list[FlightSource]
+    inputs: list[dict[str, HoldContent]]
+    """by flight and input"""
+    seed: int
+
+
+_TOO: dict[type, type] = {
+    Adequacy: AdequacyToo,
+    Estimate: Fixed,
+    Feedback: FeedbackToo,
+    ResponseAgreement: ResponsesToo,
+    Number: QualityToo,
+    HandlingPair: HandlingToo,
+}
+"""what the file has beside the fields of a class, or in their place"""
+
+
+def fit_keys() -> list[Key]:
+    """All keys, each before what stands in it."""
+    return list(_walk(FitFile, ""))
+
+
+def matching(text: str) -> list[Key]:
+    """The keys whose path holds a text, in any case; else those whose meaning does.
+
+    Args:
+        text: blanks at its ends are left out.
+    """
+    words, every = text.strip().lower(), fit_keys()
+    by_path = [k for k in every if words in k.path.lower()]
+    return by_path or [k for k in every if words in k.meaning.lower()]
+
+
+def undescribed(content: Any, kind: Any = FitFile, path: str = "") -> list[str]:
+    """The keys of a fit.json that no class has, and those of the file that are missing.
+
+    Args:
+        content: what stands there.
+        kind: what may.
+        path: of it.
+    """
+    found: list[str] = []
+    for option in _options(kind):
+        if _is_section(option) and isinstance(content, Mapping):
+            fields = _fields(option)
+            found += [f"{path}.{n}" for n in content if n not in fields]
+            if option is FitFile:
+                found += [f"no {n}" for n in fields if n not in content]
+            known = (n for n in content if n in fields)
+            found += [x for n in known for x in undescribed(content[n], fields[n], f"{path}.{n}")]
+        elif typing.get_origin(option) in _MAPPINGS and isinstance(content, Mapping):
+            inner = typing.get_args(option)[1]
+            found += [x for n, v in content.items() for x in undescribed(v, inner, f"{path}.{n}")]
+        elif (inner := _item(option)) is not None and isinstance(content, Sequence):
+            found += [x for v in content for x in undescribed(v, inner, f"{path}[]")]
+    return found
+
+
+_MAPPINGS, _SEQUENCES = (dict, Mapping), (list, tuple, Sequence)
+
+
+def _walk(section: Any, path: str) -> Iterator[Key]:
+    stated = _stated(section)
+    for name, kind in _fields(section).items():
+        place = f"{path}.{name}" if path else name
+        yield Key(place, _kind(kind), stated.get(name, ""))
+        # `verdict_before` has the keys of `verdict`: told once.
+        if name not in ("verdict_before", "determined_combinations") or path == "verdict":
+            for inner, suffix in _within(kind):
+                yield from _walk(inner, place + suffix)
+
+
+def _within(kind: Any) -> Iterator[tuple[Any, str]]:
+    """The sections within a field, and what stands between its path and their keys."""
+    for option in _options(kind):
+        if _is_section(option):
+            yield option, ""
+        elif typing.get_origin(option) in _MAPPINGS:
+            yield from ((s, f".NAME{rest}") for s, rest in _within(typing.get_args(option)[1]))
+        elif (inner := _item(option)) is not None:
+            yield from ((s, f"[]{rest}") for s, rest in _within(inner))
+
+
+def _is_section(kind: Any) -> bool:
+    return typing.is_typeddict(kind) or (isinstance(kind, type) and hasattr(kind, "_fields"))
+
+
+def _fields(section: Any) -> dict[str, Any]:
+    own = typing.get_type_hints(section)
+    too = typing.get_type_hints(_TOO[section]) if section in _TOO else {}
+    return own | too
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return typing.get_args(kind)
+    return (kind,)
+
+
+def _item(kind: Any) -> Any:
+    """What a list has in it; None of what is no list."""
+    if typing.get_origin(kind) not in _SEQUENCES:
+        return None
+    return typing.get_args(kind)[0]
+
+
+def _kind(kind: Any) -> str:
+    return " or ".join(dict.fromkeys(_one_kind(option) for option in _options(kind)))
+
+
+_PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text", type(None): "null"}
+
+
+def _one_kind(kind: Any) -> str:
+    if kind in _PLAIN:
+        return _PLAIN[kind]
+    if _is_section(kind):
+        return "section"
+    if typing.get_origin(kind) is Literal:
+        return " | ".join(map(str, typing.get_args(kind)))
+    if typing.get_origin(kind) in _MAPPINGS:
+        return f"{_kind(typing.get_args(kind)[1])} by name"
+    items = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple and Ellipsis not in items:
+        return f"[{', '.join(map(_kind, items))}]"
+    if (inner := _item(kind)) is not None:
+        return f"list of {_kind(inner)}"
+    return "list of numbers"  # an array
+
+
+def _stated(section: type) -> dict[str, str]:
+    """What stands below each field in the source, by field."""
+    words = _stated(_TOO[section]) if section in _TOO else {}
+    body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(section))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    for field, below in itertools.pairwise(body.body):
+        if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
+            continue
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+            words.setdefault(field.target.id, " ".join(str(below.value.value).split()))
+    return words
