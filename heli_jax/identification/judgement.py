@@ -42,12 +42,8 @@ from heli_jax.identification.validation.excitation_test import (
     unless_unrelated,
 )
 from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
-from heli_jax.identification.validation.feedback import (
-    Feedback,
-    feedback_notes,
-    feedback_of,
-    untested,
-)
+from heli_jax.identification.validation.feedback import feedback_notes, feedback_of, untested
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_stick import LateStick, late_stick, with_late_stick
 from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics

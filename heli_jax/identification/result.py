@@ -16,8 +16,8 @@ from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, WORSE, Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, untrusted
 from heli_jax.identification.validation.excitation import ALIASED
-from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_stick import LateStick
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 

@@ -17,7 +17,7 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
-from heli_jax.identification.validation.feedback import LEVEL
+from heli_jax.identification.validation.follows_response import LEVEL
 from heli_jax.numbers import percent
 
 

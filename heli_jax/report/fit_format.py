@@ -24,8 +24,8 @@ from heli_jax.identification.uncertainty.nuts import Convergence
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Moved
-from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate
 

@@ -7,7 +7,8 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, linear_model
-from heli_jax.identification.validation.feedback import feedback, feedback_notes, feedback_of
+from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
+from heli_jax.identification.validation.follows_response import feedback
 from tests.identification.test_equation_error import ROLL, Params
 
 DT, LATE = 0.02, 5

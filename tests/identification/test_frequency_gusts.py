@@ -14,7 +14,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     feedback_trust_notes,
     untrusted,
 )
-from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.follows_response import Feedback
 
 DT, N = 0.02, 4500
 ROLL = """

@@ -10,7 +10,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, linear_model
-from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_angles import late_angles, lateness
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.misread import record_doubts

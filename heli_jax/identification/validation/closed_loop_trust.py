@@ -45,7 +45,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import residual_and_
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
-from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.follows_response import Feedback
 
 TRUSTED = 1.4
 """stated standard deviations by which feedback may have moved an estimate that is trusted: its

@@ -10,15 +10,9 @@ from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.feedback import (
-    LEVEL,
-    STEPS,
-    Feedback,
-    feedback_notes,
-    untested,
-    why_untested,
-)
+from heli_jax.identification.validation.feedback import feedback_notes, untested, why_untested
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Feedback
 from heli_jax.identification.validation.input_units import wrong_units
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
@@ -26,7 +20,6 @@ from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import misread
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
-from heli_jax.identification.validation.shared_vibration import vibration_alone
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
     saturation,
@@ -120,7 +113,6 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
     present = feedback_notes(problem, feedback)
     if present:
         doubts = [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
-        doubts += [Finding("feedback", "note", s) for s in vibration_alone(problem, feedback)]
         return [*doubts, *aside]
     words = (
         "no input follows what is unforeseen of the response (p-value "

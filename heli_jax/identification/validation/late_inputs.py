@@ -12,8 +12,8 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.numbers import percent
 
 _RATE = 50.0

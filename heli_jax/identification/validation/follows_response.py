@@ -1,0 +1,306 @@
+"""Whether inputs follow the response: feedback, by a pilot or a controller.
+
+Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
+multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
+Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
+13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
+rest is correlated with sums of past innovations. The variance of such a correlation between two
+autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
+(L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
+
+An output answers to how a stick moves until it is measured, from where the stick goes on: that is
+no feedback. So either the innovations are freed of the inputs until then as well, in parts of a
+sample, which sees all but what is fed back at once; or the input is freed of its own past in parts
+of a sample, which sees that.
+
+An input that is logged late follows the response as well, though nobody closes a loop: no such
+correlation tells the two apart. Where a delay was estimated and is negative, the input is taken so
+much earlier; elsewhere a late log is named as the other reading.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.validation.arx_residuals import Past, arx_residuals
+from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
+from heli_jax.numbers import percent
+
+STEPS = "inputs stay where they are between jumps"
+"""the reason why nothing is tested where no input moves freely"""
+LEVEL = 0.01
+"""of the test of a whole record: all inputs, outputs and lags together"""
+RATE = 50.0
+"""samples a second at most: no feedback that a machine flies by is faster than a quarter of that"""
+_SLOW_RATE = 10.0
+"""samples a second at which slow feedback, as a pilot's, shows through a sensor's noise"""
+_PARTS = 5
+"""of a sample at a lower rate, at most, into which the inputs within it are taken apart"""
+_LONGEST = 2.0
+"""lag up to which an input may follow [s]"""
+_MOST = 20_000
+"""samples that are looked at"""
+_LEAST = 100
+"""samples of a record to be tested"""
+_JUMP, _ROUNDS = 5.0, 3
+"""times the median size of what is unforeseen of an input, above which it is a jump; how often what
+is left is looked at again"""
+_MOVES = 0.05
+"""part of the samples at which an input that may follow something moves, at least"""
+_LONG_REST, _AT_REST = 20, 0.5
+"""samples of one value in a row that are a rest between two motions, and the part of a record that
+such rests take in one whose input was programmed"""
+_STILL = 1e-4
+"""of the range of an input, below which a difference is no motion"""
+SEEN = 0.8
+"""part of the samples of an output that is used"""
+
+
+class Feedback(NamedTuple):
+    """What was found of one input of one flight. The names of the fields are keys of fit.json."""
+
+    flight: str
+    input: str
+    output: str
+    """whose past innovations it follows most surely"""
+    correlation: float
+    """of the unforeseen part of the input with them"""
+    lag: tuple[float, float]
+    """[s] how long ago they were"""
+    p_value: float
+    """for all inputs, outputs and lags of the record that were tested"""
+    earlier: float = 0.0
+    """[s] how much earlier than logged the input was taken, as its estimated delay says"""
+    delay_known: bool = False
+    """whether its delay was estimated: else the input may also be logged late"""
+
+    @property
+    def present(self) -> bool:
+        """Whether the input follows the response."""
+        return self.p_value < LEVEL
+
+
+def feedback(
+    flight: Flight, together: int = 1, earlier: Mapping[str, float] | None = None
+) -> tuple[Feedback, ...]:
+    """By input that moves freely, whether it follows past innovations; nothing where the record is
+    too short to tell.
+
+    Args:
+        flight: inputs and outputs as measured; no model is asked.
+        together: how many flights are tested side by side, for the p values.
+        earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
+    """
+    tested = [tested_at(flight, earlier or {}, rate) for rate in rates_of(flight)]
+    each = [one for one in tested if not isinstance(one, str)]
+    label, found = flight.name or "flight 1", {}
+    for one in each:
+        for name in dict.fromkeys(n for view in one.views for n in view.free):
+            made = _dependence(one, name, together * len(each))
+            late = one.steps.get(name, 0) * flight.dt
+            now = made._replace(flight=label, earlier=late)
+            found[name] = min(found.get(name, now), now, key=_sureness)
+    return tuple(found.values())
+
+
+def _sureness(one: Feedback) -> tuple[float, float]:
+    # Of several that are sure beyond all numbers the correlation decides.
+    return one.p_value, one.correlation
+
+
+def rates_of(flight: Flight) -> tuple[float, ...]:
+    """Samples a second at which a flight is looked at [Hz].
+
+    Args:
+        flight: inputs and outputs as measured.
+    """
+    # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
+    # a sample, and how it moved there, is not known, and an output that answers to it would pass
+    # for news.
+    frames = min([0.5, *map(_frames, flight.inputs.values())]) / flight.dt
+    fast = float(np.clip(frames, _SLOW_RATE, RATE))
+    return (fast, _SLOW_RATE) if fast > _SLOW_RATE else (fast,)
+
+
+def _frames(u: np.ndarray) -> float:
+    """How often an input has a new value while it moves, of its samples."""
+    at = np.flatnonzero(np.diff(u) != 0.0)
+    return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
+
+
+def _dependence(tested: "Tested", name: str, together: int) -> Feedback:
+    """Of one input the past innovations that it follows most surely."""
+    views = [view for view in tested.views if name in view.free]
+    count = len(views[0].innovations)
+    blocks = lag_blocks(max(1, min(round(_LONGEST / tested.dt), count // 10)))
+    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+    tests = together * len(views) * len(tested.inputs) * len(tested.outputs) * len(blocks)
+    made = []
+    for view in views:
+        each = correlations_with_sums(view.free[name], view.innovations, blocks)
+        k, b = min(
+            np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
+        )
+        lag = (blocks[b][0] * tested.dt, blocks[b][1] * tested.dt)
+        p, correlation = min(1.0, tests * float(each.p_value[k, b])), float(each.correlation[k, b])
+        made.append(Feedback("", name, tested.outputs[k], correlation, lag, p))
+    return min(made, key=_sureness)
+
+
+class _View(NamedTuple):
+    """What is correlated: of the past, and of an input what is compared with it."""
+
+    free: dict[str, np.ndarray]
+    """by input what its own past does not foretell (N,)"""
+    innovations: Float[np.ndarray, "N p"]
+
+
+class Tested(NamedTuple):
+    """A flight at one rate."""
+
+    views: tuple[_View, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    steps: dict[str, int]
+    """by input by how many samples of the flight it was taken earlier"""
+    dt: float
+
+
+def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | str:
+    """What of a flight is correlated, or in words why nothing is.
+
+    Args:
+        flight: inputs and outputs as measured.
+        earlier: by input, how much earlier than logged it is to be taken [s].
+        rate: samples a second at most [Hz].
+    """
+    # Half of a record at most: a delay beyond is none that it could show.
+    most = flight.n_samples // 2
+    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
+    inputs, outputs, parts, dt = decimated(flight, steps, rate)
+    if not outputs:
+        most = percent(1 - SEEN, 0)
+        return f"every output stays where it is or lacks more than {most} of its samples"
+    n = next(iter(outputs.values())).size
+    if n < _LEAST:
+        return f"the record is too short ({n * dt:.3g} s, expected {_LEAST * dt:.3g} s at least)"
+    # Steps are slopes at a lower rate.
+    quick = decimated(flight, steps, RATE).inputs
+    moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
+    free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
+    if not free:
+        return STEPS
+    finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
+    y = np.stack(list(outputs.values()), axis=1)
+    u = np.stack(list(inputs.values()), axis=1)
+    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # answer to an input, and would pass for feedback. A sample's own inputs stand beside the
+    # outputs before it.
+    now = np.concatenate(list(parts.values()), axis=1)
+    now = np.concatenate([now[1:], now[-1:]])
+    given = arx_residuals(y, np.concatenate([y, now], axis=1))
+    past = arx_residuals(y, np.concatenate([y, u], axis=1))
+    views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
+    if not views:
+        return "too few samples stand in a row without a missing one"
+    return Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt)
+
+
+def _unforeseen(
+    u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
+) -> Float[np.ndarray, " N"] | None:
+    """What an input's own past (N, m) does not foretell of it (N,), without its jumps; None where
+    nothing is left.
+
+    A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
+    out is chosen by the input alone, so that the test stays one.
+    """
+    past = Past(own)
+    left = arx_residuals(u[:, None], past)
+    for _ in range(_ROUNDS):
+        if left is None:
+            return None
+        size = float(np.nanmedian(np.abs(left)))
+        calm = np.abs(left[:, 0]) <= _JUMP * size
+        # An input that mostly stays where it is has no other motion than its jumps.
+        if size <= 1e-9 * np.std(u):
+            break
+        left = arx_residuals(np.where(calm, u, np.nan)[:, None], past)
+    if left is None or not np.nanstd(left) > 1e-9 * np.std(u):
+        return None
+    return left[:, 0]
+
+
+def _moves_freely(u: Float[np.ndarray, " N"]) -> bool:
+    """Whether there is anything in an input that could follow."""
+    # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
+    # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
+    # of its corners rings on into the rest, as it does in the response.
+    return bool(np.mean(np.diff(u) != 0.0) >= _MOVES) and _rests(u) <= _AT_REST
+
+
+def _rests(u: Float[np.ndarray, " N"]) -> float:
+    """The part of the samples of an input that lie in long runs of one value, or as good as one: a
+    command that passed a filter comes to rest by and by."""
+    ends = np.flatnonzero(np.abs(np.diff(u)) > _STILL * np.ptp(u))
+    runs = np.diff(np.concatenate([[-1], ends, [u.size - 1]]))
+    return float(np.sum(runs[runs >= _LONG_REST])) / u.size
+
+
+class Decimated(NamedTuple):
+    """Signals at a moderate rate, by name."""
+
+    inputs: dict[str, np.ndarray]
+    """those that move (N,)"""
+    outputs: dict[str, np.ndarray]
+    """those that are mostly seen (N,)"""
+    parts: dict[str, np.ndarray]
+    """means over parts of a sample (N, m) of the inputs that move"""
+    dt: float
+
+
+def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decimated:
+    """A flight averaged down.
+
+    Args:
+        flight: as measured.
+        earlier: by how many samples an input is taken earlier than logged, where it is.
+        rate: samples a second at most [Hz].
+    """
+    every = max(1, int(np.ceil(1.0 / (flight.dt * rate) - 1e-9)))
+    edges = np.rint(np.linspace(0, every, min(every, _PARTS) + 1)).astype(np.int64)
+
+    def thinned(x: np.ndarray) -> np.ndarray:
+        # Means of blocks and not every n-th sample: what is faster than the lower rate would come
+        # back as something slow.
+        return x.reshape(-1, every).mean(axis=1)  # NaN where one of them is missing
+
+    def within(x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(x.reshape(-1, every), edges[:-1], axis=1) / np.diff(edges)
+
+    # What an input does after the end of its log is not known: all signals end there.
+    cut = max(earlier.values(), default=0)
+
+    def taken(x: np.ndarray, first: int) -> np.ndarray:
+        # Of a very long record a part will do, and its regressors fit into memory.
+        part = x[first : x.size - cut + first]
+        return part[: min(part.size // every, _MOST) * every]
+
+    inputs = {n: taken(u, earlier.get(n, 0)) for n, u in flight.inputs.items()}
+    inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
+    outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
+    # A record of less than one block leaves none.
+    return Decimated(
+        {n: thinned(u) for n, u in inputs.items()},
+        {
+            n: y
+            for n, y in outputs.items()
+            if y.size and np.mean(np.isfinite(y)) >= SEEN and np.nanstd(y) > 0
+        },
+        {n: within(u) for n, u in inputs.items()},
+        flight.dt * every,
+    )
