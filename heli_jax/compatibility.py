@@ -19,6 +19,7 @@ from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.uncertainty.estimates import FAR
 from heli_jax.numbers import with_sd
 from heli_jax.report.files import SensorAgreement
 from heli_jax.workflow import FitRun, Say
@@ -177,6 +178,8 @@ def judged(run: FitRun) -> Compatibility:
     bad = [n for n in low if n not in drifting]
     compatible = converged and not bad
     verdict = _verdict(errors, r_squared, bad, drifting, converged)
+    if compatible:
+        verdict = f"{verdict}{_untold(run, errors)}"
     # Of signals that do not fit together the errors are those of a wrong model: none to take off.
     known = {e.name: e.estimate.value for e in errors if e.determined and compatible}
     corrections = _corrections(run, known, errors)
@@ -248,6 +251,26 @@ def _verdict(
     if not shown:
         return f"Compatible as logged: {agree}, and no error shows."
     return f"Compatible once {', '.join(shown)} are corrected: {agree}."
+
+
+def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
+    """What of a verdict that all is well these channels do not tell; empty where they tell all."""
+    untold = [e for e in errors if not e.determined]
+    if not untold:
+        return ""
+    # An error that nothing bounds makes up for what does not fit, however large it has to be.
+    priors = {e.name: run.problem.free[e.name].prior for e in untold}
+    far = [
+        f"{e.name} of {e.estimate.value:+.2g} {e.estimate.unit}".removesuffix(" 1").rstrip()
+        for e in untold
+        if (prior := priors[e.name]) and abs(e.estimate.value - prior.mean) > FAR * prior.sd
+    ]
+    if far:
+        return (
+            f" But only with {', '.join(far)}, which no sensor has and these channels do not "
+            "determine: the signals may well contradict each other."
+        )
+    return f" Of {', '.join(e.name for e in untold)} these channels do not tell."
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import compatibility, config, run_directory, workflow
+from heli_jax import Prior, compatibility, config, run_directory, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
@@ -143,6 +143,7 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     )
     # Third differences show half the noise that was found, unless told otherwise.
     free = {"noise_gyro": SimpleNamespace(start=noise)}
+    free["b_r"] = SimpleNamespace(prior=Prior(0.0, 0.05))
     problem = SimpleNamespace(flights=config.read_flights(experiment), free=free)
     return SimpleNamespace(config=experiment, fit=fit, problem=problem)
 
@@ -153,7 +154,8 @@ def test_a_fit_is_put_in_words(folder):
     judged = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.95}))
     assert judged.compatible
     assert judged.verdict == (
-        "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more."
+        "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more. Of b_r these "
+        "channels do not tell."
     )
     assert judged.doubts[0].startswith("lambda_p +23 %: more than a sensor's own error.")
     assert judged.doubts[1:] == ("of the fit",)
@@ -175,10 +177,14 @@ def test_a_fit_is_put_in_words(folder):
     # As the gyros' own noise lets an angle drift that hardly moves.
     drifts = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.8}, noise=0.009))
     assert drifts.compatible
-    assert drifts.verdict.endswith(
+    assert (
         "or more, but of psi (R2 0.800), which the noise of the sensors lets drift so far."
+        in drifts.verdict
     )
     assert drifts.corrections["signals"]
+    # What nothing bounds makes up for any misfit: no compatible log.
+    far = compatibility.judged(fitted(folder, found | {"b_r": (0.4, 1.0)}, {"phi": 0.99}))
+    assert "But only with b_r of +0.4, which no sensor has" in far.verdict
     lost = compatibility.judged(fitted(folder, found, {"phi": 0.99}, "not-converged"))
     assert not lost.compatible
     assert not lost.corrections["signals"]

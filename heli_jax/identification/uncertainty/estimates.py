@@ -208,7 +208,7 @@ def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     ]
 
 
-_FAR = 3.0
+FAR = 3.0
 """standard deviations of a prior at which an estimate contradicts it"""
 
 
@@ -220,7 +220,7 @@ def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
         if prior is None:
             continue
         away = abs(estimate.value - prior.mean) / prior.sd
-        if away > _FAR:
+        if away > FAR:
             notes.append(
                 f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and priors "
                 "contradict each other, and the interval does not know it."
