@@ -7,8 +7,10 @@ with `jax.tree_util.register_dataclass`. Units and meanings are optional, in the
 `roll: Annotated[Scalar, "rad", "roll angle"]`.
 """
 
+import ast
 import functools
 import inspect
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -61,6 +63,19 @@ def meaning(record: type, name: str) -> str:
     """What a field is, in words; empty where the class does not say."""
     notes = _notes(record).get(name, ())
     return notes[1] if len(notes) > 1 else ""
+
+
+def texts(record: type) -> dict[str, str]:
+    """What stands below each of a class's own fields in its source, by field."""
+    body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(record))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    stated = {}
+    for field, below in itertools.pairwise(body.body):
+        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+            words = below.value.value  # pyright: ignore[reportAttributeAccessIssue]
+            stated[field.target.id] = " ".join(str(words).split())
+    return stated
 
 
 def defaults(record: type) -> dict[str, Any]:

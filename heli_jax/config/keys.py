@@ -1,7 +1,5 @@
 """The keys of a configuration, from the classes that check them: for editors and readers."""
 
-import ast
-import inspect
 import itertools
 import math
 import typing
@@ -11,6 +9,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from heli_jax.config.schema import Config
+from heli_jax.naming import texts
 
 _URL = "https://json-schema.org/draft/2020-12/schema"
 # Of a mapping the name is the user's: of a signal, a parameter, a state.
@@ -201,18 +200,6 @@ def _meanings(section: type[BaseModel]) -> dict[str, str]:
     meanings: dict[str, str] = {}
     for each in reversed(section.__mro__):
         if issubclass(each, BaseModel) and each is not BaseModel:
-            meanings |= _stated(each)
+            meanings |= texts(each)
     aliases = {n: f.alias for n, f in section.model_fields.items() if f.alias}
     return {aliases.get(name, name): words for name, words in meanings.items()}
-
-
-def _stated(section: type[BaseModel]) -> dict[str, str]:
-    body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(section))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    stated = {}
-    for field, below in itertools.pairwise(body.body):
-        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
-            words = below.value.value  # pyright: ignore[reportAttributeAccessIssue]
-            stated[field.target.id] = " ".join(str(words).split())
-    return stated

@@ -129,11 +129,11 @@ def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic
         return None
     layout, home = head.layouts[letter], None
     if LAST_TIME in layout.predictors:
-        _leave_out(frames, letter, ~_follows(frames, letter, main))
+        _keep(frames, letter, _follows(frames, letter, main))
     if HOME in layout.predictors:
         home, known = _home(frames, head, main)
         if not known.all():  # a position is the distance from a home that is not known yet
-            _leave_out(frames, letter, ~known)
+            _keep(frames, letter, known)
             home = home[known]
     if not frames.starts[letter].size:
         return None
@@ -166,9 +166,9 @@ def _follows(frames: Frames, letter: str, main: MainFrames) -> np.ndarray:
     return np.max(before, axis=0) <= kept
 
 
-def _leave_out(frames: Frames, letter: str, which: np.ndarray) -> None:
-    frames.rows[letter] = frames.rows[letter][~which]
-    frames.starts[letter] = frames.starts[letter][~which]
+def _keep(frames: Frames, letter: str, which: np.ndarray) -> None:
+    frames.rows[letter] = frames.rows[letter][which]
+    frames.starts[letter] = frames.starts[letter][which]
 
 
 def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, np.ndarray]:

@@ -3,9 +3,6 @@
 A number that is not finite is null in the file, whatever its kind.
 """
 
-import ast
-import inspect
-import itertools
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,6 +24,7 @@ from heli_jax.identification.validation.closed_loop_trust import Moved
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.naming import texts
 from heli_jax.report.card import Gate
 
 
@@ -557,13 +555,4 @@ def _one_kind(kind: Any) -> str:
 
 
 def _stated(section: type) -> dict[str, str]:
-    """What stands below each field in the source, by field."""
-    words = _stated(_TOO[section]) if section in _TOO else {}
-    body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(section))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    for field, below in itertools.pairwise(body.body):
-        if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
-            continue
-        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-            words.setdefault(field.target.id, " ".join(str(below.value.value).split()))
-    return words
+    return texts(section) | (texts(_TOO[section]) if section in _TOO else {})
