@@ -51,9 +51,9 @@ def print_fit_keys(pattern: str | None, *, as_json: bool) -> None:
     Raises:
         InputError: no key holds it.
     """
-    from heli_jax.report import fit_format
+    from heli_jax.report import fit_keys
 
-    matches = fit_format.fit_keys() if pattern is None else fit_format.matching(pattern)
+    matches = fit_keys.fit_keys() if pattern is None else fit_keys.matching(pattern)
     if as_json:
         print(json.dumps([key._asdict() for key in matches], indent=1))
         return
