@@ -25,8 +25,10 @@ _UNCHANGED = 1e-3
 _DAMPING = 0.01
 """of the first step of a search from an optimum with another noise, in the optimiser's units"""
 _SETTLED = 3e-3
-"""squared joint standard deviations by which another noise moved the optimum, below which the
-relaxation of a noise that is a spectrum has ended: the next would move it by a fifth of that"""
+"""squared joint standard deviations by which another noise would move the optimum, below which the
+relaxation of a noise that is a spectrum has ended"""
+_SLOWER = 3.0
+"""times the fall from one such move to the next may the following fall be"""
 _EXPLAINED = 2.0
 """times the noise that a record shows by itself up to which its residual is that noise"""
 _WORTH_TELLING = 0.1
@@ -101,7 +103,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     layout, estimator = search.layout, search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
     # Where the first search began says nothing of the noise.
-    best = best._replace(moved=np.asarray(np.inf))
+    best, earlier = best._replace(moved=np.asarray(np.inf)), np.inf
     for _ in range(_ROUNDS):
         e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
@@ -121,16 +123,30 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where both stay they are so for each other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or best.moved < _SETTLED or not bool(best.converged):
+        settled = _next_move(float(best.moved), earlier) < _SETTLED
+        if change < _UNCHANGED or settled or not bool(best.converged):
             break
         if not moves:
             break
+        earlier = float(best.moved)
         # Near its optimum a search needs no damping, which would only take it longer.
         nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None, :], nearing=nearing)
         trace.append((int(best.steps), float(best.cost)))
     best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
     return RelaxedOptimum(best, noise, tuple(trace))
+
+
+def _next_move(moved: float, earlier: float) -> float:
+    """How far another noise would move the optimum, in squared joint standard deviations.
+
+    Args:
+        moved: how far the last one did.
+        earlier: how far the one before it did; inf where that is not known.
+    """
+    # Moves get smaller less fast the later they are, by up to this much from one to the next.
+    falls = _SLOWER * moved / earlier if np.isfinite(earlier) else 1.0
+    return moved * min(falls, 1.0)
 
 
 def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " q"]:
