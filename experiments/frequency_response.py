@@ -4,9 +4,10 @@
 
 Records of 120 s made with SciPy alone, moved by pilot steps or by a chirp, with gusts as large as
 the stick's response and with none; Ixx, If and kappa start 1.3 times off. `frequency-response` (in
-windows of WINDOW, 10 s) and `frequency-error` fit the same records. The bound is that of an
+windows of WINDOW, 20 s) and `frequency-error` fit the same records. The bound is that of an
 estimator that knows the gusts' spectrum and the noise: the sensitivities of the response through
-the Kalman filter that makes them white.
+the Kalman filter that makes them white. Covered: of the 95 % intervals that are stated; where a
+parameter is called not identifiable there is none.
 """
 
 import time
@@ -24,7 +25,6 @@ from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.result import Fit
 
 jax.config.update("jax_enable_x64", True)
-Z95 = 1.959963984540054
 METHODS = ("frequency-response", "frequency-error")
 
 
@@ -87,7 +87,8 @@ def record(rng: np.random.Generator, u: np.ndarray, sigma: float) -> Flight:
 def one_fit(
     flight: Flight, method: str, window: float | None
 ) -> tuple[Fit, np.ndarray, np.ndarray]:
-    """A fit from 1.3 times the truth, relative errors, and errors over the stated sd."""
+    """A fit from 1.3 times the truth, relative errors, and whether the stated 95 % intervals hold
+    the truth (NaN where none is stated)."""
     truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
     free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
     options = ResponseOptions(window=window)
@@ -96,14 +97,18 @@ def one_fit(
     )
     found = fit(problem)
     error = np.array([found.estimates[n].value for n in NAMES]) - truth
-    sd = np.array([found.estimates[n].sd or np.nan for n in NAMES])
-    return found, error / truth, error / sd
+    ends = [(found.estimates[n].lower95, found.estimates[n].upper95) for n in NAMES]
+    held = [
+        np.nan if a is None or b is None else float(a <= t <= b)
+        for (a, b), t in zip(ends, truth, strict=True)
+    ]
+    return found, error / truth, np.array(held)
 
 
 def one_run(
     seed: int, move: Callable, sigma: float, window: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
-    """By method relative errors, errors over the stated sd, the bound, the time, and whether
+    """By method relative errors, which intervals hold the truth, the bound, the time, and whether
     chi-squared lies in the interval that is expected of it (NaN where there is none)."""
     rng = np.random.default_rng(seed)
     u = move(rng)
@@ -111,12 +116,12 @@ def one_run(
     least, out = bound(u, sigma), []
     for method in METHODS:
         began = time.perf_counter()
-        found, error, z = one_fit(flight, method, window if method == METHODS[0] else None)
+        found, error, held = one_fit(flight, method, window if method == METHODS[0] else None)
         took = time.perf_counter() - began
         inside = np.nan
         if (responses := found.responses) is not None:
             inside = responses.lower95 < responses.chi_squared < responses.upper95
-        out.append((error, z, least, took, float(inside)))
+        out.append((error, held, least, took, float(inside)))
     return out
 
 
@@ -130,13 +135,14 @@ def main(runs: int, window: float) -> None:
             each = [one_run(seed, move, sigma, window) for seed in range(runs)]
             for k, method in enumerate(METHODS):
                 of_method = zip(*(run[k] for run in each), strict=True)
-                error, z, least, took, inside = (np.array(v) for v in of_method)
+                error, held, least, took, inside = (np.array(v) for v in of_method)
                 rmse = np.sqrt(np.mean(error**2, axis=0))
                 ratio = np.sqrt(np.mean((error / least) ** 2, axis=0))
-                covered = np.mean(np.abs(z) < Z95, axis=0)
+                stated = np.sum(np.isfinite(held), axis=0)
+                covered = np.nansum(held, axis=0) / np.maximum(stated, 1)
                 cells = [
-                    f"{100 * a:.3g} %, {b:.2f} of the bound, covered {100 * c:.0f} %"
-                    for a, b, c in zip(rmse, ratio, covered, strict=True)
+                    f"{100 * a:.3g} %, {b:.2f} of the bound, covered {100 * c:.0f} % of {n}"
+                    for a, b, c, n in zip(rmse, ratio, covered, stated, strict=True)
                 ]
                 name = f"{move.__name__} | {sigma:g} | {method}"
                 times = f"{np.median(took):.2f} | {100 * np.mean(inside):.0f} %"
@@ -150,6 +156,6 @@ if __name__ == "__main__":
         __doc__,
         "five minutes",
         Size("runs", 60, 2, "records of each stick, with gusts and without"),
-        Size("window", 10.0, 10.0, "of frequency-response [s]"),
+        Size("window", 20.0, 20.0, "of frequency-response [s]"),
     )
     main(options.runs, options.window)
