@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.spectral import cross_spectra, responses
+from heli_jax.analysis.spectral import OVERLAP, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, TransferFit
 
 _BLOCK = 4096
@@ -57,7 +57,7 @@ def window_error(
         np.concatenate([r[kept], _answer(fitted, r[windows.inputs[input]], hold)[None]])
         for r in windows.records
     ]
-    spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds)
+    spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds, OVERLAP)
     by = None if windows.instruments is None else [place[i] for i in windows.instruments]
     estimate = responses(spectra, [place[i] for i in windows.inputs], [len(kept)], by)
     return estimate.H[:, 0, input] - fitted.sampled(windows.omega, hold)
