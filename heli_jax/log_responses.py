@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from heli_jax.yaml_file import as_yaml
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
+_HOLDS = {"linear": "taken to move in straight lines", "zero-order": "held"}
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom from which on a transfer function is called too simple"""
 
@@ -70,7 +71,34 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return estimate
+    return estimate._replace(notes=(*estimate.notes, *between_samples(flights, estimate.holds)))
+
+
+def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[str]:
+    """What inputs were taken to do between samples where a log decided it, and what hangs on it.
+
+    Args:
+        flights: of one rate.
+        inputs: by name.
+    """
+    notes = []
+    for name in inputs:
+        holds = [f.hold[name] for f in flights]
+        if len(set(holds)) > 1:
+            notes.append(
+                f"{name}: of the first flight {_HOLDS[holds[0]]} between samples, of others "
+                f"{_HOLDS[next(h for h in holds if h != holds[0])]}; all are taken as the first: "
+                "state signals.inputs.*.hold, or take responses of like flights together"
+            )
+        elif holds[0] == "linear" and name in flights[0].hold_reason:
+            # The other way round nobody is misled: a stick that jumps is held.
+            reason = flights[0].hold_reason[name]
+            notes.append(
+                f"{name}: {_HOLDS['linear']} between samples, as it {reason}; was it a command "
+                "that is held, delays and phase delays are half a sample, "
+                f"{500.0 * flights[0].dt:.3g} ms, shorter (state signals.inputs.{name}.hold)"
+            )
+    return notes
 
 
 def _of_log(experiment: Experiment, log: str | None) -> Experiment:
