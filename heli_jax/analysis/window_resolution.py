@@ -36,6 +36,18 @@ class Windows(NamedTuple):
     """length of a window"""
 
 
+def forgets(fitted: TransferFit, seconds: float) -> bool:
+    """Whether a transfer function forgets within a window, so that what it does is known from the
+    record: its slowest mode falls to 1/e.
+
+    Args:
+        fitted: the transfer function.
+        seconds: length of a window.
+    """
+    poles = fitted.poles
+    return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
+
+
 def window_error(
     fitted: TransferFit, windows: Windows, input: int, hold: Hold
 ) -> Complex[np.ndarray, " k"] | None:
@@ -48,8 +60,7 @@ def window_error(
         input: the place of its input among the inputs.
         hold: what that does between samples.
     """
-    poles = fitted.poles
-    if not (np.isfinite(poles).all() and np.all(np.real(poles) * windows.seconds < -1.0)):
+    if not forgets(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})
     place = {i: j for j, i in enumerate(kept)}
