@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +18,14 @@ from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
-from heli_jax.numbers import number, plain_words
+from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
-_TOO_LARGE = 2.0
-"""chi-squared per degree of freedom from which on a transfer function is called too simple"""
+_HOLDS = {"linear": "taken to move in straight lines", "zero-order": "held"}
 
 
 def responses_of_log(
@@ -70,7 +69,34 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return estimate
+    return estimate._replace(notes=(*estimate.notes, *between_samples(flights, estimate.holds)))
+
+
+def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[str]:
+    """What inputs were taken to do between samples where a log decided it, and what hangs on it.
+
+    Args:
+        flights: of one rate.
+        inputs: by name.
+    """
+    notes = []
+    for name in inputs:
+        holds = [f.hold[name] for f in flights]
+        if len(set(holds)) > 1:
+            notes.append(
+                f"{name}: of the first flight {_HOLDS[holds[0]]} between samples, of others "
+                f"{_HOLDS[next(h for h in holds if h != holds[0])]}; all are taken as the first: "
+                "state signals.inputs.*.hold, or take responses of like flights together"
+            )
+        elif holds[0] == "linear" and name in flights[0].hold_reason:
+            # The other way round nobody is misled: a stick that jumps is held.
+            reason = flights[0].hold_reason[name]
+            notes.append(
+                f"{name}: {_HOLDS['linear']} between samples, as it {reason}; was it a command "
+                "that is held, delays and phase delays are half a sample, "
+                f"{500.0 * flights[0].dt:.3g} ms, shorter (state signals.inputs.{name}.hold)"
+            )
+    return notes
 
 
 def _of_log(experiment: Experiment, log: str | None) -> Experiment:
@@ -151,7 +177,7 @@ def not_usable(responses: FlightResponses) -> tuple[str, ...]:
 
 def print_responses(responses: FlightResponses) -> None:
     """What each response is good for, and the transfer functions, on standard output."""
-    from heli_jax.report.responses import FIT_HEAD, fit_row, useful_band
+    from heli_jax.report.responses import FIT_HEAD, fit_row, fit_sentences, useful_band
 
     rows = []
     for name, output in responses.outputs.items():
@@ -166,13 +192,5 @@ def print_responses(responses: FlightResponses) -> None:
         tell(f"{request.input} to {request.output}, {orders}:")
         for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
             tell(f"  {head}: {cell}")
-        if not fit.determined:
-            tell("  the response does not determine it: fewer poles, or more excitation, is needed")
-        elif not fit.converged:
-            tell("  the search did not converge: these numbers are no result")
-        elif fit.chi_squared > _TOO_LARGE:
-            tell(
-                f"  squared errors are {number(fit.chi_squared, 2)} times what the random errors "
-                "let expect: the order is too low, the machine is not linear, or a window of "
-                f"{responses.window:.3g} s does not resolve it"
-            )
+        for sentence in fit_sentences(fit, responses.window):
+            tell(f"  {plain_words(sentence)}")

@@ -122,7 +122,7 @@ def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():
     H = 12.0 / (s + 3.0)
     at = Measured(s.imag, H, 0.02 * np.abs(H), 1e3, np.full(60, 0.95))
     wanted = [Wanted("lat", "p", 0, poles) for poles in (1, 3)]
-    enough, more = (_content(w, fit_transfer(at, w.zeros, w.poles)) for w in wanted)
+    enough, more = (_content(w, fit_transfer(at, w.zeros, w.poles), 20.0) for w in wanted)
     assert (enough["status"], enough["converged"]) == ("converged", True)
     assert {} in more["denominator"]
     assert more["status"] != "converged"

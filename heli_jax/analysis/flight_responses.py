@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
-from heli_jax.analysis.spectral import CrossSpectra, composite, cross_spectra, responses
+from heli_jax.analysis.spectral import OVERLAP, CrossSpectra, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
@@ -302,7 +302,7 @@ def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> di
     m, first = len(inputs), len(inputs) + len(instruments)
     u, y = list(range(m)), list(range(first, first + len(outputs)))
     by = None if windows.instruments is None else list(windows.instruments)
-    spectra = cross_spectra(records, dt, omega, window)
+    spectra = cross_spectra(records, dt, omega, window, OVERLAP)
     estimate = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
@@ -348,7 +348,7 @@ def _several(
         if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
             continue
         own = length == 1.0
-        spectra = one if own else cross_spectra(records, dt, one.omega, length * window)
+        spectra = one if own else cross_spectra(records, dt, one.omega, length * window, OVERLAP)
         if np.min(spectra.averages) >= m + 1:
             several.append(spectra)
     return several

@@ -117,7 +117,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     sign, phase = (1, _loop_phase(points)) if kind == "open-loop" else _branch(grid, points)
     response = _Response(curve, grid, points, phase)
     numbers: dict[str, Number] = {}
-    sentences: list[str] = []
+    sentences = [curve.caution] if curve.caution else []
     if kind == "open-loop":
         _loop(response, numbers, sentences)
     else:

@@ -24,6 +24,9 @@ _PRECISE = 0.03
 octave"""
 _LEAST_BINS = 7
 """in a local fit, which reaches further where there are fewer"""
+_SHARP, _SURELY = 0.2, 4.0
+"""relative (or rad), and in standard deviations, by which two bins side by side are off their local
+fits where a response is sharper than these"""
 _AROUND = 3
 """bins to either side that say where the phase of one is"""
 _COHERENT = 0.6
@@ -70,6 +73,8 @@ class Curve(NamedTuple):
     """by frequency [rad/s]"""
     band: tuple[float, float]
     """[rad/s]"""
+    caution: str = ""
+    """where the curve is not the response itself, in words"""
 
 
 def integrated(curve: Curve) -> Curve:
@@ -83,7 +88,7 @@ def integrated(curve: Curve) -> Curve:
             gain_slope=p.gain_slope - 1.0,
         )
 
-    return Curve(at, curve.band)
+    return curve._replace(at=at)
 
 
 def times(curve: Curve, gain: float) -> Curve:
@@ -94,7 +99,7 @@ def times(curve: Curve, gain: float) -> Curve:
         p = curve.at(omega)
         return p._replace(log_gain=p.log_gain + np.log(abs(gain)), phase=p.phase + turned)
 
-    return Curve(at, curve.band)
+    return curve._replace(at=at)
 
 
 def without_hold(
@@ -149,7 +154,12 @@ def measured_curve(
     known = (octave_mean(omega, coherence) >= _COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
     coherent = _widest(np.log(omega), known)
     if coherent.size < _LEAST_BINS:
-        return f"its coherence stays below {_COHERENT} in the mean over an octave"
+        if not coherent.size:
+            return f"its coherence stays below {_COHERENT} in the mean over an octave"
+        return (
+            f"{coherent.size} frequencies side by side have a coherence of {_COHERENT} in the mean "
+            f"over an octave, expected {_LEAST_BINS} at least: more `points`, or more excitation"
+        )
     # Unwrapped past a bin that leaps, all that follows may be a turn off.
     known[coherent] &= ~_leaps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
@@ -174,7 +184,22 @@ def measured_curve(
             np.concatenate([nothing, gradient], axis=1),
         )
 
-    return Curve(at, (float(w[0]), float(w[-1])))
+    off = y - _local(x, x, relative)[0] @ y
+    return Curve(at, (float(w[0]), float(w[-1])), _too_sharp(w, np.max(np.abs(off), 1), relative))
+
+
+def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
+    """Where a response (k,) is off its own local fits by what is no random error, in words."""
+    far = (off > _SHARP) & (off > _SURELY * relative)
+    both = np.flatnonzero(far[:-1] & far[1:])
+    if not both.size:
+        return ""
+    hz = w[[both[0], both[-1] + 1]] / (2.0 * np.pi)
+    return (
+        f"caution: at {hz[0]:.3g} to {hz[1]:.3g} Hz the response is sharper than the half octave "
+        "that it is smoothed over, as beside a mode of little damping (a slung load, a tail boom): "
+        "what is read off below w180 may be far off, a fitted model or a transfer function tells"
+    )
 
 
 def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:

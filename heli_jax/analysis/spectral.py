@@ -26,6 +26,10 @@ _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
 _FINE = 64
 """samples whose turns are sines, each times those of every so many"""
+OVERLAP = 2.0 / 3.0
+"""of a Hann window with the next, for responses. The squares of such windows add up to the same at
+all times, so that what they cut off of answers that end outside of them, in proportion to the
+square's slope, cancels; of windows that overlap by half it does not"""
 _ROUNDING = 1e-14
 """of an output's density, what rounding leaves where the inputs explain all of it"""
 

@@ -19,6 +19,9 @@ _DELAYS = 13
 """from how many delays the search begins: the phase wraps, and each wrap has an optimum"""
 _SEARCHES = 3
 """of them go on to the optimum"""
+_AS_LIKELY = 10.8
+"""of squared errors over their variance, what one of two optima may be worse by chance (99.9 %, one
+degree of freedom)"""
 _RESOLVED = 1.95
 """frequencies closer than this over the window's length are not independent (Hann)"""
 _SINGULAR = 1e-10
@@ -185,13 +188,16 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
     if 2.0 * np.sum(_shares(measured)) <= unknowns:
         raise ValueError(
             f"expected more than {unknowns / 2:g} independent frequencies for {unknowns} "
-            f"coefficients, got {np.sum(_shares(measured)):.3g}: a wider band or longer windows"
+            f"coefficients, got {np.sum(_shares(measured)):.3g}: a wider band or longer windows, "
+            "fewer zeros and poles, or a lower limit of coherence"
         )
     begun = [_begin(scaled, zeros, poles, tau) for tau in _first_delays(scaled, delay)]
     # Those that begin nearest to the data: each search costs as much as all the starts.
     begun.sort(key=lambda x: _cost(scaled, x, zeros))
     best = min((_search(scaled, x, zeros, delay) for x in begun[:_SEARCHES]), key=lambda r: r.cost)
-    return _result(measured, scaled, best, zeros, delay)
+    freedom = _freedom(measured, best.x.size)
+    best = _stable(scaled, best, zeros, freedom) if delay else best
+    return _result(measured, scaled, best, zeros, delay, freedom)
 
 
 def _shares(m: Measured) -> np.ndarray:
@@ -288,14 +294,56 @@ def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
         )
 
 
-def _result(measured: Measured, scaled: _Scaled, optimum, zeros: int, delay: bool) -> TransferFit:
+def _freedom(measured: Measured, unknowns: int) -> float:
+    """Degrees of freedom, at least 1."""
+    return max(2.0 * float(np.sum(_shares(measured))) - unknowns, 1.0)
+
+
+def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
+    """The optimum with its fast growing poles turned over, where the data do not tell the two
+    apart.
+
+    In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, the more so
+    the farther p lies beyond: without a lot of evidence a machine has the pole that does not grow.
+    A slow one is another matter: it stands in the band, or an interval about zero holds it.
+
+    Args:
+        best: the optimum, its delay free.
+        freedom: degrees of freedom.
+    """
+    poles = _roots(best, zeros)
+    growing = _fast_growing(poles)
+    if not growing.any():
+        return best
+    x = best.x.copy()
+    x[: zeros + 1] *= (-1.0) ** np.sum(growing)
+    x[zeros + 1 : -1] = np.real(np.poly(np.where(growing, -np.conj(poles), poles)))[1:]
+    x[-1] -= np.sum(np.real(2.0 / poles[growing]))
+    other = _search(scaled, x, zeros, True)
+    allowed = _AS_LIKELY * max(2.0 * float(best.cost) / freedom, 1.0)
+    as_likely = 2.0 * float(other.cost - best.cost) <= allowed
+    fewer = np.sum(_fast_growing(_roots(other, zeros))) < np.sum(growing)
+    return other if as_likely and fewer else best
+
+
+def _roots(optimum, zeros: int) -> np.ndarray:
+    """(n,) poles in units of the band's middle."""
+    return np.roots(np.concatenate([[1.0], optimum.x[zeros + 1 : -1]]))
+
+
+def _fast_growing(poles: np.ndarray) -> np.ndarray:
+    return (np.real(poles) > 0) & (np.abs(poles) > 1.0)
+
+
+def _result(
+    measured: Measured, scaled: _Scaled, optimum, zeros: int, delay: bool, freedom: float
+) -> TransferFit:
     poles = optimum.x.size - zeros - 1 - delay
     # Back to seconds: a power of s less in a coefficient is a power of the scale more.
     powers = np.concatenate(
         [poles - np.arange(zeros, -1, -1), poles - np.arange(poles - 1, -1, -1), [-1] * delay]
     )
     units = scaled.speed ** powers.astype(float)
-    freedom = max(2.0 * float(np.sum(_shares(measured))) - optimum.x.size, 1.0)
     chi_squared = 2.0 * float(optimum.cost) / freedom
     # What the order leaves unexplained is no smaller than what it was measured to.
     sd = _deviations(optimum.jac) * max(chi_squared, 1.0) ** 0.5

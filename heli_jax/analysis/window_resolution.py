@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.spectral import cross_spectra, responses
+from heli_jax.analysis.spectral import OVERLAP, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, TransferFit
 
 _BLOCK = 4096
@@ -36,6 +36,18 @@ class Windows(NamedTuple):
     """length of a window"""
 
 
+def forgets(fitted: TransferFit, seconds: float) -> bool:
+    """Whether a transfer function forgets within a window, so that what it does is known from the
+    record: its slowest mode falls to 1/e.
+
+    Args:
+        fitted: the transfer function.
+        seconds: length of a window.
+    """
+    poles = fitted.poles
+    return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
+
+
 def window_error(
     fitted: TransferFit, windows: Windows, input: int, hold: Hold
 ) -> Complex[np.ndarray, " k"] | None:
@@ -48,8 +60,7 @@ def window_error(
         input: the place of its input among the inputs.
         hold: what that does between samples.
     """
-    poles = fitted.poles
-    if not (np.isfinite(poles).all() and np.all(np.real(poles) * windows.seconds < -1.0)):
+    if not forgets(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})
     place = {i: j for j, i in enumerate(kept)}
@@ -57,7 +68,7 @@ def window_error(
         np.concatenate([r[kept], _answer(fitted, r[windows.inputs[input]], hold)[None]])
         for r in windows.records
     ]
-    spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds)
+    spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds, OVERLAP)
     by = None if windows.instruments is None else [place[i] for i in windows.instruments]
     estimate = responses(spectra, [place[i] for i in windows.inputs], [len(kept)], by)
     return estimate.H[:, 0, input] - fitted.sampled(windows.omega, hold)

@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
+from heli_jax.analysis.window_resolution import forgets
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number
@@ -32,6 +33,8 @@ _FILES = (
     "handling_qualities.json",
 )
 _DB = 20.0 / np.log(10.0)
+_TOO_LARGE = 2.0
+"""chi-squared per degree of freedom from which on a transfer function is called too simple"""
 
 
 def write_responses(
@@ -58,7 +61,7 @@ def write_responses(
     """
     write_table(directory / "responses.csv", table(responses))
     _write_netcdf(directory / "responses.nc", responses, units)
-    fits = [_content(*fit) for fit in responses.fits]
+    fits = [_content(*fit, responses.window) for fit in responses.fits]
     (directory / "transfer_functions.json").write_text(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -87,6 +90,11 @@ def write_responses(
                 for w, fit in responses.fits
             ],
         ),
+        fit_sentences=[
+            f"{w.input} to {w.output}: {sentence}"
+            for w, fit in responses.fits
+            for sentence in fit_sentences(fit, responses.window)
+        ],
         window=f"{responses.window:g}",
         handling=handling_table(handling),
         handling_sentences=handling_sentences(handling),
@@ -196,7 +204,7 @@ def _write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, st
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
 
-def _content(request: Wanted, fit: TransferFit) -> dict[str, Any]:
+def _content(request: Wanted, fit: TransferFit, window: float) -> dict[str, Any]:
     poles_known = all(c.determined for c in fit.denominator)
     zeros_known = all(c.determined for c in fit.numerator)
     delay_known = fit.delay is None or fit.delay.determined
@@ -217,6 +225,8 @@ def _content(request: Wanted, fit: TransferFit) -> dict[str, Any]:
         "status": status,
         "converged": status == "converged",
         "determined": fit.determined,
+        "windows_taken_off": forgets(fit, window),
+        "sentences": fit_sentences(fit, window),
     }
 
 
@@ -225,6 +235,38 @@ def _number(c: Coefficient) -> dict[str, float]:
     if not c.determined:
         return {}
     return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
+
+
+def fit_sentences(fit: TransferFit, window: float) -> list[str]:
+    """What is to be heeded of a transfer function.
+
+    Args:
+        fit: the transfer function.
+        window: [s]
+    """
+    if not fit.determined:
+        return ["the response does not determine it: fewer poles, or more excitation, is needed"]
+    if not fit.converged:
+        return ["the search did not converge: these numbers are no result"]
+    said = []
+    if fit.chi_squared > _TOO_LARGE:
+        said.append(
+            f"squared errors are {number(fit.chi_squared, 2)} times what the random errors let "
+            "expect: the order is too low, the machine is not linear, or a window of "
+            f"{window:.3g} s does not resolve it"
+        )
+    if not forgets(fit, window):
+        last = max(fit.poles, key=lambda p: p.real)
+        # Two periods in a window are the least that it resolves.
+        slow = abs(last) * window < 4.0 * np.pi
+        said.append(
+            f"a pole of {number(last.real, 2)} 1/s is not forgotten within a window of "
+            f"{window:.3g} s, so what the windows cut off of answers is not taken off, and "
+            "intervals may be too narrow"
+            + ("; it is not told from an integrator's or a slower one" if slow else "")
+            + ": of an angle fit the rate's response, or a model by frequency-error"
+        )
+    return said
 
 
 FIT_HEAD = ("numerator", "denominator", "delay [ms]", "chi² per degree", "J")

@@ -8,6 +8,7 @@ from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import Panels, panels
+from heli_jax.report.figures.responses import last_of
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import phase
 from heli_jax.report.sketch import Sketch
@@ -49,7 +50,7 @@ def match(
     axes[2].set_ylim(0.0, 1.05)
     _draw_error(axes[3:], pair, known & modelled)
     axes[0].set_xscale("log")
-    axes[0].set_xlim(pair.omega[0], pair.omega[known][-1] if known.any() else pair.omega[-1])
+    axes[0].set_xlim(pair.omega[0], pair.omega[last_of(pair.omega, pair.coherence, known)])
     style.plain_log_ticks(axes[0])
     labels = (f"gain [{unit}]", "phase [deg]", "coherence", "error [dB]", "error [deg]")
     for ax, words in zip(axes, labels, strict=True):

@@ -21,6 +21,9 @@ _WIDE = 1.0
 _SEEN = 0.1
 """mean coherence over an octave below which bins neither set the axes nor tell the phase's branch:
 there it is chance"""
+_BEYOND_CHANCE = 0.3
+"""mean coherence over an octave that chance hardly makes, of three or four averages too: up to the
+last such bin frequencies are drawn"""
 _MARGINS = (6.0, 45.0)
 """dB and deg beyond what sets the axes"""
 
@@ -67,7 +70,7 @@ def draw_response(
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
     axes[0].set_xscale("log")
-    axes[0].set_xlim(hz[0], hz[known][-1] if known.any() else hz[-1])
+    axes[0].set_xlim(hz[0], hz[last_of(omega, pair.coherence, known)])
     style.plain_log_ticks(axes[0])
     axes[0].set_ylabel(f"gain [dB re {unit}]" if unit != "1" else "gain [dB]")
     axes[1].set_ylabel("phase [deg]")
@@ -90,6 +93,23 @@ def seen_of(omega: np.ndarray, pair: Any) -> np.ndarray:
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
     return known & (octave_mean(omega, pair.coherence) >= _SEEN)
+
+
+def last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> int:
+    """The place of the last frequency that the axes hold.
+
+    Single bins are coherent by chance up to the end of the band, far above what was excited.
+
+    Args:
+        omega: (k,) [rad/s]
+        coherence: (k,) partial.
+        known: (k,) bool, bins that are drawn where there is room.
+    """
+    mean = octave_mean(omega, coherence)
+    for bins in (known & (mean >= _BEYOND_CHANCE), known & (mean >= _SEEN), known):
+        if bins.any():
+            return int(np.flatnonzero(bins)[-1])
+    return omega.size - 1
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:

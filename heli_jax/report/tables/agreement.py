@@ -79,7 +79,7 @@ def responses(fit: Fit) -> Table | None:
             f"{p.lines}/{p.of}",
             number(p.coherence, 2),
             number(p.chi_squared, 2),
-            number(p.J, 3),
+            number(p.J, 3) if math.isfinite(p.J) else NOTHING,
             "in windows" if p.simulated else "in windows, ends free",
         )
         for p in agreement.pairs

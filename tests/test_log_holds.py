@@ -1,0 +1,23 @@
+"""What `heli-jax frf` says of inputs between samples."""
+
+import numpy as np
+
+from heli_jax import Flight
+from heli_jax.log_responses import between_samples
+
+
+def _flight(hold: str, reason: dict[str, str]) -> Flight:
+    t = np.arange(0.0, 4.0, 0.02)
+    signals = {"lat": np.sin(t)}, {"p": np.cos(t)}
+    return Flight(0.02, *signals, hold={"lat": hold}, hold_reason=reason)
+
+
+def test_what_a_log_decided_of_an_input_between_samples_is_said_with_what_hangs_on_it() -> None:
+    decided = _flight("linear", {"lat": "moves at 100 % of the samples"})
+    (note,) = between_samples([decided], ["lat"])
+    assert "straight lines" in note
+    assert "10 ms, shorter" in note
+    assert not between_samples([_flight("linear", {})], ["lat"])  # as stated
+    assert not between_samples([_flight("zero-order", {"lat": "jumps once and stays"})], ["lat"])
+    (note,) = between_samples([decided, _flight("zero-order", {})], ["lat"])
+    assert "all are taken as the first" in note
