@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import number, plain_words
 from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
@@ -70,7 +71,30 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return estimate
+    return estimate._replace(notes=(*estimate.notes, *_guessed_holds(flights[0], estimate.holds)))
+
+
+def _guessed_holds(flight: Flight, moving: Collection[str]) -> tuple[str, ...]:
+    """That delays hang on what inputs do between samples, of those of which that was guessed.
+
+    No model is fitted here that the record could be asked by. Held inputs are what a reader expects
+    of a stick, and a low-passed one can be no other than linear.
+    """
+    guessed = [
+        n
+        for n in moving
+        if n in flight.hold_reason
+        and flight.hold[n] == "linear"
+        and not is_low_passed(flight.hold_reason[n])
+    ]
+    if not guessed:
+        return ()
+    return (
+        f"{', '.join(guessed)}: taken as linear between samples, which is a guess; if it is a "
+        "command that was held from sample to sample, half a sample is in each delay and phase "
+        f"delay ({500.0 * flight.dt:.3g} ms too much) and bandwidths are too low: state hold: "
+        "zero-order, or linear where it was measured on its way",
+    )
 
 
 def _of_log(experiment: Experiment, log: str | None) -> Experiment:

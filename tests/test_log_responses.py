@@ -11,12 +11,12 @@ import scipy.signal
 import xarray as xr
 
 from heli_jax.analysis.attitude_responses import handling_gaps
-from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_responses
 from heli_jax.analysis.transfer_fit import Measured, fit_transfer
 from heli_jax.cli import main
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
-from heli_jax.report.figures.responses import branch_of
+from heli_jax.report.figures.responses import branch_of, seen_of
 from heli_jax.report.responses import _content
 
 DT = 0.02
@@ -175,6 +175,34 @@ def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, ca
     config.write_text(text)
     assert main(["frf", str(config), "--out", str(tmp_path / "direct")]) == 0
     assert "lat: taken for inputs that do not follow the outputs" in capsys.readouterr().err
+
+
+def test_half_a_sample_of_delay_that_hangs_on_a_guess_is_said(config, tmp_path, capsys):
+    """A stick that moves at every sample was held all the same: the delay is 10 ms too long."""
+    known = config.read_text()
+    config.write_text(known.replace(", hold: zero-order", ""))
+    out = tmp_path / "guessed"
+    assert main(["frf", str(config), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "lat: taken as linear between samples, which is a guess" in said
+    assert "10 ms too much" in said
+    assert "which is a guess" in (out / "responses.html").read_text()
+    [late] = json.loads((out / "transfer_functions.json").read_text())
+    config.write_text(known)
+    assert main(["frf", str(config), "--out", str(tmp_path / "known")]) == 0
+    assert "which is a guess" not in capsys.readouterr().err
+    [right] = json.loads((tmp_path / "known" / "transfer_functions.json").read_text())
+    assert late["delay_s"]["value"] - right["delay_s"]["value"] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_what_chance_makes_of_few_averages_sets_no_axes():
+    omega = np.geomspace(1.0, 100.0, 120)
+    coherence = np.where(omega < 20.0, 0.9, 0.15)  # chance makes an eighth of eight averages
+    pair = Pair(1.0 / (1j * omega), np.full(120, 1e-3), coherence, np.full(120, np.nan + 0j))
+    few, many = (seen_of(omega, pair, averages) for averages in (8.0, 100.0))
+    assert few[omega < 15.0].all()
+    assert not few[omega > 30.0].any()
+    assert many.all()
 
 
 @pytest.mark.parametrize(

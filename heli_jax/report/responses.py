@@ -110,7 +110,13 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
     unit = quotient(units[output], units[input])
     return draw_response(
-        (input, output), responses.omega, measured.pairs[input], unit, note, curves
+        (input, output),
+        responses.omega,
+        measured.pairs[input],
+        unit,
+        note,
+        measured.averages,
+        curves,
     )
 
 
@@ -127,7 +133,7 @@ def table(responses: FlightResponses) -> dict[str, Any]:
     numbers: dict[str, list[np.ndarray]] = {}
     for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            k = responses.omega.size
+            k, seen = responses.omega.size, seen_of(responses.omega, pair, output.averages)
             columns["input"] += [input] * k
             columns["output"] += [name] * k
             with np.errstate(all="ignore"):
@@ -135,7 +141,7 @@ def table(responses: FlightResponses) -> dict[str, Any]:
                     "frequency_hz": responses.omega / (2.0 * np.pi),
                     "gain": np.abs(pair.H),
                     "gain_db": 20.0 * np.log10(np.abs(pair.H)),
-                    "phase_deg": branch_of(responses.omega, pair.H, seen_of(responses.omega, pair)),
+                    "phase_deg": branch_of(responses.omega, pair.H, seen),
                     "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
