@@ -150,7 +150,7 @@ def check(problem: Problem) -> Check:
     """
     _require_problem(problem)
     guess = _with_likely_gusts(problem)
-    noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
+    noise = guess.layout.estimator.as_it_ends(guess.layout, guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     # At the start values, since nothing else is known yet: where these are far off, what is
