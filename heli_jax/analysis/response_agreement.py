@@ -33,7 +33,8 @@ class PairAgreement(NamedTuple):
     coherence: float
     """mean partial coherence over those that take part"""
     J: float
-    """Tischler's cost over about twenty of them; NaN where none takes part"""
+    """Tischler's cost over about twenty of them with a coherence of 0.6 in the mean over an octave;
+    NaN where there are none"""
     chi_squared: float
     """squared errors over their variance, in the mean; 1 is expected"""
     simulated: bool
@@ -171,10 +172,13 @@ def pair_agreements(
 
 
 def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Over frequencies about equally spaced in the logarithm, as it is usually taken."""
+    """Over frequencies about equally spaced in the logarithm, as it is usually taken; where the
+    response is coherent, since errors of noise in decibels know no bound."""
     # Here: it brings SciPy's optimiser, which takes longer to import than this to run.
+    from heli_jax.analysis.response_curves import COHERENT, octave_mean
     from heli_jax.analysis.transfer_fit import Measured, mismatch
 
+    used = used & (octave_mean(2.0 * np.pi * w.hz, of_pair[2]) >= COHERENT)
     if not used.any():
         return float("nan")
     hz = w.hz[used]

@@ -26,7 +26,7 @@ _LEAST_BINS = 7
 """in a local fit, which reaches further where there are fewer"""
 _AROUND = 3
 """bins to either side that say where the phase of one is"""
-_COHERENT = 0.6
+COHERENT = 0.6
 """mean coherence over an octave from which on a response is taken for the input's: Tischler and
 Remple, Aircraft and Rotorcraft System Identification (2012)"""
 
@@ -146,10 +146,10 @@ def measured_curve(
         coherence: (k,) partial.
         window: length of the Hann windows [s].
     """
-    known = (octave_mean(omega, coherence) >= _COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
+    known = (octave_mean(omega, coherence) >= COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
     coherent = _widest(np.log(omega), known)
     if coherent.size < _LEAST_BINS:
-        return f"its coherence stays below {_COHERENT} in the mean over an octave"
+        return f"its coherence stays below {COHERENT} in the mean over an octave"
     # Unwrapped past a bin that leaps, all that follows may be a turn off.
     known[coherent] &= ~_leaps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
