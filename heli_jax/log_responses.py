@@ -71,7 +71,22 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return estimate._replace(notes=(*estimate.notes, *_guessed_holds(flights[0], estimate.holds)))
+    notes = (*_read_in_degrees(experiment, flights), *_guessed_holds(flights[0], estimate.holds))
+    return estimate._replace(notes=(*estimate.notes, *notes))
+
+
+def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[str, ...]:
+    """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
+    shows it."""
+    # Not before it is needed: it brings what fits are judged by.
+    from heli_jax.identification.unknowns.nuisances import labels
+    from heli_jax.identification.validation.misread import degrees_for_radians
+
+    return tuple(
+        doubt.finding.sentence
+        for label, flight in zip(labels(tuple(flights)), flights, strict=True)
+        for doubt in degrees_for_radians(experiment.model, label, flight)
+    )
 
 
 def _guessed_holds(flight: Flight, moving: Collection[str]) -> tuple[str, ...]:

@@ -195,6 +195,21 @@ def test_half_a_sample_of_delay_that_hangs_on_a_guess_is_said(config, tmp_path, 
     assert late["delay_s"]["value"] - right["delay_s"]["value"] == pytest.approx(0.01, abs=1e-3)
 
 
+def test_degrees_that_are_read_as_radians_are_said(config, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    head, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    at = head.index("gyro")
+    for row in rows:
+        row[at] = str(np.degrees(float(row[at])))
+    log.write_text("\n".join(",".join(row) for row in [head, *rows]))
+    assert main(["frf", str(config), "--out", str(tmp_path / "degrees")]) == 0
+    said = capsys.readouterr().err
+    assert "'gyro' looks like deg/s read as rad/s; state unit: deg/s" in said
+    assert "state unit: deg/s" in (tmp_path / "degrees" / "responses.html").read_text()
+    assert main(["frf", str(config), "--set", "frequency.window=100", "--out", "none"]) == 2
+    assert "a longer record, or a shorter window" in capsys.readouterr().err
+
+
 def test_what_chance_makes_of_few_averages_sets_no_axes():
     omega = np.geomspace(1.0, 100.0, 120)
     coherence = np.where(omega < 20.0, 0.9, 0.15)  # chance makes an eighth of eight averages
