@@ -19,15 +19,13 @@ from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.numbers import number, plain_words
+from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
-_TOO_LARGE = 2.0
-"""chi-squared per degree of freedom from which on a transfer function is called too simple"""
 
 
 def responses_of_log(
@@ -190,7 +188,7 @@ def not_usable(responses: FlightResponses) -> tuple[str, ...]:
 
 def print_responses(responses: FlightResponses) -> None:
     """What each response is good for, and the transfer functions, on standard output."""
-    from heli_jax.report.responses import FIT_HEAD, fit_row, useful_band
+    from heli_jax.report.responses import FIT_HEAD, doubts_of_fit, fit_row, useful_band
 
     rows = []
     for name, output in responses.outputs.items():
@@ -205,13 +203,5 @@ def print_responses(responses: FlightResponses) -> None:
         tell(f"{request.input} to {request.output}, {orders}:")
         for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
             tell(f"  {head}: {cell}")
-        if not fit.determined:
-            tell("  the response does not determine it: fewer poles, or more excitation, is needed")
-        elif not fit.converged:
-            tell("  the search did not converge: these numbers are no result")
-        elif fit.chi_squared > _TOO_LARGE:
-            tell(
-                f"  squared errors are {number(fit.chi_squared, 2)} times what the random errors "
-                "let expect: the order is too low, the machine is not linear, or a window of "
-                f"{responses.window:.3g} s does not resolve it"
-            )
+        for sentence in doubts_of_fit(fit, responses.window):
+            tell(f"  {sentence}")

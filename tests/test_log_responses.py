@@ -12,12 +12,12 @@ import xarray as xr
 
 from heli_jax.analysis.attitude_responses import handling_gaps
 from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_responses
-from heli_jax.analysis.transfer_fit import Measured, fit_transfer
+from heli_jax.analysis.transfer_fit import Measured, TransferFit, fit_transfer
 from heli_jax.cli import main
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report.figures.responses import branch_of, seen_of
-from heli_jax.report.responses import _content
+from heli_jax.report.responses import _content, doubts_of_fit, fit_row
 
 DT = 0.02
 ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
@@ -115,6 +115,21 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert all((out / link).exists() for link in links)
     assert "Configuration, in full" in page
     assert (out / "figures/p-lat.svg").exists()
+
+
+def test_poles_are_told_by_frequency_and_damping_and_unstable_ones_are_doubted():
+    s = 1j * np.geomspace(0.5, 30.0, 60)
+
+    def fitted(damping: float) -> TransferFit:
+        H = 50.0 / (s**2 + 2.0 * damping * 8.0 * s + 64.0)
+        at = Measured(s.imag, H, 0.02 * np.abs(H), 1e3, np.full(60, 0.95))
+        return fit_transfer(at, 0, 2)
+
+    assert fit_row(fitted(0.3))[2] == "ω 8, ζ 0.3"
+    assert doubts_of_fit(fitted(0.3), 10.0) == ()
+    assert fit_row(fitted(-0.1))[2] == "ω 8, ζ −0.1"
+    [said] = doubts_of_fit(fitted(-0.1), 10.0)
+    assert "unstable (a pole with the real part +0.8 rad/s)" in said
 
 
 def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():

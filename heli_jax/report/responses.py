@@ -32,6 +32,8 @@ _FILES = (
     "handling_qualities.json",
 )
 _DB = 20.0 / np.log(10.0)
+_TOO_LARGE = 2.0
+"""chi-squared per degree of freedom from which on a transfer function is called too simple"""
 
 
 def write_responses(
@@ -87,6 +89,11 @@ def write_responses(
                 for w, fit in responses.fits
             ],
         ),
+        fit_sentences=[
+            f"{w.input} to {w.output}, {w.zeros} zeros, {w.poles} poles: {sentence}"
+            for w, fit in responses.fits
+            for sentence in doubts_of_fit(fit, responses.window)
+        ],
         window=f"{responses.window:g}",
         handling=handling_table(handling),
         handling_sentences=handling_sentences(handling),
@@ -233,15 +240,16 @@ def _number(c: Coefficient) -> dict[str, float]:
     return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
 
 
-FIT_HEAD = ("numerator", "denominator", "delay [ms]", "chi² per degree", "J")
+FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
 
 
 def fit_row(fit: TransferFit) -> tuple[str, ...]:
-    """Numerator, denominator, delay with their sd, chi-squared and J, as text."""
+    """Numerator, denominator, delay with their sd, poles, chi-squared and J, as text."""
     delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
     return (
         _polynomial(fit.numerator, ""),
         _polynomial(fit.denominator, f"s{_power(len(fit.denominator))}"),
+        _roots(fit),
         delay,
         number(fit.chi_squared, 3),
         number(fit.J, 3),
@@ -254,6 +262,48 @@ def _polynomial(coefficients: tuple[Coefficient, ...], lead: str) -> str:
         n = len(coefficients) - 1 - i
         terms.append(f"({_measured(c)})" + (f" s{_power(n)}" if n else ""))
     return " + ".join(terms)
+
+
+def _roots(fit: TransferFit) -> str:
+    """Poles as frequency and damping of a pair, or as a number: as transfer functions are written
+    in handling qualities."""
+    if not all(c.determined for c in fit.denominator):
+        return "not determined"
+    words = []
+    for pole in sorted(fit.poles, key=abs):
+        if pole.imag > 0.0:
+            damping = number(-pole.real / abs(pole), 3)
+            words.append(f"ω {number(abs(pole), 4)}, ζ {damping}")
+        elif pole.imag == 0.0:
+            words.append(number(pole.real, 4))
+    return "; ".join(words)
+
+
+def doubts_of_fit(fit: TransferFit, window: float) -> tuple[str, ...]:
+    """What keeps a transfer function from being taken for the machine's, in sentences.
+
+    Args:
+        fit: the transfer function.
+        window: length of the windows that its response was taken in [s].
+    """
+    if not fit.determined:
+        return ("the response does not determine it: fewer poles, or more excitation, is needed",)
+    if not fit.converged:
+        return ("the search did not converge: these numbers are no result",)
+    said = []
+    if fit.chi_squared > _TOO_LARGE:
+        said.append(
+            f"squared errors are {number(fit.chi_squared, 2)} times what the random errors "
+            "let expect: the order is too low, the machine is not linear, or a window of "
+            f"{window:.3g} s does not resolve it"
+        )
+    known = all(c.determined for c in fit.denominator)
+    if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
+        said.append(
+            f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
+            "the machine is not, a stick logged late, feedback or a wrong order makes it so"
+        )
+    return tuple(said)
 
 
 def _power(n: int) -> str:
