@@ -21,6 +21,7 @@ from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, t
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.report.fitted_responses import NO_RESPONSES
 from heli_jax.report.tables.handling import handling_lines
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
@@ -107,6 +108,11 @@ def _print_handling(run: FitRun) -> None:
     """Handling qualities of model and data, and of which axes there are none."""
     if run.supplementary.responses is None:
         return
+    # Whoever states a band or a window asks for them.
+    if run.config.config.frequency is not None:
+        for note in run.supplementary.responses.notes:
+            if note.startswith(NO_RESPONSES):
+                tell(f"! {note}")
     for line in handling_lines(run.supplementary.responses.handling):
         tell(plain_words(line))
     logged = {n for f in run.problem.training for n in f.outputs}

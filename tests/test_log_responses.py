@@ -4,20 +4,26 @@ import csv
 import dataclasses
 import json
 import re
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import scipy.signal
 import xarray as xr
 
+from heli_jax import output
 from heli_jax.analysis.attitude_responses import handling_gaps
 from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_responses
 from heli_jax.analysis.transfer_fit import Measured, TransferFit, fit_transfer
 from heli_jax.cli import main
+from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report.figures.responses import branch_of, seen_of
+from heli_jax.report.fitted_responses import NO_RESPONSES, FittedResponses
 from heli_jax.report.responses import _content, doubts_of_fit, fit_row
+from heli_jax.workflow import FitRun
 
 DT = 0.02
 ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
@@ -290,6 +296,20 @@ def test_flights_of_two_rates_are_refused():
     other = Flight(dt=0.01, inputs=flight(0).inputs, outputs=flight(0).outputs)
     with pytest.raises(ValueError, match="expected flights of one rate, got 50, 100 Hz"):
         flight_responses([flight(0), other])
+
+
+def test_a_fit_says_that_the_band_which_was_asked_for_has_no_responses(monkeypatch, capsys):
+    monkeypatch.setattr(output, "missing_handling", lambda *_: ())
+    none = FittedResponses((), 0, (), "", (f"{NO_RESPONSES}: band: expected more", "lat is still"))
+    for asked in (None, FrequencyConfig()):
+        run = SimpleNamespace(
+            supplementary=SimpleNamespace(responses=none),
+            config=SimpleNamespace(config=SimpleNamespace(frequency=asked)),
+            problem=SimpleNamespace(training=()),
+        )
+        output._print_handling(cast(FitRun, run))
+        said = f"! {NO_RESPONSES}: band: expected more\n" if asked else ""
+        assert capsys.readouterr().out == said
 
 
 def test_an_order_that_is_too_low_is_called_so():
