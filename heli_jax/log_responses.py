@@ -18,6 +18,7 @@ from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
@@ -69,7 +70,8 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    return estimate._replace(notes=(*estimate.notes, *between_samples(flights, estimate.holds)))
+    notes = (*_read_in_degrees(experiment, flights), *between_samples(flights, estimate.holds))
+    return estimate._replace(notes=(*estimate.notes, *notes))
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[str]:
@@ -88,15 +90,32 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
                 f"{_HOLDS[next(h for h in holds if h != holds[0])]}; all are taken as the first: "
                 "state signals.inputs.*.hold, or take responses of like flights together"
             )
-        elif holds[0] == "linear" and name in flights[0].hold_reason:
-            # The other way round nobody is misled: a stick that jumps is held.
-            reason = flights[0].hold_reason[name]
+        elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
+            # The other way round nobody is misled: a stick that jumps is held. A low-passed one can
+            # be no other than linear.
+            if is_low_passed(reason):
+                continue
             notes.append(
-                f"{name}: {_HOLDS['linear']} between samples, as it {reason}; was it a command "
-                "that is held, delays and phase delays are half a sample, "
-                f"{500.0 * flights[0].dt:.3g} ms, shorter (state signals.inputs.{name}.hold)"
+                f"{name}: {_HOLDS['linear']} between samples, as it {reason}, which is a guess; if "
+                "it is a command that is held from sample to sample, delays and phase delays are "
+                f"half a sample, {500.0 * flights[0].dt:.3g} ms, shorter and bandwidths higher: "
+                f"state signals.inputs.{name}.hold"
             )
     return notes
+
+
+def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[str, ...]:
+    """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
+    shows it."""
+    # Not before it is needed: it brings what fits are judged by.
+    from heli_jax.identification.unknowns.nuisances import labels
+    from heli_jax.identification.validation.misread import degrees_for_radians
+
+    return tuple(
+        doubt.finding.sentence
+        for label, flight in zip(labels(tuple(flights)), flights, strict=True)
+        for doubt in degrees_for_radians(experiment.model, label, flight)
+    )
 
 
 def _of_log(experiment: Experiment, log: str | None) -> Experiment:

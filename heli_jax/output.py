@@ -21,6 +21,7 @@ from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, t
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.report.fitted_responses import NO_RESPONSES
 from heli_jax.report.tables.handling import handling_lines
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
@@ -107,6 +108,11 @@ def _print_handling(run: FitRun) -> None:
     """Handling qualities of model and data, and of which axes there are none."""
     if run.supplementary.responses is None:
         return
+    # Whoever states a band or a window asks for them.
+    if run.config.config.frequency is not None:
+        for note in run.supplementary.responses.notes:
+            if note.startswith(NO_RESPONSES):
+                tell(f"! {note}")
     for line in handling_lines(run.supplementary.responses.handling):
         tell(plain_words(line))
     logged = {n for f in run.problem.training for n in f.outputs}
@@ -232,14 +238,20 @@ def print_check(check: Check) -> None:
         # The covariance is that of the logarithms: its root is the relative sd.
         relative = math.sqrt(verdict.covariance[i, i])
         lacking = name in verdict.undetermined or name in verdict.without_effect
-        expected = "not determined" if lacking else f"{terse(100 * relative, 2)} %"
+        expected = f"{terse(100 * relative, 2)} %"
+        if name in check.at_zero:
+            size, unit = check.at_zero[name]
+            expected = f"{terse(size * relative, 2)} {unit}"
+        expected = "not determined" if lacking else expected
         rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
         tell(f"noise of {name}: {terse(sd, 3)}{guess}")
     follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
-    sds = np.sqrt(np.diag(verdict.covariance))
+    # Of a value of zero an sd is no part.
+    kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
+    sds = np.sqrt(np.diag(verdict.covariance))[kept]
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         tell(f"! {sentence}")
     for note in check.further_notes:

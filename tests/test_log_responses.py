@@ -4,20 +4,26 @@ import csv
 import dataclasses
 import json
 import re
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import scipy.signal
 import xarray as xr
 
+from heli_jax import output
 from heli_jax.analysis.attitude_responses import handling_gaps
-from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
-from heli_jax.analysis.transfer_fit import Measured, fit_transfer
+from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_responses
+from heli_jax.analysis.transfer_fit import Measured, TransferFit, fit_transfer
 from heli_jax.cli import main
+from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
-from heli_jax.report.figures.responses import branch_of
-from heli_jax.report.responses import _content
+from heli_jax.report.figures.responses import branch_of, seen_of
+from heli_jax.report.fitted_responses import NO_RESPONSES, FittedResponses
+from heli_jax.report.responses import _content, fit_row, fit_sentences
+from heli_jax.workflow import FitRun
 
 DT = 0.02
 ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
@@ -117,6 +123,21 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert (out / "figures/p-lat.svg").exists()
 
 
+def test_poles_are_told_by_frequency_and_damping_and_unstable_ones_are_doubted():
+    s = 1j * np.geomspace(0.5, 30.0, 60)
+
+    def fitted(damping: float) -> TransferFit:
+        H = 50.0 / (s**2 + 2.0 * damping * 8.0 * s + 64.0)
+        at = Measured(s.imag, H, 0.02 * np.abs(H), 1e3, np.full(60, 0.95))
+        return fit_transfer(at, 0, 2)
+
+    assert fit_row(fitted(0.3))[2] == "ω 8, ζ 0.3"
+    assert not fit_sentences(fitted(0.3), 10.0)
+    assert fit_row(fitted(-0.1))[2] == "ω 8, ζ −0.1"
+    [_, said] = fit_sentences(fitted(-0.1), 10.0)
+    assert "unstable (a pole with the real part +0.8 rad/s)" in said
+
+
 def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():
     s = 1j * np.geomspace(0.5, 30.0, 60)
     H = 12.0 / (s + 3.0)
@@ -177,6 +198,49 @@ def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, ca
     assert "lat: taken for inputs that do not follow the outputs" in capsys.readouterr().err
 
 
+def test_half_a_sample_of_delay_that_hangs_on_a_guess_is_said(config, tmp_path, capsys):
+    """A stick that moves at every sample was held all the same: the delay is 10 ms too long."""
+    known = config.read_text()
+    config.write_text(known.replace(", hold: zero-order", ""))
+    out = tmp_path / "guessed"
+    assert main(["frf", str(config), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "lat: taken to move in straight lines between samples" in said
+    assert "half a sample, 10 ms, shorter" in said
+    assert "which is a guess" in (out / "responses.html").read_text()
+    [late] = json.loads((out / "transfer_functions.json").read_text())
+    config.write_text(known)
+    assert main(["frf", str(config), "--out", str(tmp_path / "known")]) == 0
+    assert "which is a guess" not in capsys.readouterr().err
+    [right] = json.loads((tmp_path / "known" / "transfer_functions.json").read_text())
+    assert late["delay_s"]["value"] - right["delay_s"]["value"] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_degrees_that_are_read_as_radians_are_said(config, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    head, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    at = head.index("gyro")
+    for row in rows:
+        row[at] = str(np.degrees(float(row[at])))
+    log.write_text("\n".join(",".join(row) for row in [head, *rows]))
+    assert main(["frf", str(config), "--out", str(tmp_path / "degrees")]) == 0
+    said = capsys.readouterr().err
+    assert "'gyro' looks like deg/s read as rad/s; state unit: deg/s" in said
+    assert "state unit: deg/s" in (tmp_path / "degrees" / "responses.html").read_text()
+    assert main(["frf", str(config), "--set", "frequency.window=100", "--out", "none"]) == 2
+    assert "a longer record, or a shorter window" in capsys.readouterr().err
+
+
+def test_what_chance_makes_of_few_averages_sets_no_axes():
+    omega = np.geomspace(1.0, 100.0, 120)
+    coherence = np.where(omega < 20.0, 0.9, 0.15)  # chance makes an eighth of eight averages
+    pair = Pair(1.0 / (1j * omega), np.full(120, 1e-3), coherence, np.full(120, np.nan + 0j))
+    few, many = (seen_of(omega, pair, averages) for averages in (8.0, 100.0))
+    assert few[omega < 15.0].all()
+    assert not few[omega > 30.0].any()
+    assert many.all()
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -232,6 +296,20 @@ def test_flights_of_two_rates_are_refused():
     other = Flight(dt=0.01, inputs=flight(0).inputs, outputs=flight(0).outputs)
     with pytest.raises(ValueError, match="expected flights of one rate, got 50, 100 Hz"):
         flight_responses([flight(0), other])
+
+
+def test_a_fit_says_that_the_band_which_was_asked_for_has_no_responses(monkeypatch, capsys):
+    monkeypatch.setattr(output, "missing_handling", lambda *_: ())
+    none = FittedResponses((), 0, (), "", (f"{NO_RESPONSES}: band: expected more", "lat is still"))
+    for asked in (None, FrequencyConfig()):
+        run = SimpleNamespace(
+            supplementary=SimpleNamespace(responses=none),
+            config=SimpleNamespace(config=SimpleNamespace(frequency=asked)),
+            problem=SimpleNamespace(training=()),
+        )
+        output._print_handling(cast(FitRun, run))
+        said = f"! {NO_RESPONSES}: band: expected more\n" if asked else ""
+        assert capsys.readouterr().out == said
 
 
 def test_an_order_that_is_too_low_is_called_so():

@@ -11,6 +11,7 @@ from heli_jax import cli, load_config, units, yaml_file
 from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
+from heli_jax.errors import InputError
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
 from heli_jax.new_config import scales, tables, write_config
 from heli_jax.new_config.guess import (
@@ -107,6 +108,26 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(
     out.write_text(out.read_text().replace("scale: EDIT", "scale: 6.0e-9"))
     free = problem(load_config(out)).free
     assert (free["Ixx"].start, free["If"].start) == (0.024, 1.7e-4)
+
+
+def test_a_stick_and_an_axis_that_were_not_logged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A hover of which roll and pitch were logged: the pedal stays, and no gust of yaw shows."""
+    columns = table("roll_rate_dps", "lat_cmd")
+    columns |= {"lon_cmd": columns["lat_cmd"][::-1], "pitch_rate_dps": columns["roll_rate_dps"]}
+    log, out = write(tmp_path / "hover.csv", columns), tmp_path / "hover.yaml"
+    made = ["new", str(log), "--out", str(out), "--model", "linear:attitude-flybarless"]
+    assert cli.main(made) == 0
+    assert "write {constant: 0} in place of {signal: EDIT}" in capsys.readouterr().err
+    assert yaml_file.read_mapping(out)["disturbance"] == {"on": ["roll", "pitch"]}
+    assert cli.main(["check", str(out)]) == 2
+    assert "an input that stayed where it was is {constant: 0}" in capsys.readouterr().err
+    out.write_text(out.read_text().replace("{signal: EDIT}", "{constant: 0}"))
+    assert problem(load_config(out)).free
+    # The file's numbers are another machine's: they have to be written down to be begun from.
+    with pytest.raises(InputError, match=r"Lb\.start: missing.*166\.1 is that of the machine"):
+        problem(load_config(out, {"fit.free": {"Lb": {}}}))
 
 
 def test_a_scale_that_only_the_user_knows_is_asked_for_in_words(

@@ -1,5 +1,6 @@
 """The whole analysis from Python: the same as the command line, and read back."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import pytest
 import heli_jax
 from heli_jax.cli import main
 from heli_jax.errors import InputError
+from heli_jax.identification.free import Free, Prior
+from heli_jax.identification.validation.expected_accuracy import starting_at_zero
+from heli_jax.output import print_check
 
 CONFIG = """
 model: roll-on-stand
@@ -198,6 +202,21 @@ def test_a_check_for_other_programs(config, capsys):
     np.testing.assert_allclose(list(sd.values()), np.sqrt(np.diag(check.verdict.covariance)))
     assert list(sd) == ["Ixx", "If"]
     assert found["noise_sd"] == {"flight 1/roll": 0.002}
+
+
+def test_of_a_start_at_zero_no_part_is_expected(config, capsys):
+    roll, t = heli_jax.linear_model("roll-flybarless"), np.arange(0.0, 4.0, 0.02)
+    flight = heli_jax.Flight(dt=0.02, inputs={"lat": np.sin(t)}, outputs={"p": np.cos(t)})
+    free = {"Blat": Free(0.1), "Lb": Free(0.0, prior=Prior(0.0, 50.0))}
+    problem = heli_jax.Problem(roll.model, roll.vehicle().params, [flight], free)
+    assert starting_at_zero(problem) == {"Lb": (50.0, "1/s^2")}
+    check = dataclasses.replace(heli_jax.run_check(config), at_zero={"If": (0.5, "kg m^2")})
+    print_check(check)
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert rows["Ixx"].count("%") == 2
+    assert rows["If"].count("%") == 1
+    sd = 0.5 * float(np.sqrt(check.verdict.covariance[1, 1]))
+    assert f"{sd:.1e} kg m^2" in rows["If"]
 
 
 def test_the_time_of_a_run_is_told_part_by_part(config):

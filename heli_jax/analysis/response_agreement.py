@@ -6,13 +6,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Complex, Float
 
-from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.windowed import Windowed
 
 USUAL_J = 100.0
 """at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
-_COHERENT = 0.6
-"""coherence in the mean over an octave, from which on frequencies count in it (likewise)"""
 _POINTS = 20
 """frequencies, equally spaced in the logarithm, that J is usually taken over"""
 _TOO_SMALL = 0.7
@@ -36,7 +33,8 @@ class PairAgreement(NamedTuple):
     coherence: float
     """mean partial coherence over those that take part"""
     J: float
-    """Tischler's cost over about twenty of them that are coherent; NaN where none is"""
+    """Tischler's cost over about twenty of them with a coherence of 0.6 in the mean over an octave;
+    NaN where there are none"""
     chi_squared: float
     """squared errors over their variance, in the mean; 1 is expected"""
     simulated: bool
@@ -174,13 +172,13 @@ def pair_agreements(
 
 
 def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Over coherent frequencies about equally spaced in the logarithm, as it is usually taken."""
-    # Where little is coherent an error in decibels is the noise's: a cost over all lines is in the
-    # thousands for the model that made the record.
-    used = used & (octave_mean(2.0 * np.pi * w.hz, of_pair[2]) >= _COHERENT)
+    """Over frequencies about equally spaced in the logarithm, as it is usually taken; where the
+    response is coherent, since errors of noise in decibels know no bound."""
     # Here: it brings SciPy's optimiser, which takes longer to import than this to run.
+    from heli_jax.analysis.response_curves import COHERENT, octave_mean
     from heli_jax.analysis.transfer_fit import Measured, mismatch
 
+    used = used & (octave_mean(2.0 * np.pi * w.hz, of_pair[2]) >= COHERENT)
     if not used.any():
         return float("nan")
     hz = w.hz[used]

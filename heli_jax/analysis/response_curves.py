@@ -29,7 +29,7 @@ _SHARP, _SURELY = 0.2, 4.0
 fits where a response is sharper than these"""
 _AROUND = 3
 """bins to either side that say where the phase of one is"""
-_COHERENT = 0.6
+COHERENT = 0.6
 """mean coherence over an octave from which on a response is taken for the input's: Tischler and
 Remple, Aircraft and Rotorcraft System Identification (2012)"""
 
@@ -151,13 +151,13 @@ def measured_curve(
         coherence: (k,) partial.
         window: length of the Hann windows [s].
     """
-    known = (octave_mean(omega, coherence) >= _COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
+    known = (octave_mean(omega, coherence) >= COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
     coherent = _widest(np.log(omega), known)
     if coherent.size < _LEAST_BINS:
         if not coherent.size:
-            return f"its coherence stays below {_COHERENT} in the mean over an octave"
+            return f"its coherence stays below {COHERENT} in the mean over an octave"
         return (
-            f"{coherent.size} frequencies side by side have a coherence of {_COHERENT} in the mean "
+            f"{coherent.size} frequencies side by side have a coherence of {COHERENT} in the mean "
             f"over an octave, expected {_LEAST_BINS} at least: more `points`, or more excitation"
         )
     # Unwrapped past a bin that leaps, all that follows may be a turn off.

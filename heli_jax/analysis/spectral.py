@@ -236,7 +236,7 @@ def responses(
     if np.min(n) < m + 1:
         raise ValueError(
             f"expected at least {m + 1} independent averages for {m} inputs, got "
-            f"{np.min(n):.2f}: a longer record, or shorter segments"
+            f"{np.min(n):.2f}: a longer record, or a shorter window"
         )
     # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
     P = inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))

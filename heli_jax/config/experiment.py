@@ -268,7 +268,8 @@ def _sentence(error: ErrorDetails) -> str:
 
 
 _MEANT = {
-    "signal": "the channel in the log; an output that was not logged is taken out",
+    "signal": "the channel in the log; an output that was not logged is taken out, an input that "
+    "stayed where it was is {constant: 0}",
     "unit": "that of the channel's numbers in the log",
     "rate": "samples a second, in Hz",
     "scale": "how much of the stated unit one unit of the log's own numbers is: the input's full "

@@ -49,9 +49,9 @@ def first_guesses(
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
             raise InputError(
-                f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with, "
-                "a value in the vehicle file or the model's own, or fit.start: equation-error, "
-                "which finds one for linear models"
+                f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with"
+                f"{_shipped_value(experiment, missing[0])}, a value in the vehicle file or the "
+                "model's own, or fit.start: equation-error, which finds one for linear models"
             )
         return dict(free), None
     # Not before it is needed: it takes a second to import.
@@ -71,6 +71,15 @@ def first_guesses(
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
+
+
+def _shipped_value(experiment: Experiment, name: str) -> str:
+    """What a linear model that ships has of a parameter, in SI; nothing of other models."""
+    model = experiment.config.model
+    if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
+        return ""
+    value = float(getattr(experiment.vehicle.params, name))
+    return f" ({value:.4g} is that of the machine that the model was taken from)"
 
 
 def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:

@@ -297,10 +297,14 @@ def _to_si(
         if bad.size:
             row = rows.start + int(bad[0])
             problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"
-            problem += why_missing(table, signal.name)
+            lacks = kind != "output" and bool(np.isnan(logged[bad[0]]))
+            problem += why_missing(table, signal.name) or (_AN_INPUT if lacks else "")
             raise wrong(table.path, problem, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples
+
+
+_AN_INPUT = "; an input acts all the time: fill it in, or take windows without that part"
 
 
 def _check_step(stamps: _Stamps) -> None:

@@ -60,7 +60,11 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.expected_accuracy import guessed_gusts, unstated_gusts
+from heli_jax.identification.validation.expected_accuracy import (
+    guessed_gusts,
+    starting_at_zero,
+    unstated_gusts,
+)
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.input_units import wrong_units
@@ -150,7 +154,7 @@ def check(problem: Problem) -> Check:
     """
     _require_problem(problem)
     guess = _with_likely_gusts(problem)
-    noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
+    noise = guess.layout.estimator.as_it_ends(guess.layout, guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     # At the start values, since nothing else is known yet: where these are far off, what is
@@ -180,7 +184,7 @@ def check(problem: Problem) -> Check:
     findings = is_it_enough(problem, at, guess.e, feedback)
     slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
     findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
-    return Check(verdict, sds, tuple(notes), guessed, findings)
+    return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))
 
 
 def findings(problem: Problem, guess: FirstGuess | None = None) -> tuple[Finding, ...]:

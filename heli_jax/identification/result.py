@@ -105,6 +105,9 @@ class Check:
     """flights and outputs whose noise nobody stated"""
     findings: tuple[Finding, ...] = ()
     """whether the log is enough: bands, rates, outputs, feedback, what to fly next; worst first"""
+    at_zero: dict[str, tuple[float, str]] = field(default_factory=dict)
+    """by parameter that starts at zero, of which nothing is a part: the size [SI] that its expected
+    sd is relative to, and the unit"""
 
     @property
     def further_notes(self) -> tuple[str, ...]:

@@ -105,7 +105,10 @@ def write_config(
         notes.append(f"found none of {outputs} by its name: say which were logged, and as what")
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
-        notes.append(f"{words}: name the stick's, which no rate or angle is")
+        notes.append(
+            f"{words}: name the stick's, which no rate or angle is, or write {{constant: 0}} in "
+            "place of {signal: EDIT} where it stayed where it was and was not logged"
+        )
     if signals is not None:
         absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
         absent = [n for n in absent if n not in signals.wandering]

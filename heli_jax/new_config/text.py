@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from heli_jax import naming
@@ -116,7 +116,7 @@ def configuration(
     else:
         assert signals is not None
         lines += _flight(chosen, signals, time, log)
-    axes = _axes(chosen.model)
+    axes = _axes(chosen.model, () if signals is None else signals.outputs)
     smooth = signals is not None and signals.smooth
     if smooth:
         axes = ()
@@ -177,9 +177,12 @@ def _is_read(model: Any, params: Any, name: str) -> bool:
     return math.isfinite(float(getattr(params, name))) and reads(model, params, name)
 
 
-def _axes(model: Any) -> tuple[str, ...]:
-    """The axes on which gusts may act."""
-    return tuple(axis.name for axis in axes_of(model))
+def _axes(model: Any, logged: Collection[str]) -> tuple[str, ...]:
+    """The axes on which gusts may act: those with a logged output, where outputs are known."""
+    axes = axes_of(model)
+    # Gusts about an axis of which nothing was logged show in nothing, and cannot be estimated.
+    seen = [a.name for a in axes if not {a.rate, a.angle, a.name}.isdisjoint(logged)]
+    return tuple(seen or (a.name for a in axes))
 
 
 def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
@@ -351,7 +354,8 @@ def _signal(name: str, guess: Guess | None, meaning: str, settings: str = "") ->
         words.append(f"        # filtered by the autopilot: {_comment(settings)}")
     if guess is None:
         # A constant that nobody knows moves nothing: the user says which channel it is.
-        return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so"]
+        stays = "; {constant: 0} if it did not move"
+        return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so{stays}"]
     keys = [f"signal: {_value(guess.channel)}", f"unit: {_value(guess.unit)}"]
     if guess.offset:
         keys.append(f"offset: {guess.offset:g}")

@@ -59,6 +59,10 @@ class FittedPair(NamedTuple):
     """of the machine in continuous time"""
 
 
+NO_RESPONSES = "no responses of the flights, nor handling qualities"
+"""what a note begins with where none could be taken"""
+
+
 class FittedResponses(NamedTuple):
     """All that is shown of a fit's responses."""
 
@@ -86,7 +90,7 @@ def fitted_responses(
     try:
         responses = flight_responses(problem.training, settings)
     except ValueError as e:
-        words = f"no responses of the flights: {e}"
+        words = f"{NO_RESPONSES}: {e}"
         return FittedResponses((), 0, (), "", (words,))
     known = problem.training[0].known
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})

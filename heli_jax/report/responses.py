@@ -91,7 +91,7 @@ def write_responses(
             ],
         ),
         fit_sentences=[
-            f"{w.input} to {w.output}: {sentence}"
+            f"{w.input} to {w.output}, {w.zeros} zeros, {w.poles} poles: {sentence}"
             for w, fit in responses.fits
             for sentence in fit_sentences(fit, responses.window)
         ],
@@ -118,7 +118,13 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
     unit = quotient(units[output], units[input])
     return draw_response(
-        (input, output), responses.omega, measured.pairs[input], unit, note, curves
+        (input, output),
+        responses.omega,
+        measured.pairs[input],
+        unit,
+        note,
+        measured.averages,
+        curves,
     )
 
 
@@ -135,7 +141,7 @@ def table(responses: FlightResponses) -> dict[str, Any]:
     numbers: dict[str, list[np.ndarray]] = {}
     for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            k = responses.omega.size
+            k, seen = responses.omega.size, seen_of(responses.omega, pair, output.averages)
             columns["input"] += [input] * k
             columns["output"] += [name] * k
             with np.errstate(all="ignore"):
@@ -143,7 +149,7 @@ def table(responses: FlightResponses) -> dict[str, Any]:
                     "frequency_hz": responses.omega / (2.0 * np.pi),
                     "gain": np.abs(pair.H),
                     "gain_db": 20.0 * np.log10(np.abs(pair.H)),
-                    "phase_deg": branch_of(responses.omega, pair.H, seen_of(responses.omega, pair)),
+                    "phase_deg": branch_of(responses.omega, pair.H, seen),
                     "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
@@ -266,18 +272,25 @@ def fit_sentences(fit: TransferFit, window: float) -> list[str]:
             + ("; it is not told from an integrator's or a slower one" if slow else "")
             + ": of an angle fit the rate's response, or a model by frequency-error"
         )
+    known = all(c.determined for c in fit.denominator)
+    if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
+        said.append(
+            f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
+            "the machine is not, a stick logged late, feedback or a wrong order makes it so"
+        )
     return said
 
 
-FIT_HEAD = ("numerator", "denominator", "delay [ms]", "chi² per degree", "J")
+FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
 
 
 def fit_row(fit: TransferFit) -> tuple[str, ...]:
-    """Numerator, denominator, delay with their sd, chi-squared and J, as text."""
+    """Numerator, denominator, delay with their sd, poles, chi-squared and J, as text."""
     delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
     return (
         _polynomial(fit.numerator, ""),
         _polynomial(fit.denominator, f"s{_power(len(fit.denominator))}"),
+        _roots(fit),
         delay,
         number(fit.chi_squared, 3),
         number(fit.J, 3),
@@ -290,6 +303,21 @@ def _polynomial(coefficients: tuple[Coefficient, ...], lead: str) -> str:
         n = len(coefficients) - 1 - i
         terms.append(f"({_measured(c)})" + (f" s{_power(n)}" if n else ""))
     return " + ".join(terms)
+
+
+def _roots(fit: TransferFit) -> str:
+    """Poles as frequency and damping of a pair, or as a number: as transfer functions are written
+    in handling qualities."""
+    if not all(c.determined for c in fit.denominator):
+        return "not determined"
+    words = []
+    for pole in sorted(fit.poles, key=abs):
+        if pole.imag > 0.0:
+            damping = number(-pole.real / abs(pole), 3)
+            words.append(f"ω {number(abs(pole), 4)}, ζ {damping}")
+        elif pole.imag == 0.0:
+            words.append(number(pole.real, 4))
+    return "; ".join(words)
 
 
 def _power(n: int) -> str:

@@ -131,7 +131,10 @@ def test_a_flight_is_where_its_inputs_are_known(tmp_path, begin, end):
 def test_an_input_that_is_empty_within_or_everywhere_is_refused(tmp_path):
     lat = np.sin(np.arange(200.0))
     lat[[0, 100]] = np.nan
-    with pytest.raises(InputError, match="line 102, column 'lat': got nothing, expected a finite"):
+    said = (
+        "line 102, column 'lat': got nothing, expected a finite number; an input acts all the time"
+    )
+    with pytest.raises(InputError, match=said):
         flight(filled(tmp_path / "log.csv", lat), outputs=("p",))
     with pytest.raises(InputError, match="holds 0 samples"):
         flight(filled(tmp_path / "all.csv", np.full(200, np.nan)), outputs=("p",))

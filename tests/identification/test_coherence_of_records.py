@@ -119,7 +119,7 @@ def test_feedback_that_was_not_tested_is_said():
     jumps = problem(flight(0))
     [found] = _of_feedback(jumps, feedback_of(jumps))
     assert found.severity == "note"
-    assert "between jumps" in found.sentence
+    assert "inputs move as programmed ones do" in found.sentence
 
 
 def test_modes_that_do_not_swing_ask_for_a_rate_too():

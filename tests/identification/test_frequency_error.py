@@ -8,8 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models, naming, simulate
+from heli_jax import (
+    Flight,
+    Free,
+    Nuisance,
+    Problem,
+    fit,
+    linear_model,
+    models,
+    naming,
+    simulate,
+)
 from heli_jax.dynamics.linearised import point
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
@@ -120,6 +131,34 @@ def test_estimates_are_those_of_output_error_in_white_noise(by):
     # The simulation in time has initial state and bias of its own, though no line knows them.
     assert by["frequency-error"].metrics["roll"].vaf > 0.999
     assert by["frequency-error"].noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.05)
+
+
+def test_the_noise_to_check_by_is_what_the_inputs_leave():
+    """Gusts a tenth as large as the answer to a chirp; what is wrong with the start is no noise."""
+    roll, t = linear_model("roll-flybarless"), np.arange(0.0, 80.0, DT)
+    lat = 0.1 * np.sin(2 * np.pi * (0.1 * t + 0.024 * t**2))
+    params = roll.vehicle().params
+    A = np.array([[0.0, params.Lb], [-1.0, -1 / params.tau_f]])
+    B = np.array([[0.0], [params.Blat / params.tau_f]])
+    p = scipy.signal.lsim((A, B, [[1.0, 0.0]], [[0.0]]), lat, t)[1]
+    rng, slow = np.random.default_rng(0), scipy.signal.butter(1, 0.5, fs=1 / DT)
+    gust = 0.3 * scipy.signal.lfilter(*slow, rng.standard_normal(t.size))
+    noisy = p + gust + 3e-3 * rng.standard_normal(t.size)
+    flight = Flight(dt=DT, inputs={"lat": lat}, outputs={"p": noisy}, hold={"lat": "linear"})
+    free = {"Lb": Free(300.0), "tau_f": Free(0.02)}
+    problem = Problem(roll.model, params, [flight], free, method="frequency-error")
+    layout = layout_of(problem, [flight])
+    data, begun = data_of(problem, [flight], layout), first_noise(problem, [flight])
+    noise = layout.estimator.as_it_ends(layout, data, begun)
+    hz = np.arange(1, noise.whitening[0].shape[0] + 1) / (t.size * DT)
+    true = np.abs(0.3 * scipy.signal.freqz(*slow, hz, fs=1 / DT)[1]) ** 2 + 3e-3**2
+    found = 1.0 / np.abs(noise.whitening[0][:, 0, 0]) ** 2
+    for low, high in ((0.1, 0.5), (0.5, 2.0), (2.0, 4.0), (5.0, 20.0)):
+        ratio = (found / true)[(hz > low) & (hz < high)]
+        assert 0.75 < np.mean(ratio) < 1.3, (low, ratio)
+    # As if all of it were noise a fit begins.
+    swept = (hz > 0.5) & (hz < 2.0)
+    assert np.mean(1.0 / np.abs(begun.whitening[0][swept, 0, 0]) ** 2 / true[swept]) > 5.0
 
 
 @pytest.mark.slow

@@ -22,7 +22,9 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
 from heli_jax.identification.fit import cautions
 from heli_jax.identification.model_selection import choose
 from heli_jax.identification.result import Fit
+from heli_jax.identification.validation.enough import _of_feedback
 from heli_jax.identification.validation.excitation_test import _in_bands
+from heli_jax.identification.validation.feedback import feedback_of
 
 DT = 0.04
 LEANING = """
@@ -137,6 +139,16 @@ def moved_if_gone_on_with(found: Fit) -> float:
         z, noise = layout.estimator.relax(layout, data, None, noise, z)
         z = optimise(layout, data, noise, z).z
     return float(np.linalg.norm(J @ np.asarray(z - found.reached.z)[:q]))
+
+
+def test_a_closed_loop_that_an_instrument_allows_for_is_not_called_open(leaning):
+    by_instrument = problem(leaning, [flown(3)])
+    found = feedback_of(by_instrument)
+    assert found[0].present
+    [line] = _of_feedback(by_instrument, found)
+    assert line.severity == "ok"
+    assert line.sentence.startswith("lat follows what is unforeseen of the response (p-value")
+    assert "the loop is closed, which the logged excitation (instrument)" in line.sentence
 
 
 def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leaning):

@@ -87,6 +87,12 @@ def test_coloured_residuals_are_told(white):
     doubtful = dataclasses.replace(white, coloured=True)
     found = intervals(doubtful, profiles=["If"])
     assert any("coloured" in s for s in found.sentences)
+    # In frequency the profile goes by the noise's spectrum, and there is no bootstrap.
+    low, high = white.estimates["If"].lower95, white.estimates["If"].upper95
+    by = {"If": {"gaussian": (low, high), "profile": (low, high)}}
+    assert _sentences(doubtful, by, None, None)
+    in_frequency = dataclasses.replace(doubtful, method="frequency-error")
+    assert _sentences(in_frequency, by, None, None) == []
 
 
 def test_a_name_that_is_not_free_is_refused(white):

@@ -29,5 +29,5 @@ def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     axes = match(pair, "dB re rad/s", "")
     assert axes[0].get_xlim()[1] / (2.0 * np.pi) < 6.0
     measured = type("Measured", (), {**pair._asdict(), "picture": np.full(OMEGA.size, np.nan)})
-    figure = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "")
+    figure = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
     assert figure.axes[0].get_xlim()[1] < 6.0

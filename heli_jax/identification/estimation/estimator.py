@@ -170,11 +170,12 @@ class Estimator(abc.ABC):
         """
         return data
 
-    def as_it_ends(self, data: Data, noise: Noise) -> Noise:
+    def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """The noise to ask at the start values what a fit may determine, where a search begins by
-        other equations than it ends with.
+        other equations or with another noise than it ends with.
 
         Args:
+            layout: what the unknowns are.
             data: the numbers of the problem.
             noise: to begin with.
         """

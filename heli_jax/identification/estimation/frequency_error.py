@@ -55,6 +55,7 @@ from heli_jax.identification.estimation.linearisation_doubts import linearisatio
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.trust_region import Nearing
+from heli_jax.identification.estimation.what_inputs_leave import whitening_without_model
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -157,13 +158,18 @@ class FrequencyError(Estimator):
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
 
-    def as_it_ends(self, data: Data, noise: Noise) -> Noise:
-        """By instrument, where there is one.
+    def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
+        """By instrument, where there is one; the noise is what the inputs leave of the outputs.
+
+        That of the errors at the start values would hold all that is wrong with these.
 
         Args:
+            layout: what the unknowns are.
             data: the numbers of the problem.
             noise: to begin with.
         """
+        if (whitening := whitening_without_model(layout, data)) is not None:
+            noise = noise._replace(whitening=whitening)
         if data.flights[0].by_instrument is None:
             return noise
         return noise._replace(by_instrument=np.ones(()))

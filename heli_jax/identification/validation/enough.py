@@ -118,4 +118,13 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
         "no input follows what is unforeseen of the response (p-value "
         f"{least.p_value:.2g} for {least.input})."
     )
+    # The loop is closed, and nothing is to be doubted of inputs that are taken by an instrument.
+    if least.present:
+        closed = list(dict.fromkeys(f.input for f in feedback if f.present))
+        follow = "follows" if len(closed) == 1 else "follow"
+        words = (
+            f"{', '.join(closed)} {follow} what is unforeseen of the response (p-value "
+            f"{least.p_value:.2g} for {least.input}): the loop is closed, which the logged "
+            "excitation (instrument) allows for."
+        )
     return [Finding("feedback", "ok", words, least.p_value, criterion), *aside]

@@ -10,6 +10,7 @@ from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution, unpack
+from heli_jax.identification.unknowns.transforms import scale
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
 """of a noise that nobody stated"""
@@ -42,6 +43,20 @@ def too_good(
         "from differences between samples, and is far too small where the log was smoothed or "
         "simulated; state the outputs' sd. Compare such numbers with one another alone."
     )
+
+
+def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
+    """By free parameter that starts at zero the size [SI] that its expected sd is relative to, and
+    its unit: of zero itself nothing is a part.
+
+    Args:
+        problem: what is to be fitted.
+    """
+    return {
+        n: (scale(f), naming.unit(problem.model.Params, n) or "1")
+        for n, f in problem.free.items()
+        if f.start == 0
+    }
 
 
 def unstated_gusts(problem: Problem) -> list[str]:

@@ -30,7 +30,7 @@ from heli_jax.identification.validation.arx_residuals import Past, arx_residuals
 from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
 from heli_jax.numbers import percent
 
-STEPS = "inputs stay where they are between jumps"
+STEPS = "inputs move as programmed ones do, in jumps, between rests or without anything unforeseen"
 """the reason why nothing is tested where no input moves freely"""
 LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.dynamics.model import axes_of
+from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
@@ -63,7 +63,7 @@ def misread(problem: Problem) -> list[Misread]:
         for label, flight in zip(labels(flights), flights, strict=True)
         for one in (
             *_contradicted(label, flight),
-            *_degrees(problem, label, flight),
+            *degrees_for_radians(problem.model, label, flight),
             *_sticks(label, flight),
         )
     ]
@@ -149,8 +149,15 @@ def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
         yield Misread(Finding("signs and units", "doubt", words))
 
 
-def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
-    headings = {a.angle for a in axes_of(problem.model) if a.rate == "r"} | {"psi", "yaw"}
+def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Misread]:
+    """Angles and rates that are too large to be in the unit that they are read in.
+
+    Args:
+        model: whose axes say which outputs are attitudes and rates.
+        label: of the flight.
+        flight: as read from a log.
+    """
+    headings = {a.angle for a in axes_of(model) if a.rate == "r"} | {"psi", "yaw"}
     for name, signal in (flight.source.outputs if flight.source else {}).items():
         values = flight.outputs.get(name)
         if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
@@ -158,10 +165,10 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         seen = np.abs(values[np.isfinite(values)])
         unit = "deg" if signal.unit == "rad" else "deg/s"
         # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage.
-        judged = _of_fuselage(problem, str(name)) or signal.contradicted == unit
+        judged = _of_fuselage(model, str(name)) or signal.contradicted == unit
         if not seen.size or not judged:
             continue
-        size, linear = float(np.percentile(seen, _MOST)), problem.model.linear
+        size, linear = float(np.percentile(seen, _MOST)), model.linear
         if signal.unit == "rad/s":
             limits = (_LARGEST_RATE, _LINEAR_RATE)
         elif name in headings:
@@ -182,7 +189,7 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         criterion = f"{_MOST:g} % of the samples below, {most:.4g} {signal.unit}"
         # What the file says of it makes sure what its size alone does not. An angle past pi that
         # its own rate leads to may have been flown: then the size says nothing.
-        flown = _flown(problem, flight, str(name), size)
+        flown = _flown(model, flight, str(name), size)
         if flown and signal.contradicted != unit:
             words = (
                 f"{label}: {name} is up to {size:.3g} rad ({np.degrees(size):.0f} deg): it was "
@@ -194,17 +201,16 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
 
 
-def _of_fuselage(problem: Problem, name: str) -> bool:
+def _of_fuselage(model: Model, name: str) -> bool:
     """Whether an output is an attitude or a rate of the machine, and no other angle of it."""
-    model = problem.model
     of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
     return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
 
 
-def _flown(problem: Problem, flight: Flight, name: str, size: float) -> bool:
+def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
     """Whether an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
     so it is in aerobatics, and where both are in degrees."""
-    rate = next((a.rate for a in axes_of(problem.model) if a.angle == name), None)
+    rate = next((a.rate for a in axes_of(model) if a.angle == name), None)
     p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
     if p is None or size > _FLOWN_TURNS * 2 * np.pi or np.nanmax(np.abs(p)) > _LARGEST_RATE:
         return False

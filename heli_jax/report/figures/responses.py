@@ -18,9 +18,9 @@ from heli_jax.report.style import legend_above, subtitle
 _COLOURS = (style.VERMILLION, style.GREEN, style.PURPLE)
 _WIDE = 1.0
 """relative random error past which a bin says nothing, and is not drawn"""
-_SEEN = 0.1
-"""mean coherence over an octave below which bins neither set the axes nor tell the phase's branch:
-there it is chance"""
+_SEEN, _BY_CHANCE = 0.1, 2.0
+"""Bins neither set the axes nor tell the phase's branch below a mean coherence over an octave of
+the first, nor of this times what chance makes of it, one over the number of averages."""
 _BEYOND_CHANCE = 0.3
 """mean coherence over an octave that chance hardly makes, of three or four averages too: up to the
 last such bin frequencies are drawn"""
@@ -34,6 +34,7 @@ def draw_response(
     pair: Any,
     unit: str,
     note: str,
+    averages: float,
     fits: Sequence[tuple[str, np.ndarray]] = (),
 ) -> Figure:
     """One response.
@@ -44,6 +45,7 @@ def draw_response(
         pair: with H, sd, coherence and picture, (k,) each (`flight_responses.Pair`).
         unit: of output over input.
         note: below the title.
+        averages: independent ones.
         fits: transfer functions, each a label and its response (k,).
     """
     hz = omega / (2.0 * np.pi)
@@ -51,7 +53,7 @@ def draw_response(
     if (left_out := int(np.sum(~known))) > 0:
         note += f"; {left_out} of {omega.size} frequencies not drawn"
     axes = panels(None, 6.0 + style.ROW, [1.4, 1.2, 0.6], top=style.TOP + style.ROW)
-    seen = seen_of(omega, pair)
+    seen = seen_of(omega, pair, averages)
     branch = branch_of(omega, pair.H, seen)
     _draw_measured(axes, hz, pair, known, branch)
     _limit(axes, pair.H, branch, seen if seen.any() else known)
@@ -84,15 +86,18 @@ def draw_response(
     return drawn
 
 
-def seen_of(omega: np.ndarray, pair: Any) -> np.ndarray:
+def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
     """The frequencies (k,) that tell the branch of the phase.
 
     Args:
         omega: (k,) [rad/s]
         pair: with H, sd and coherence, (k,) each.
+        averages: independent ones.
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
-    return known & (octave_mean(omega, pair.coherence) >= _SEEN)
+    # Of few averages chance makes much, but what passes for coherent is no chance.
+    least = min(max(_SEEN, _BY_CHANCE / averages), COHERENT)
+    return known & (octave_mean(omega, pair.coherence) >= least)
 
 
 def last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> int:

@@ -1,0 +1,23 @@
+"""How a model's responses agree with measured ones."""
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+
+from heli_jax.analysis.response_agreement import _J
+from heli_jax.analysis.windowed import Windowed
+
+
+def test_what_lies_above_a_sweep_has_no_part_in_J():
+    """A right model, and a response that is noise past 4 Hz, as in any record of a sweep."""
+    rng, hz = np.random.default_rng(0), np.arange(1, 400) / 10.0
+    H = 1.0 / (1.0 + 1j * hz)
+    swept = hz < 4.0
+    noise = (rng.standard_normal(hz.size) + 1j * rng.standard_normal(hz.size)) / np.sqrt(2.0)
+    E = np.where(swept, 0.02 * H, 3.0) * noise
+    coherence = np.where(swept, 0.95, 0.2)
+    windows = cast(Windowed, SimpleNamespace(hz=hz, seconds=10.0))
+    used = np.ones(hz.size, bool)
+    assert _J(windows, used, (H + E, E, coherence)) < 10.0
+    assert np.isnan(_J(windows, used, (H + E, E, np.full(hz.size, 0.2))))
