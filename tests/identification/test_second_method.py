@@ -172,7 +172,7 @@ def test_what_goes_along_with_an_open_parameter_has_the_interval_of_both(tmp_pat
     # An optimum of chance beside Kr = 0, where the lag Krfb has no effect: slopes there bound both.
     found = fit(_problem(tmp_path, 1.5, "frequency-error", seed=3))
     assert {"Kr", "Krfb"} <= {n for n, e in found.estimates.items() if e.sd is None}
-    assert found.estimates["Nr"].sd is not None
+    assert found.estimates["Nped"].sd is not None
     for name, e in found.estimates.items():
         if e.sd is not None:
             assert e.lower95 is not None

@@ -6,10 +6,10 @@ a frequency of the record's own,
 $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 
 is exact, for unstable machines too: nothing is simulated, and the ends of the record are n numbers
-that are found by linear least squares and projected out. The noise's spectrum, a matrix over the
-outputs, is estimated from the residual and weighs the frequencies; maximum likelihood then holds
-where gusts disturb the machine as well, as long as no feedback brings them into the inputs. Models
-that are not linear are linearised where they fly.
+that are found by linear least squares and projected out, with n more for the ends of slow gusts.
+The noise's spectrum, a matrix over the outputs, is estimated from the residual and weighs the
+frequencies; maximum likelihood then holds where gusts disturb the machine as well, as long as no
+feedback brings them into the inputs. Models that are not linear are linearised where they fly.
 
 Where flights hold an excitation that was added to an input and that no feedback reaches, the errors
 are weighed by the response to what of the input follows it: then feedback does no harm either.

@@ -29,6 +29,8 @@ _TOGETHER = 4
 """flights of one machine side by side at most"""
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
+_SPARED = 0.1
+"""part of a record's numbers that its ends may take, those of gusts among them"""
 
 
 class Matrices(NamedTuple):
@@ -78,11 +80,14 @@ class Resolved(NamedTuple):
     """the whitening"""
     H: Complex[Array, "K p n"]
     """W C (zI - Ad)^-1"""
-    Q: Float[Array, "s n"]
+    ends: Complex[np.ndarray, "K e"]
+    """what drives a state that ends elsewhere than it began and, but in a very short record, what
+    does where a slow gust that pushes it does"""
+    Q: Float[Array, "s m"]
     """an orthonormal basis of what the ends may add to whitened rows; zero where a state leaves no
     trace"""
-    solution: Float[Array, "n n"]
-    """from the components along Q to the ends' states"""
+    solution: Float[Array, "m m"]
+    """from the components along Q to the ends' states, and behind these to the gusts'"""
 
 
 class Errors(NamedTuple):
@@ -203,9 +208,17 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
     T, V = _triangle(m.Ad)
     H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
+    # A gust that ends elsewhere than it began has its leap at all lines: taken for noise of each
+    # line by itself it moves slow modes by several standard deviations. Above its corner it is an
+    # integrated push. Over the length, so that it is no larger than the states' own ends.
+    ends = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
+    _, p, n = H.shape
+    if 2 * n > _SPARED * 2 * p * record.lines:
+        ends = ends[:, :1]
     # What the ends of the record explain is found by linear least squares.
-    Q, solution = _span(stacked(jnp.asarray(z)[:, None, None] * H).reshape(-1, H.shape[2]))
-    return Resolved(z, T, V, whitening, H, Q, solution)
+    basis = jnp.concatenate([H * v[:, None, None] for v in jnp.asarray(ends).T], axis=2)
+    Q, solution = _span(stacked(basis).reshape(-1, basis.shape[2]))
+    return Resolved(z, T, V, whitening, H, ends, Q, solution)
 
 
 def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
@@ -224,7 +237,7 @@ def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[A
     return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
 
 
-def _span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
+def _span(basis: Float[Array, "s m"]) -> tuple[Float[Array, "s m"], Float[Array, "m m"]]:
     Q, R = jnp.linalg.qr(basis)
     # A state that no output shows has a column of rounding, and QR makes some direction of it,
     # another at each step: what that takes off makes the sum of squares rough.
@@ -289,9 +302,9 @@ def errors_of_some(
         white = stacked(_times(at.W, beyond) - _times(at.H, driving)).reshape(record.lines, -1)
         # The ends of the record: what they add lies along Q.
         along = at.Q.T @ white.reshape(-1)
-        d = (at.solution @ along).astype(at.z.dtype)
+        d = (at.solution @ along).reshape(at.ends.shape[1], -1).astype(at.z.dtype)
         rows = white - (at.Q @ along).reshape(white.shape)
-        return rows, driving + at.z[:, None] * d[None, :], lines, beyond
+        return rows, driving + at.ends @ d, lines, beyond
 
     # Under vmap flights are columns of the same products and substitutions.
     rows, driving, lines, beyond = jax.vmap(of_one)(signals, y)

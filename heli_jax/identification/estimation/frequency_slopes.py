@@ -63,7 +63,7 @@ class _Shared(NamedTuple):
     """(K, p, n), or for each line the real matrix of it"""
     W: Array | None
     """the same of (K, p, p); None where nothing that it multiplies moves"""
-    Q: Float[Array, "K 2p n"]
+    Q: Float[Array, "K 2p m"]
 
 
 class _Own(NamedTuple):
