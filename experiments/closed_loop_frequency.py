@@ -201,6 +201,7 @@ def one_fit(seed: int, method: str) -> dict[str, Any]:
         "all_seconds": time.perf_counter() - begin,
         "tic": doublet_tic(values),
         "untrusted": list(found.untrusted),
+        "adequate": found.adequate,
         "moved": found.moved_by_feedback,
         "error": {n: values[n] - t for n, t in truths().items()},
         "z": {n: (values[n] - t) / (found.estimates[n].sd or np.nan) for n, t in truths().items()},
@@ -230,7 +231,9 @@ def table(fits: list[dict[str, Any]]) -> str:
     if direct:
         share = {n: np.mean([n in f["untrusted"] for f in direct]) for n in size}
         flagged = ", ".join(f"{n} {100 * v:.0f}" for n, v in share.items())
+        no = sum(not f["adequate"] for f in direct)
         lines.append(f"\nDirect: said to be untrusted, % of {len(direct)} runs: {flagged}.")
+        lines.append(f"Called inadequate: {no} of them.")
     return "\n".join(lines)
 
 

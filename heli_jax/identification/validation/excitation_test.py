@@ -32,6 +32,15 @@ WRONG_OPTIMUM = (
     "start with other signs or from several points (fit.starts); where somebody held the machine, "
     "log the excitation (signals.instruments)."
 )
+MOVED_BY_FEEDBACK = (
+    "An unstable model that explains nearly all, and whose residual follows the inputs all the "
+    "same, was moved by feedback, or is a wrong optimum: where somebody held the machine, log the "
+    "excitation (signals.instruments); else start with other signs or from several points "
+    "(fit.starts)."
+)
+_NEARLY_ALL = 0.9
+"""part explained of each output whose residual follows the inputs, from which on a wrong optimum is
+the less likely cause"""
 LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
@@ -88,7 +97,9 @@ def by_excitation(
             f"the residual of {' and '.join(failed)} follows {what}, and simulated the model "
             "leaves the record"
         )
-        return Adequacy(False, False, (), (said,), (WRONG_OPTIMUM,), remarks, doubts=(doubt,))
+        nearly = all(f.explained >= _NEARLY_ALL for f in failed.values())
+        advice = MOVED_BY_FEEDBACK if nearly else WRONG_OPTIMUM
+        return Adequacy(False, False, (), (said,), (advice,), remarks, doubts=(doubt,))
     if bad:
         doubt = f"the residual of {' and '.join(bad)} follows {what}"
         worse = any(not followed[n].explained >= 0.0 for n in bad)
