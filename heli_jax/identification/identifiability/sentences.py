@@ -239,7 +239,7 @@ def _also_fits(facts: Facts) -> list[str]:
 
 def _at_bound(u: Unknown) -> str:
     return (
-        f"{u.name} is at its bound, {u.value:.4g}: the data want it beyond, and do not determine "
+        f"{u.name} is at its bound, {u.value:.3g}: the data want it beyond, and do not determine "
         "it there."
     )
 
