@@ -46,6 +46,11 @@ class FrequencyErrorStart(NamedTuple):
             f"Start by frequency error of {', '.join(taken)} ({self.status}, "
             f"{self.seconds:.2g} s): the fit begins there, they are not its result."
         ]
+        if of_several := [n for n in taken if self.values[n].sd is None]:
+            said.append(
+                f"Start: {', '.join(of_several)} at one of the solutions that the spectra do not "
+                "tell apart."
+            )
         grouped: dict[str, list[str]] = {}
         for name, v in self.values.items():
             if v.reason:
@@ -79,8 +84,13 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
         first_guess=None,
     )
     first = fit(in_frequency, max_steps=max_steps)
+    # Any of several solutions is as good a start as the only one would be.
+    of_several = {n for pair in first.verdict.twins for n in pair}
+    of_several |= {n for other in first.verdict.second for n in other.changed}
     values = {
-        name: _value(estimate, first.status, problem.free[name].start)
+        name: _value(
+            estimate, first.status, problem.free[name].start, of_several=name in of_several
+        )
         for name, estimate in first.estimates.items()
     }
     return FrequencyErrorStart(values, first.status, time.perf_counter() - began, first.notes)
@@ -100,11 +110,13 @@ def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
     return dataclasses.replace(problem, free=free, first_guess=guess)
 
 
-def _value(estimate: Estimate, status: Status, stated: float) -> StartValue:
+def _value(
+    estimate: Estimate, status: Status, stated: float, *, of_several: bool = False
+) -> StartValue:
     reason = ""
     if status == "not-converged":
         reason = "frequency error did not converge"
-    elif estimate.sd is None:
+    elif estimate.sd is None and not of_several:
         reason = "the spectra do not determine them"
     elif estimate.at_bound:
         reason = "frequency error ended at their bounds"

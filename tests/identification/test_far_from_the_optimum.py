@@ -9,6 +9,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
+from heli_jax.identification.frequency_start import frequency_error_start
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
@@ -122,6 +123,16 @@ def test_two_lags_in_series_are_told_to_be_exchangeable(starts):
     assert sorted(found.estimates[n].value for n in ("T1", "T2")) == pytest.approx(
         [0.06, 0.3], rel=0.1
     )
+
+
+@pytest.mark.slow
+def test_a_start_by_frequency_error_takes_either_of_two_solutions():
+    free = {"T1": Free(0.6), "T2": Free(0.02)}
+    problem = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
+    guess = frequency_error_start(problem)
+    assert {v.origin for v in guess.values.values()} == {"frequency error"}
+    assert sorted(v.value for v in guess.values.values()) == pytest.approx([0.06, 0.3], rel=0.1)
+    assert "at one of the solutions that the spectra do not tell apart" in " ".join(guess.sentences)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ class StartValue(NamedTuple):
     value: float
     sd: float | None
     """standard error of the regression, without its bias, or that of frequency error; None where
-    the value is from neither"""
+    the value is from neither, and where several solutions fit as well"""
     unit: str
     origin: Origin
     reason: str

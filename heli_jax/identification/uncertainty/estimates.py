@@ -154,9 +154,9 @@ def _at_bound(problem: Problem, name: str, value: float) -> bool:
 def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     """Where an estimate ended at its bound."""
     return [
-        f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. Its interval ends "
-        "there and does not hold, and the other estimates are those of a bound that the data do "
-        "not bear out. Remedy: widen the bound, or mend what makes the data want that."
+        f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. Its interval "
+        "ends there and does not hold, and the other estimates are those of a bound that the data "
+        "do not bear out. Remedy: widen the bound, or mend what makes the data want that."
         for name, estimate in estimates.items()
         if estimate.at_bound
     ]
