@@ -11,6 +11,7 @@ from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.transfer_fit import Z95
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
+from heli_jax.report.figures.frequency_axis import last_of
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.frequency import phase
 from heli_jax.report.style import legend_above, subtitle
@@ -21,9 +22,6 @@ _WIDE = 1.0
 _SEEN, _BY_CHANCE = 0.1, 2.0
 """Bins neither set the axes nor tell the phase's branch below a mean coherence over an octave of
 the first, nor of this times what chance makes of it, one over the number of averages."""
-_BEYOND_CHANCE = 0.3
-"""mean coherence over an octave that chance hardly makes, of three or four averages too: up to the
-last such bin frequencies are drawn"""
 _MARGINS = (6.0, 45.0)
 """dB and deg beyond what sets the axes"""
 
@@ -98,23 +96,6 @@ def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
     # Of few averages chance makes much, but what passes for coherent is no chance.
     least = min(max(_SEEN, _BY_CHANCE / averages), COHERENT)
     return known & (octave_mean(omega, pair.coherence) >= least)
-
-
-def last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> int:
-    """The place of the last frequency that the axes hold.
-
-    Single bins are coherent by chance up to the end of the band, far above what was excited.
-
-    Args:
-        omega: (k,) [rad/s]
-        coherence: (k,) partial.
-        known: (k,) bool, bins that are drawn where there is room.
-    """
-    mean = octave_mean(omega, coherence)
-    for bins in (known & (mean >= _BEYOND_CHANCE), known & (mean >= _SEEN), known):
-        if bins.any():
-            return int(np.flatnonzero(bins)[-1])
-    return omega.size - 1
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
