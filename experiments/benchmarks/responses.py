@@ -25,6 +25,7 @@ import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, flight_responses
+from heli_jax.analysis.spectral import OVERLAP
 
 jax.config.update("jax_enable_x64", True)
 signal: Any = scipy.signal
@@ -52,7 +53,8 @@ def by_scipy(record: Flight, omega: np.ndarray, lean: bool) -> np.ndarray:
         n = round(length * WINDOW * RATE)
 
         def csd(a: np.ndarray, b: np.ndarray, n: int = n) -> np.ndarray:
-            hz, S = signal.csd(a, b, fs=RATE, nperseg=n, noverlap=n // 2, detrend="constant")
+            both = round(OVERLAP * n)
+            hz, S = signal.csd(a, b, fs=RATE, nperseg=n, noverlap=both, detrend="constant")
             w = 2.0 * np.pi * hz
             return np.interp(omega, w, S.real) + 1j * np.interp(omega, w, S.imag)
 
