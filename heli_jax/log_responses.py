@@ -11,7 +11,7 @@ from heli_jax.analysis.attitude_responses import (
     measured_handling,
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
-from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
@@ -24,8 +24,6 @@ from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
-COHERENT = 0.6
-"""as in `analysis.response_curves`, from which on a response is taken for the input's"""
 _HOLDS = {"linear": "taken to move in straight lines", "zero-order": "held"}
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.methods import estimator_of
@@ -19,7 +20,7 @@ from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import number, percent, vaf_percent
 from heli_jax.report import frequency
-from heli_jax.report.coherence import COHERENT, Coherence, coherences
+from heli_jax.report.coherence import Coherence, coherences
 from heli_jax.report.frequency import FittedFlight
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT

@@ -18,9 +18,6 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
 from heli_jax.report import frequency
 
-COHERENT = 0.6
-"""coherence from which on a record's response is taken for the machine's: Tischler and Remple,
-Aircraft and Rotorcraft System Identification (2012)"""
 SIZEABLE = 0.1
 """part of an output's power that the model puts down to an input, from which on it is asked for"""
 _MORE = 2

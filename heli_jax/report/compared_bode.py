@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
-from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import panels, sample_time
 from heli_jax.report.frequency import Empirical, empirical, phase
 

@@ -20,6 +20,7 @@ from heli_jax.analysis.attitude_responses import (
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, flight_responses
 from heli_jax.analysis.handling_qualities import HandlingQualities, handling_qualities
 from heli_jax.analysis.response_curves import (
+    COHERENT,
     Acting,
     Curve,
     LinearResponses,
@@ -33,7 +34,6 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.report import frequency
-from heli_jax.report.coherence import COHERENT
 from heli_jax.report.frequency import FittedFlight
 
 MOST_PAIRS = 6

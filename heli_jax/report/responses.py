@@ -10,12 +10,12 @@ import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
+from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.analysis.window_resolution import forgets
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number
-from heli_jax.report.coherence import COHERENT
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.responses import branch_of, draw_response, seen_of
 from heli_jax.report.handling_json import handling_json

@@ -37,8 +37,8 @@ from heli_jax.identification.estimation.frequency_instrument import (
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
-    Record,
     cut_notes,
+    lines_of,
     parts_of,
     records_of,
     without_parts,
@@ -138,9 +138,7 @@ class FrequencyError(Estimator):
         for flight, sd in zip(flights, noise.sd, strict=True):
             whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
             for first, last in parts_of(flight):
-                y = whole[first:last]
-                lines = np.fft.rfft(y - y.mean(axis=0), axis=0) / np.sqrt(len(y))
-                measured.append(lines[1 : 1 + Record(0, first, last).lines])
+                measured.append(lines_of(whole[first:last]))
         # As if all of it were noise: each frequency by its own size. White noise would give all
         # the say to where the record is largest, gusts included.
         whitening = whitening_of(without_shared(s) for s in smoothed(measured))

@@ -18,6 +18,7 @@ from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations
+from heli_jax.identification.estimation.frequency_records import lines_of
 from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
@@ -143,7 +144,7 @@ def _parts(
     of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> list[Float[np.ndarray, "N u"]]:
     """By flight what of some columns follows signals, about the columns' means."""
-    U, R = ([_lines(v) for v in one] for one in (of, signals))
+    U, R = ([lines_of(v) for v in one] for one in (of, signals))
     m, out = U[0].shape[1], []
     spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
     for whole, S, lines in zip(of, spectra, R, strict=True):
@@ -156,12 +157,6 @@ def _parts(
         estimate = np.einsum("kur,kr->ku", S[:, :m, m:] / size[:, None, :], part)
         out.append(_in_time(estimate, len(whole)) + whole.mean(axis=0))
     return out
-
-
-def _lines(v: Float[np.ndarray, "N c"]) -> np.ndarray:
-    """At the frequencies between zero and Nyquist's."""
-    N = len(v)
-    return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (N - 1) // 2] / np.sqrt(N)
 
 
 def _in_time(lines: np.ndarray, N: int) -> Float[np.ndarray, "N c"]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Complex, Float
 
 from heli_jax.analysis.trim import Condition
 from heli_jax.flights.flight import Flight
@@ -44,6 +45,16 @@ class Record(NamedTuple):
     def lines(self) -> int:
         """Frequencies of the record's own, without zero and the Nyquist frequency."""
         return (self.samples - 1) // 2
+
+
+def lines_of(v: Float[np.ndarray, "N c"]) -> Complex[np.ndarray, "K c"]:
+    """The Fourier transform of signals at a record's own frequencies, over the root of its length.
+
+    Args:
+        v: the samples of one record.
+    """
+    N = len(v)
+    return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (N - 1) // 2] / np.sqrt(N)
 
 
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:

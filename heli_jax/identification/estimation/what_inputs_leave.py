@@ -7,7 +7,7 @@ Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pi
 import jax
 import numpy as np
 
-from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.estimation.frequency_spectrum import (
     AVERAGES,
     averages,
@@ -37,8 +37,7 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
         flight = flights[record.flight]
         outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
         signals = np.stack([*outputs, *flight.inputs], axis=1)[record.first : record.last]
-        found = np.fft.rfft(signals - signals.mean(axis=0), axis=0) / np.sqrt(record.samples)
-        lines.append(found[1 : 1 + record.lines])
+        lines.append(lines_of(signals))
     p = len(layout.outputs[0])
     powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
     moving = p + np.flatnonzero(powers[p:] > 0)

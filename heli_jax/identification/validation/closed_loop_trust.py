@@ -39,7 +39,7 @@ from heli_jax import naming
 from heli_jax.identification.estimation.frequency_gusts import machine_of
 from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.methods import estimator_of
@@ -287,8 +287,7 @@ def _lines(at: Solution) -> _Lines:
             (list(sticks.values()), inputs),
         ):
             v = np.stack([np.asarray(x)[part] for x in signals], axis=1)
-            lines = np.fft.rfft(v - v.mean(axis=0), axis=0) / np.sqrt(len(v))
-            made.append(lines[1 : 1 + record.lines])
+            made.append(lines_of(v))
     moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
     errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
     W = [np.asarray(w) for w in noise.whitening]

@@ -22,7 +22,7 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instruments_of,
     strengths,
 )
-from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
@@ -122,8 +122,7 @@ def _followed(
     lines = []
     for pair, (begin, end) in zip(signals, spans, strict=True):
         v = np.stack([np.asarray(x[n])[begin:end] for x in pair for n in names], axis=1)
-        v = np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (end - begin - 1) // 2]
-        lines.append(v / np.sqrt(end - begin))
+        lines.append(lines_of(v))
     m, followed, F = len(names), [], []
     for S in smoothed(lines, PART):
         size = np.sqrt(np.real(np.einsum("kii->ki", S[:, :m, :m])))

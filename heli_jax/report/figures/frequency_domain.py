@@ -6,11 +6,11 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.operating_point import OperatingPoint
+from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.result import Signals
 from heli_jax.report import frequency, style
-from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import Panels, panels, sample_time
 from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.sketch import Sketch, SketchAxes

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax.analysis.mismatch import unnoticeable
+from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.report import style
-from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.frequency_axis import last_of
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.fitted_responses import FittedPair

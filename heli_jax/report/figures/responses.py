@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.analysis.transfer_fit import Z95
 from heli_jax.report import style
-from heli_jax.report.coherence import COHERENT
-from heli_jax.report.figures.frequency_axis import last_of
+from heli_jax.report.figures.frequency_axis import SEEN, last_of
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.frequency import phase
 from heli_jax.report.style import legend_above, subtitle
@@ -19,9 +18,9 @@ from heli_jax.report.style import legend_above, subtitle
 _COLOURS = (style.VERMILLION, style.GREEN, style.PURPLE)
 _WIDE = 1.0
 """relative random error past which a bin says nothing, and is not drawn"""
-_SEEN, _BY_CHANCE = 0.1, 2.0
+_BY_CHANCE = 2.0
 """Bins neither set the axes nor tell the phase's branch below a mean coherence over an octave of
-the first, nor of this times what chance makes of it, one over the number of averages."""
+SEEN, nor of this times what chance makes of it, one over the number of averages."""
 _MARGINS = (6.0, 45.0)
 """dB and deg beyond what sets the axes"""
 
@@ -94,7 +93,7 @@ def seen_of(omega: np.ndarray, pair: Any, averages: float) -> np.ndarray:
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
     # Of few averages chance makes much, but what passes for coherent is no chance.
-    least = min(max(_SEEN, _BY_CHANCE / averages), COHERENT)
+    least = min(max(SEEN, _BY_CHANCE / averages), COHERENT)
     return known & (octave_mean(omega, pair.coherence) >= least)
 
 
