@@ -24,11 +24,11 @@ from heli_jax import (
 from heli_jax.dynamics.linearised import point
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
-    Matrices,
     errors_of_lines,
     resolved,
     states,
 )
+from heli_jax.identification.estimation.frequency_machines import Matrices
 from heli_jax.identification.estimation.frequency_records import Record, cut_notes
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
@@ -97,8 +97,9 @@ def lines_of_a_machine(A: jax.Array) -> tuple[jax.Array, jax.Array]:
     n = A.shape[0]
     record = Record(0, 0, 40)
     m = Matrices(A, jnp.ones((n, 1)), jnp.eye(n)[:2], jnp.zeros((2, 1)))
-    at = resolved(m, record, jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2)))
-    return at.H, states(at, jnp.ones((record.lines, n), complex))
+    white = jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2))
+    at = resolved(m, record, white, jnp.asarray(1.0))
+    return at.H, states(at, 0, jnp.ones((1, record.lines, n), complex))
 
 
 def test_lines_without_a_triangle_are_the_same(monkeypatch):

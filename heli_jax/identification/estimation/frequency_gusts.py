@@ -27,7 +27,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.frequency_lines import (
+from heli_jax.identification.estimation.frequency_machines import (
     Machine,
     alike,
     first_machine,

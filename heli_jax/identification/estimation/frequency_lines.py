@@ -7,7 +7,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 (1975) for the projection.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,209 +15,139 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax import naming
-from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.identification.estimation.frequency_records import Record, records_of
-from heli_jax.identification.estimation.linearised_flights import linear_drive
-from heli_jax.identification.estimation.simulated_flights import driven
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
-from heli_jax.simulation.hold import linear_inputs
-from heli_jax.simulation.stepping import held_columns
+from heli_jax.identification.estimation.frequency_blocks import Blocks, blocks_of
+from heli_jax.identification.estimation.frequency_machines import (
+    Machine,
+    Matrices,
+    Signals,
+    alike,
+    by_flight,
+    first_machine,
+    machines_of,
+    measured,
+    parts_of_group,
+)
+from heli_jax.identification.estimation.frequency_records import Record
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
-_TOGETHER = 4
-"""flights of one machine side by side at most"""
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
+_ROUNDING = 1e-12
+"""part of the largest power of a direction of the ends below which it is rounding: a millionth of
+its size"""
 _SPARED = 0.1
 """part of a record's numbers that its ends may take, those of gusts among them"""
 
 
-class Matrices(NamedTuple):
-    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
-
-    Ad: Float[Array, "... n n"]
-    B: Float[Array, "... n r"]
-    C: Float[Array, "... p n"]
-    D: Float[Array, "... p m"]
-
-
-class Machine(NamedTuple):
-    """What turns gusts into outputs."""
-
-    Ad: Float[Array, "n n"]
-    C: Float[Array, "p n"]
-
-
-class Signals(NamedTuple):
-    """What drives a machine, in time or at the lines."""
-
-    U: Array
-    """what B multiplies, (N, r)"""
-    acting: Array
-    """the inputs that act at the samples, (N, m)"""
-
-
-class Machines(NamedTuple):
-    """Flights that are alike, side by side."""
-
-    matrices: Matrices
-    """of all of them, or with a leading axis where parameters are known of each flight"""
-    signals: Signals
-    """with a leading axis"""
-    by: Signals | None
-    """likewise with the inputs by instrument; None without"""
-
-
 class Resolved(NamedTuple):
-    """What a machine does at every line of a record, signals apart; without a derivative."""
+    """What a machine does at the lines of a record, by block (b, ...); without a derivative."""
 
-    z: Complex[np.ndarray, " K"]
+    blocks: Blocks
+    z: Complex[Array, "b k"]
     T: Complex[Array, "n n"]
     """Ad = V T V^H, triangular"""
     V: Complex[Array, "n n"]
-    W: Complex[Array, "K p p"]
-    """the whitening"""
-    H: Complex[Array, "K p n"]
+    W: Complex[Array, "b k p p"]
+    """the whitening; zero beyond the lines that are used"""
+    H: Complex[Array, "b k p n"]
     """W C (zI - Ad)^-1"""
-    ends: Complex[np.ndarray, "K e"]
+    ends: Complex[Array, "b k e"]
     """what drives a state that ends elsewhere than it began and, but in a very short record, what
     does where a slow gust that pushes it does"""
-    Q: Float[Array, "s m"]
-    """an orthonormal basis of what the ends may add to whitened rows; zero where a state leaves no
-    trace"""
-    solution: Float[Array, "m m"]
-    """from the components along Q to the ends' states, and behind these to the gusts'"""
+    S: Float[Array, "m m"]
+    """a basis of what the ends may add to whitened rows, times this, is orthonormal: columns are
+    zero where a state leaves no trace"""
+
+    def basis(self, b: Array | int) -> Float[Array, "s m"]:
+        """What the ends' states, and behind these the gusts', add to the rows of a block.
+
+        Args:
+            b: number of the block.
+        """
+        # Together with what takes a block out of all of them the products would be several times
+        # slower.
+        return _basis(*jax.lax.optimization_barrier((self.H[b], self.ends[b])))
 
 
 class Errors(NamedTuple):
-    """Of one record, with what they came of."""
+    """Of one record of each of a few flights, with what they came of; the first three by block."""
 
-    rows: Float[Array, "K 2p"]
-    """measured less simulated, whitened, the ends of the record taken off"""
-    X: Complex[Array, "K n"]
-    """the states"""
+    rows: Float[Array, "b f s"]
+    """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines
+    that are used"""
+    X: Complex[Array, "b f k n"]
+    """the states; zero beyond the blocks that are used"""
+    X_by: Complex[Array, "b f k n"] | None
+    """those that inputs by instrument make; None without any"""
     signals: Signals
-    """at the lines"""
-    beyond: Complex[Array, "K p"]
+    """at all lines (f, K, ...)"""
+    beyond: Complex[Array, "f K p"]
     """measured less what the inputs add to the outputs past the states"""
 
 
-def alike(layout: Layout, data: Data) -> list[list[int]]:
-    """The flights in groups that differ in numbers alone.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-    """
-    groups: dict[Any, list[int]] = {}
-    for i, flight in enumerate(data.flights):
-        n = next(iter(flight.outputs.values())).shape[0]
-        key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
-        # An offset of its own moves the point about which a flight is linearised.
-        key = key if layout.model.linear else (i, *key)
-        groups.setdefault(key, []).append(i)
-    return list(groups.values())
-
-
-def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> Machines:
-    """Those of one group.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns, in the units of the model.
-        members: the flights' numbers.
-    """
-    first = members[0]
-    stacked = jax.tree.map(lambda *v: jnp.stack(v), *(data.flights[i] for i in members))
-
-    def of_one(flight: Any) -> Machines:
-        # With one sample time all that does not hang on the signals is computed once.
-        flight = flight._replace(dt=data.flights[first].dt)
-        matrices, signals = _machine(layout, data, u, (first, flight))
-        if flight.by_instrument is None:
-            return Machines(matrices, signals, None)
-        # A point to linearise about knows means alone, which inputs by instrument have as well.
-        by = flight._replace(inputs=flight.by_instrument)
-        return Machines(matrices, signals, _machine(layout, data, u, (first, by))[1])
-
-    axes = Machines(None if _one_machine(data, members) else 0, 0, 0)  # pyright: ignore
-    return jax.vmap(of_one, out_axes=axes)(stacked)
-
-
-def _one_machine(data: Data, members: list[int]) -> bool:
-    return len(members) > 1 and not data.flights[members[0]].known
-
-
-def _machine(
-    layout: Layout, data: Data, u: Unknowns, of: tuple[int, Any]
-) -> tuple[Matrices, Signals]:
-    i, flight = of
-    data = data._replace(flights=(*data.flights[:i], flight, *data.flights[i + 1 :]))
-    condition = layout.of_flights[i].condition
-    model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)
-
-
-def by_flight(
-    data: Data,
-    members: list[int],
-    prepared: Callable[[Any], Any],
-    body: Callable[[Any, Any], Any],
-    common: Any,
-    each: Any,
-) -> Any:
-    """`body(prepared(common), some of each)` over the flights of a group, with a leading axis.
-
-    Args:
-        data: the numbers of the problem.
-        members: the flights' numbers.
-        prepared: what of it is the same for flights that have one machine.
-        body: of a few flights, which have a leading axis in what it is given and what it returns.
-        common: of the machine; with a leading axis where each flight has its own.
-        each: of the flights, with a leading axis.
-    """
-    count = len(members)
-    one_machine = _one_machine(data, members)
-    # A few at a time: what is read for every line of a machine is then read once for all of them,
-    # and what is on the way to a few sums of a flight still fits into memory.
-    size = max(n for n in range(1, _TOGETHER + 1) if count % n == 0) if one_machine else 1
-    some = jax.tree.map(lambda v: v.reshape(count // size, size, *v.shape[1:]), each)
-    if one_machine:
-        ready = prepared(common)
-        made = jax.lax.map(lambda of: body(ready, of), some)
-    else:
-        made = jax.lax.map(lambda of: body(prepared(of[0]), of[1]), (common, some))
-    return jax.tree.map(lambda v: v.reshape(count, *v.shape[2:]), made)
-
-
-def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
+def resolved(
+    m: Matrices, record: Record, whitening: Complex[Array, "K p p"], part: Array
+) -> Resolved:
     """A machine at the lines of a record.
 
     Args:
         m: its matrices.
         record: which samples it is.
         whitening: of the record's lines.
+        part: of the lines that are used.
     """
-    z = np.exp(2j * np.pi * np.arange(1, record.lines + 1) / record.samples)
+    blocks = blocks_of(record, part)
+    # Beyond the last line those that would follow it, so that nothing is singular there.
+    k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
+    z = np.exp(2j * np.pi * k / (record.samples + 2 * blocks.size))
+    z[k <= record.lines] = np.exp(2j * np.pi * k[k <= record.lines] / record.samples)
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
-    T, V = _triangle(m.Ad)
-    H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
     # A gust that ends elsewhere than it began has its leap at all lines: taken for noise of each
     # line by itself it moves slow modes by several standard deviations. Above its corner it is an
     # integrated push. Over the length, so that it is no larger than the states' own ends.
-    ends = np.stack([z, z / (z - 1.0) / record.samples], axis=1)
-    _, p, n = H.shape
-    if 2 * n > _SPARED * 2 * p * record.lines:
-        ends = ends[:, :1]
-    # What the ends of the record explain is found by linear least squares.
-    basis = jnp.concatenate([H * v[:, None, None] for v in jnp.asarray(ends).T], axis=2)
-    Q, solution = _span(stacked(basis).reshape(-1, basis.shape[2]))
-    return Resolved(z, T, V, whitening, H, ends, Q, solution)
+    ends = np.stack([z, z / (z - 1.0) / record.samples], axis=2)
+    (p, n), K = m.C.shape, record.lines
+    if 2 * n > _SPARED * 2 * p * K:
+        ends = ends[:, :, :1]
+    z, ends, W = jnp.asarray(z), jnp.asarray(ends), blocks.cut(whitening)
+    T, V = _triangle(m.Ad)
+    C, back = m.C.astype(z.dtype) @ V, jnp.conj(V.T)
+
+    def more(b: Any, made: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        white, H, gram = made
+        W_b = W[b] * blocks.within(b)[:, None, None].astype(z.dtype)
+        H_b = W_b @ (_solved(z[b], T, C[None], left=False) @ back)
+        basis = _basis(*jax.lax.optimization_barrier((H_b, ends[b])))
+        return white.at[b].set(W_b), H.at[b].set(H_b), gram + basis.T @ basis
+
+    m_ends = n * ends.shape[2]
+    nothing = (
+        jnp.zeros_like(W),
+        jnp.zeros((*z.shape, p, n), z.dtype),
+        jnp.zeros((m_ends, m_ends), m.Ad.dtype),
+    )
+    W, H, gram = blocks.over(more, nothing)
+    return Resolved(blocks, z, T, V, W, H, ends, _orthonormal(gram))
+
+
+def _basis(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Array, "s m"]:
+    made = stacked(H[:, :, None, :] * ends[:, None, :, None])
+    return made.reshape(2 * H.shape[0] * H.shape[1], -1)
+
+
+def _orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """S with S^T G S the identity, but for directions without effect, which are zero."""
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
+    # A state that no output shows has a column of rounding: that would make some direction of it,
+    # another at each step, and what is taken off by it makes the sum of squares rough.
+    seen = sizes > _NO_END * jnp.max(sizes)
+    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
+    # Squares of the sizes of directions. What remains along one that is dropped is small where the
+    # others have sizes that a record can tell.
+    kept = values > _ROUNDING * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    return over[:, None] * vectors * root[None, :]
 
 
 def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
@@ -235,16 +164,6 @@ def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[A
     # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved. JAX
     # has it for the CPU alone: elsewhere `_solved` takes the matrix as it is.
     return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
-
-
-def _span(basis: Float[Array, "s m"]) -> tuple[Float[Array, "s m"], Float[Array, "m m"]]:
-    Q, R = jnp.linalg.qr(basis)
-    # A state that no output shows has a column of rounding, and QR makes some direction of it,
-    # another at each step: what that takes off makes the sum of squares rough.
-    U, sizes, Vt = jnp.linalg.svd(R)
-    kept = sizes > _NO_END * sizes[0]
-    over = jnp.where(kept, 1.0 / jnp.where(kept, sizes, 1.0), 0.0)
-    return Q @ jnp.where(kept[None, :], U, 0.0), Vt.T * over[None, :]
 
 
 def stacked(v: Array) -> Array:
@@ -281,9 +200,8 @@ def errors_of_some(
     signals: Signals,
     y: Float[Array, "f N p"],
     by: Signals | None = None,
-) -> tuple[Errors, Complex[Array, "f K n"] | None]:
-    """Of one record of each of a few flights of one machine, with a leading axis; and the states
-    that inputs by instrument make, None without any.
+) -> Errors:
+    """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
         at: the machine at the record's lines.
@@ -293,44 +211,60 @@ def errors_of_some(
         y: what was measured.
         by: the inputs by instrument.
     """
+    blocks, f = at.blocks, y.shape[0]
     B, D = (M.T.astype(at.z.dtype) for M in (m.B, m.D))
+    of_flights = jax.vmap(lambda v: at_lines(record, v))
+    lines = Signals(*(of_flights(v) for v in signals))
+    beyond = of_flights(y) - lines.acting @ D
+    # By instrument the states are those of the inputs alone: such a record has no ends.
+    inputs = [lines.U] if by is None else [lines.U, of_flights(by.U)]
+    driving = blocks.cut(jnp.concatenate(inputs) @ B, axis=1)
+    left = blocks.cut(beyond, axis=1)
 
-    def of_one(signals: Signals, y: Float[Array, "N p"]) -> tuple[Array, Array, Signals, Array]:
-        lines = Signals(*(at_lines(record, v) for v in signals))
-        beyond = at_lines(record, y) - lines.acting @ D
-        driving = lines.U @ B
-        white = stacked(_times(at.W, beyond) - _times(at.H, driving)).reshape(record.lines, -1)
-        # The ends of the record: what they add lies along Q.
-        along = at.Q.T @ white.reshape(-1)
-        d = (at.solution @ along).reshape(at.ends.shape[1], -1).astype(at.z.dtype)
-        rows = white - (at.Q @ along).reshape(white.shape)
-        return rows, driving + at.ends @ d, lines, beyond
+    def unprojected(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
+        white, along = made
+        e = _times(at.W[b], left[b]) - _times(at.H[b], driving[b][:f])
+        e = jnp.stack([jnp.real(e), jnp.imag(e)], axis=2).reshape(f, -1)
+        return white.at[b].set(e), along + e @ at.basis(b)
 
-    # Under vmap flights are columns of the same products and substitutions.
-    rows, driving, lines, beyond = jax.vmap(of_one)(signals, y)
-    if by is not None:
-        others = jax.vmap(lambda U: at_lines(record, U) @ B)(by.U)
-        driving = jnp.concatenate([driving, others])
-    X = jax.vmap(lambda driving: states(at, driving))(driving)
-    count = rows.shape[0]
-    return Errors(rows, X[:count], lines, beyond), None if by is None else X[count:]
+    size, m_ends, real_type = 2 * at.H.shape[1] * at.H.shape[2], len(at.S), m.Ad.dtype
+    nothing = (
+        jnp.zeros((blocks.count, f, size), real_type),
+        jnp.zeros((f, m_ends), real_type),
+    )
+    white, along = blocks.over(unprojected, nothing)
+    # The ends' states of each flight, by linear least squares.
+    d = (along @ at.S) @ at.S.T
+    of_ends = d.reshape(f, at.ends.shape[2], -1).astype(at.z.dtype)
+
+    def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
+        rows, X = made
+        driven = driving[b].at[:f].add(at.ends[b][None] @ of_ends)
+        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
+
+    rows, X = blocks.over(without_ends, (white, jnp.zeros_like(driving)))
+    return Errors(rows, X[:, :f], None if by is None else X[:, f:], lines, beyond)
 
 
-def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"]:
+def states(
+    at: Resolved, b: Array | int, driving: Complex[Array, "f k n"]
+) -> Complex[Array, "f k n"]:
     """(zI - Ad)^-1 of what drives them.
 
     Args:
         at: the machine at the lines.
+        b: number of the block.
         driving: B U, and the ends.
     """
-    seen = (driving @ jnp.conj(at.V))[:, :, None]
-    return _solved(at.z, at.T, seen, left=True)[:, :, 0] @ at.V.T
+    # Flights are columns of the same substitutions.
+    seen = jnp.moveaxis(driving @ jnp.conj(at.V), 0, 2)
+    return jnp.moveaxis(_solved(at.z[b], at.T, seen, left=True), 2, 0) @ at.V.T
 
 
-def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> Array:
-    """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with T of `_triangle`."""
+def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array:
+    """(zI - T)^-1 b at each line (k, ...), or b (zI - T)^-1, with T of `_triangle`."""
     M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype)[None] - T[None]
-    b = jnp.broadcast_to(b, (len(z), *b.shape[-2:]))
+    b = jnp.broadcast_to(b, (z.shape[0], *b.shape[1:]))
 
     def whole(M: Array, b: Array) -> Array:
         if left:
@@ -344,9 +278,9 @@ def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> 
     return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
 
-def _times(M: Complex[Array, "K a b"], v: Complex[Array, "K b"]) -> Complex[Array, "K a"]:
+def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Array, "f k a"]:
     # A sum: products of a small matrix and a vector each would call a routine for every line.
-    return jnp.sum(M * v[:, None, :], axis=2)
+    return jnp.sum(M[None] * v[:, :, None, :], axis=3)
 
 
 @eqx.filter_jit
@@ -367,14 +301,14 @@ def errors_of_lines(
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
 
         def ready(m: Matrices, parts: Any = parts) -> Any:
-            return m, [resolved(m, record, W) for record, W in parts]
+            return m, [resolved(m, record, W, part_used(noise)) for record, W in parts]
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> list[Array]:
             m, ats = common
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
-                e, _ = errors_of_some(at, m, record, *some)
-                made.append(e.beyond - e.X @ m.C.T.astype(at.z.dtype))
+                e = errors_of_some(at, m, record, *some)
+                made.append(e.beyond - at.blocks.joined(e.X, axis=1) @ m.C.T.astype(at.z.dtype))
             return made
 
         first = first_machine(machines.matrices) if first is None else first
@@ -386,37 +320,10 @@ def errors_of_lines(
     return [one for i in range(len(data.flights)) for one in errors[i]], first
 
 
-def first_machine(m: Matrices) -> Machine:
-    """That of the first flight of a group: records of one length share a spectrum.
+def part_used(noise: Noise) -> Array:
+    """The part of the lines, from the lowest, that a noise says of.
 
     Args:
-        m: of all of them, or with a leading axis.
+        noise: of frequency error.
     """
-    Ad, C = (v[0] if v.ndim == 3 else v for v in (m.Ad, m.C))
-    return Machine(Ad, C)
-
-
-def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
-    """The records of each flight of a group, with their whitening.
-
-    Args:
-        layout: what the unknowns are.
-        noise: with the whitening of each record.
-        members: the flights' numbers.
-    """
-    # Records of one length have one spectrum (`smoothed`): that of the first flight's serve all.
-    pairs = zip(records_of(layout), noise.whitening, strict=True)
-    return [(record, W) for record, W in pairs if record.flight == members[0]]
-
-
-def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
-    """What the flights of a group measured.
-
-    Args:
-        layout: says in what order.
-        data: the numbers of the problem.
-        members: the flights' numbers.
-    """
-    names = layout.outputs[members[0]]
-    columns = [[data.flights[i].outputs[n] for n in names] for i in members]
-    return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
+    return jnp.asarray(1.0 if isinstance(noise.part, tuple) else noise.part)

@@ -15,26 +15,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.frequency_lines import (
-    Machines,
-    Matrices,
+    Errors,
     Resolved,
-    Signals,
-    alike,
     at_lines,
-    by_flight,
     errors_of_some,
-    machines_of,
-    measured,
-    parts_of_group,
+    part_used,
     real,
     resolved,
     stacked,
 )
+from heli_jax.identification.estimation.frequency_machines import (
+    Machines,
+    Matrices,
+    Signals,
+    alike,
+    by_flight,
+    machines_of,
+    measured,
+    parts_of_group,
+)
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
-
-_BLOCK = 256
-"""lines whose derivatives are made and summed before the next"""
 
 
 class Products(NamedTuple):
@@ -48,28 +49,29 @@ class Products(NamedTuple):
 
 
 class _Driven(NamedTuple):
-    """Lines of a record: the states, what drives them, and the derivatives of that."""
+    """Lines of a block: the states, what drives them, and the derivatives of that."""
 
-    X: Complex[Array, "K n"]
+    X: Complex[Array, "k n"]
     lines: Signals
     slopes: Signals
-    """(K, c, q); None for those that do not move"""
+    """(k, c, q); None for those that do not move"""
 
 
 class _Shared(NamedTuple):
-    """Of a record's lines what flights of one machine have in common."""
+    """Of a block what flights of one machine have in common."""
 
     H: Array
-    """(K, p, n), or for each line the real matrix of it"""
+    """for each line the real matrix of it (k, 2p, 2n)"""
     W: Array | None
-    """the same of (K, p, p); None where nothing that it multiplies moves"""
-    Q: Float[Array, "K 2p m"]
+    """the same (k, 2p, 2p); None where nothing that it multiplies moves"""
+    basis: Float[Array, "s m"]
+    """of what the ends may add"""
 
 
 class _Own(NamedTuple):
     """What each flight has of its own."""
 
-    e: Float[Array, "K 2p"]
+    e: Float[Array, " s"]
     driven: _Driven
     by: _Driven | None = None
     """by instrument, where that is what Z is of"""
@@ -85,6 +87,15 @@ class _Sums(NamedTuple):
     Qe: Array
     QZ: Array
     QJ: Array
+
+    def along(self, S: Float[Array, "m m"]) -> "_Sums":
+        """With components along an orthonormal basis.
+
+        Args:
+            S: makes it of the basis that the sums are of.
+        """
+        Qe, QZ, QJ = (S.T @ v for v in (self.Qe, self.QZ, self.QJ))
+        return self._replace(Qe=Qe, QZ=QZ, QJ=QJ)
 
     def products(self) -> Products:
         """Z P e and Z P J with the projection P: only the small products change (Kaufman)."""
@@ -124,14 +135,14 @@ def products_of_lines(
 
         def ready(common: Any, parts: Any = parts) -> Any:
             m, dm = common
-            return m, dm, [resolved(m, record, W) for record, W in parts]
+            return m, dm, [resolved(m, record, W, part_used(noise)) for record, W in parts]
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> Products:
             m, dm, ats = common
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 sums = _of_record((at, m, dm), record, noise.by_instrument, *some)
-                made.append(jax.vmap(_Sums.products)(sums))
+                made.append(jax.vmap(lambda of, S=at.S: of.along(S).products())(sums))
             return jax.tree.map(lambda *v: sum(v), *made)
 
         measured_signals = (machines.signals, slopes.signals, measured(layout, data, members))
@@ -159,58 +170,54 @@ def _of_record(
         instruments: the inputs by instrument and their derivatives.
     """
     (at, m, dm), (signals, ds, y) = common, measured_signals
-    by = None if instruments is None else instruments[0]
-    e, X_by = errors_of_some(at, m, record, signals, y, by)
-    driven = jax.vmap(lambda e, ds: _Driven(e.X, e.signals, _lines(record, ds)))(e, ds)
-    own = _Own(e.rows, driven)
+    e = errors_of_some(at, m, record, signals, y, instruments and instruments[0])
+    driven: list[tuple[Any, Signals, Signals]] = [(e.X, e.signals, _lines(record, ds))]
     if instruments is not None:
-        own = own._replace(by=jax.vmap(lambda *v: _driven_by(record, *v))(X_by, *instruments))
-    # What passes a machine by, without its states, hangs on no unknown of most.
-    passes = any(v is not None for v in (dm.C, dm.D, ds.acting))
-    W = at.W if passes else None
-    lines = _Shared(at.H, W, at.Q.reshape(*e.rows.shape[1:], -1))
-    return _summed((m, dm), lines, own, by_instrument)
-
-
-def _driven_by(record: Record, X: Complex[Array, "K n"], by: Signals, dby: Signals) -> _Driven:
-    return _Driven(X, Signals(*(at_lines(record, v) for v in by)), _lines(record, dby))
+        by, dby = instruments
+        lines = Signals(*(jax.vmap(lambda v: at_lines(record, v))(v) for v in by))
+        driven.append((e.X_by, lines, _lines(record, dby)))
+    return _summed(at, (m, dm), e, driven, by_instrument)
 
 
 def _summed(
-    matrices: tuple[Matrices, Matrices], lines: _Shared, own: _Own, by_instrument: Array
+    at: Resolved,
+    matrices: tuple[Matrices, Matrices],
+    e: Errors,
+    driven: list[tuple[Any, Signals, Signals]],
+    by_instrument: Array,
 ) -> _Sums:
-    """Over all lines, some hundred at a time: the derivatives of all would leave every cache."""
-    K = lines.H.shape[0]
-    count = -(-K // _BLOCK)
-    size = -(-K // count)
+    """Over the lines that are used, block by block: the derivatives of all would leave every cache.
 
-    def blocks(v: Array, axis: int) -> Array:
-        # Lines of zeros add nothing.
-        widths = [(0, 0)] * v.ndim
-        widths[axis] = (0, count * size - K)
-        v = jnp.pad(v, widths).reshape(*v.shape[:axis], count, size, *v.shape[axis + 1 :])
-        return jnp.moveaxis(v, axis, 0)
+    Args:
+        at: the machine at the lines.
+        matrices: the machine and its derivatives.
+        e: the errors.
+        driven: states by block, signals at all lines and their derivatives; and by instrument.
+        by_instrument: whether instruments are used.
+    """
+    blocks, (_, dm) = at.blocks, matrices
+    # What passes a machine by, without its states, hangs on no unknown of most.
+    passes = any(v is not None for v in (dm.C, dm.D, driven[0][2].acting))
+    of_blocks = [
+        _Driven(X, *jax.tree.map(lambda v: blocks.cut(v, axis=1), (lines, slopes)))
+        for X, lines, slopes in driven
+    ]
 
-    def made(block: tuple[_Shared, _Own]) -> _Sums:
-        H, W, Q = block[0]
-        shared = _Shared(real(H), None if W is None else real(W), Q)
-        return jax.lax.map(lambda one: _sums(matrices, shared, one, by_instrument), block[1])
+    def made(b: Any) -> _Sums:
+        W = real(at.W[b]) if passes else None
+        shared = _Shared(real(at.H[b]), W, at.basis(b))
+        own = _Own(*jax.tree.map(lambda v: v[b], (e.rows, *of_blocks)))
+        return jax.lax.map(lambda one: _sums(matrices, shared, one, by_instrument), own)
 
-    def more(total: _Sums, block: tuple[_Shared, _Own]) -> tuple[_Sums, None]:
-        return jax.tree.map(jnp.add, total, made(block)), None
-
-    shared = jax.tree.map(lambda v: blocks(v, 0), lines)
-    stacked_blocks = (shared, jax.tree.map(lambda v: blocks(v, 1), own))
-    shapes = jax.eval_shape(made, jax.tree.map(lambda v: v[0], stacked_blocks))
+    shapes = jax.eval_shape(made, 0)
     zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-    return jax.lax.scan(more, zeros, stacked_blocks)[0]
+    return blocks.over(lambda b, total: jax.tree.map(jnp.add, total, made(b)), zeros)
 
 
 def _sums(
     matrices: tuple[Matrices, Matrices], lines: _Shared, own: _Own, by_instrument: Array
 ) -> _Sums:
-    e = own.e.reshape(-1, 1)
-    Q = lines.Q.reshape(e.shape[0], -1)
+    e, Q = own.e[:, None], lines.basis
 
     def slopes(of: _Driven) -> Float[Array, "s q"]:
         made = _slopes(lines, *matrices, of)
@@ -241,11 +248,11 @@ def _sums(
 
 
 def _lines(record: Record, ds: Signals) -> Signals:
-    """At the lines the derivatives (N, c, q) of signals; None where there are none."""
+    """At the lines the derivatives (f, N, c, q) of signals; None where there are none."""
 
     def lines(v: Array) -> Array:
-        flat = at_lines(record, v.reshape(v.shape[0], -1))
-        return flat.reshape(flat.shape[0], *v.shape[1:])
+        flat = jax.vmap(lambda v: at_lines(record, v))(v.reshape(*v.shape[:2], -1))
+        return flat.reshape(*flat.shape[:2], *v.shape[2:])
 
     return jax.tree.map(lines, ds)
 

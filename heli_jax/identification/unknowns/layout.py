@@ -198,6 +198,8 @@ class Noise(NamedTuple):
     by_instrument: Any = ()
     """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
     as it does until the search by instrument has somewhere to begin"""
+    part: Any = ()
+    """frequency error: the part of a record's lines, from the lowest, that is used"""
     scale_slopes: Any = ()
     """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
     unknown (k,), see `noisy_scales`; () where the model has none"""
