@@ -28,6 +28,7 @@ import jax
 
 from heli_jax import Problem, fit
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.first_search import first_optima
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.fit import first_guess
@@ -61,14 +62,12 @@ class Took(NamedTuple):
 
 def search(problem: Problem) -> None:
     """Estimates with covariance, as `fit` finds them from one start, and nothing else."""
-    layout, data, noise, z, e = first_guess(problem)
-    begun, most = layout.estimator.begins_with(data), 200
-    known = (jax.numpy.asarray(e.r), jax.numpy.asarray(e.J)) if begun is data else None
-    first = Search(problem, layout, begun, most)
-    [best] = first.run(noise, z[None], nearing=layout.estimator.nearing, known=known)
-    found = relax_noise_covariance(Search(problem, layout, data, most), noise, best)
+    guess = first_guess(problem)
+    over = Search(problem, guess.layout, guess.data, 200)
+    first = first_optima(over, guess, guess.z[None])
+    found = relax_noise_covariance(over, first.noise, first.optima[0])
     assert bool(found.best.converged)
-    deviations(evaluate(layout, data, found.noise, found.best.z).J)
+    deviations(evaluate(guess.layout, guess.data, found.noise, found.best.z).J)
 
 
 def timed(problem: Problem) -> Took:

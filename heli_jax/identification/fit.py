@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,8 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.drawn_starts import draw
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.likely_gusts import likely_gusts
 from heli_jax.identification.estimation.multistart import StartRow
@@ -49,9 +50,6 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
-    Data,
-    Layout,
-    Noise,
     Solution,
     layout_of,
     scales_of,
@@ -98,16 +96,6 @@ _FIRST_STEPS = 40
 """of filter error, until it is known that there is a disturbance to find"""
 
 
-class FirstGuess(NamedTuple):
-    """A problem at its first guess."""
-
-    layout: Layout
-    data: Data
-    noise: Noise
-    z: Float[Array, " q"]
-    e: Evaluation
-
-
 def first_guess(problem: Problem) -> FirstGuess:
     """The problem at its start values, with a first guess of the noise.
 
@@ -127,7 +115,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e)
+    return FirstGuess(layout, data, noise, z, e, begun)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -338,26 +326,21 @@ def _search(
     search = starting.Search(
         problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
     )
-    # Residuals at the first start are those of the first guess.
-    begun = layout.estimator.begins_with(data)
-    same = begun is data and bool(np.array_equal(points[0], guess.z))
-    known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
-    first = starting.Search(problem, layout, begun, search.max_steps)
-    optima = first.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
+    first, quick, optima = first_optima(search, guess, points, report)
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
     if shooting is not None:
         best, notes = shooting, (SAID,)
-    if further is not None and explains_little(first, noise, best):
+    if further is not None and explains_little(first, quick, best):
         report(SAID_FURTHER)
         more = further_starts(layout, problem, guess.z, further)
-        optima += first.run(noise, more, report, nearing=layout.estimator.nearing)
+        optima += first.run(quick, more, report, nearing=layout.estimator.nearing)
         points = jnp.concatenate([points, more])
         better = min(optima, key=starting.rank)
         if starting.rank(better) < starting.rank(best):
             best, notes = better, ()
-    optimum = relax_noise_covariance(search, noise, best)
+    optimum = relax_noise_covariance(search, quick, best)
     optimum = optimum._replace(notes=(*notes, *optimum.notes))
     # Relaxation ends where its first weights of the outputs lead: tried from others too.
     optimum = better_of_two_guesses(search, points, optimum, problem.training)

@@ -170,6 +170,34 @@ class Estimator(abc.ABC):
         """
         return data
 
+    def to_begin_with(
+        self,
+        layout: Layout,
+        data: Data,
+        noise: Noise,
+        z: Float[Array, " q"],
+        known: tuple[Array, Array],
+    ) -> tuple[Noise, tuple[Array, Array]]:
+        """A noise by which a search takes less time and finds nearly the same, with residuals and
+        Jacobian at z; the one given where there is none.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: to begin with.
+            z: the start values.
+            known: residuals and Jacobian there with `noise`.
+        """
+        return noise, known
+
+    def whole(self, noise: Noise) -> Noise:
+        """The noise by which a search ends that began with less; the same object otherwise.
+
+        Args:
+            noise: so far.
+        """
+        return noise
+
     def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """The noise to ask at the start values what a fit may determine, where a search begins by
         other equations or with another noise than it ends with.

@@ -102,3 +102,21 @@ def combined_deviations(
     lost = np.abs(along[:, ~kept]) > takes_part * lengths[:, None]
     sds = np.linalg.norm(along[:, kept] / sizes[kept], axis=1)
     return np.where(lost.any(axis=1), np.inf, sds)
+
+
+def least_share(part: np.ndarray, J: np.ndarray) -> float:
+    """Of what whitened rows tell of any combination of coordinates, the least that others tell.
+
+    Args:
+        part: the others (m, q).
+        J: the rows (n, q).
+    """
+    if not (np.isfinite(J).all() and np.isfinite(part).all()):
+        return 0.0
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    # Combinations that no row tells of are of neither.
+    kept = sizes > 1e-10 * sizes[0]
+    along = (part / norms) @ (right[kept].T / sizes[kept])
+    return float(np.linalg.svd(along, compute_uv=False)[-1] ** 2) if kept.any() else 0.0

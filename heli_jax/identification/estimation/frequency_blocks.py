@@ -81,4 +81,6 @@ def blocks_of(record: Record, part: Array) -> Blocks:
     """
     K = record.lines
     count = -(-K // _BLOCK)
+    # So that a half and a quarter of the lines are whole blocks.
+    count = count if count == 1 else 4 * -(-count // 4)
     return Blocks(K, count, -(-K // count), jnp.floor(part * K).astype(int))

@@ -23,10 +23,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.evaluation import least_share
 from heli_jax.identification.estimation.frequency_gusts import whitening_by
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
@@ -51,6 +52,7 @@ from heli_jax.identification.estimation.frequency_spectrum import (
     without_shared,
 )
 from heli_jax.identification.estimation.in_time import in_time
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -64,6 +66,13 @@ from heli_jax.identification.unknowns.layout import (
     Solution,
     Unknowns,
 )
+
+_FEW = 0.25
+"""part of the lines that a search begins with: a fraction of two, the same in all precisions"""
+_NEARLY_ALL = 0.9
+"""of what all lines tell of any combination of unknowns"""
+_MANY = 300_000
+"""numbers at all lines times unknowns, below which these take no time"""
 
 
 class FrequencyError(Estimator):
@@ -143,7 +152,8 @@ class FrequencyError(Estimator):
         # the say to where the record is largest, gusts included.
         whitening = whitening_of(without_shared(s) for s in smoothed(measured))
         # Least squares at first: near that estimate the equations by instrument have one solution.
-        return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
+        begun, all_lines = np.zeros(()), np.ones(())
+        return noise._replace(whitening=whitening, by_instrument=begun, part=all_lines)
 
     def begins_with(self, data: Data) -> Data:
         """By instrument what follows the instruments, of inputs and outputs.
@@ -155,6 +165,42 @@ class FrequencyError(Estimator):
         # what feedback makes of the signals as they were measured may lead to one.
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
+
+    def to_begin_with(
+        self,
+        layout: Layout,
+        data: Data,
+        noise: Noise,
+        z: Float[Array, " q"],
+        known: tuple[Array, Array],
+    ) -> tuple[Noise, tuple[Array, Array]]:
+        """The lowest frequencies alone, where these tell nearly all of every unknown.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: to begin with.
+            z: the start values.
+            known: residuals and Jacobian there with `noise`.
+        """
+        interest = len(layout.of_interest)
+        numbers = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
+        if numbers * interest < _MANY:
+            return noise, known
+        few = noise._replace(part=np.asarray(_FEW))
+        at = residual_and_jacobian(layout, data, few, z)
+        # Each line weighs by what was measured at it, the motion included: of the low frequencies,
+        # where there is most of it, this says rather too little.
+        J, part = (np.asarray(v)[:, :interest] for v in (known[1], at.J))
+        return (few, (at.r, at.J)) if least_share(part, J) > _NEARLY_ALL else (noise, known)
+
+    def whole(self, noise: Noise) -> Noise:
+        """All lines.
+
+        Args:
+            noise: so far.
+        """
+        return noise if noise.part >= 1.0 else noise._replace(part=np.ones(()))
 
     def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """By instrument, where there is one; the noise is what the inputs leave of the outputs.
@@ -185,13 +231,15 @@ class FrequencyError(Estimator):
             z: the unknowns.
         """
         errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
+        part = float(noise.part)
+        errors = [v[: int(part * len(v))] for v in errors]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(machine, errors)
+                whitening = whitening_by(machine, errors, part)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
@@ -203,6 +251,8 @@ class FrequencyError(Estimator):
         # Records of one length have one spectrum.
         by_id = {id(W): -2.0 * log_determinants(W) for W in whitening}
         logs = np.concatenate([by_id[id(W)] for W in whitening])
+        if part < 1.0:
+            whitening = _at_lowest(whitening, noise.whitening)
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
@@ -210,7 +260,7 @@ class FrequencyError(Estimator):
             rms = np.sqrt(np.mean(np.abs(own) ** 2, axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
         by = np.asarray(float(data.flights[0].by_instrument is not None))
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by, noise.part)
 
     def with_nuisances(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
@@ -289,6 +339,18 @@ class FrequencyError(Estimator):
             seed: of nothing here, since nothing is drawn.
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
+
+
+def _at_lowest(
+    new: Sequence[Complex[np.ndarray, "k p p"]], old: Sequence[Complex[np.ndarray, "K p p"]]
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record the new whitening at the lowest lines and the old one beyond; of records that share
+    one the same array."""
+    made: dict[int, np.ndarray] = {}
+    for W, before in zip(new, old, strict=True):
+        if id(W) not in made:
+            made[id(W)] = np.concatenate([W, np.asarray(before)[len(W) :]])
+    return tuple(made[id(W)] for W in new)
 
 
 ESTIMATOR = FrequencyError()

@@ -70,18 +70,19 @@ def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
 
 
 def whitening_by(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], part: float = 1.0
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array.
 
     Args:
         machine: that gusts come through.
         errors: by record at its own frequencies.
+        part: of those, from the lowest, that they are at.
     """
     size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
-    before = _before(machine, scaled, size)
+    before = _before(machine, scaled, size, part)
     left = smoothed([(before[len(e)] @ e[:, :, None])[:, :, 0] for e in scaled], PART, least=LEAST)
     counts = tuple(Counter(len(e) for e in errors).items())
     p, made = errors[0].shape[1], {}
@@ -105,14 +106,18 @@ class _Cells(NamedTuple):
 
 
 def _before(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], size: Float[np.ndarray, " p"]
+    machine: Machine,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    size: Float[np.ndarray, " p"],
+    part: float,
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
     """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
     p = errors[0].shape[1]
     lengths = dict.fromkeys(len(e) for e in errors)
     flat = {K: np.broadcast_to(np.eye(p, dtype=complex), (K, p, p)) for K in lengths}
     with np.errstate(all="ignore"):
-        at = {K: _cells(machine, [e for e in errors if len(e) == K], size) for K in lengths}
+        of_length = {K: [e for e in errors if len(e) == K] for K in lengths}
+        at = {K: _cells(machine, of_length[K], size, part) for K in lengths}
         cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
         corners = _corners(cells.f)
         # A line on a mode that does not decay has no finite response.
@@ -133,7 +138,10 @@ def _before(
 
 
 def _cells(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], size: Float[np.ndarray, " p"]
+    machine: Machine,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    size: Float[np.ndarray, " p"],
+    part: float,
 ) -> _Cells:
     """A cell around each knot of records of one length."""
     K = len(errors[0])
@@ -142,7 +150,7 @@ def _cells(
     power = sum(e[:, :, None] * np.conj(e[:, None, :]) for e in errors) / len(errors)
     count = np.diff(np.append(edges, K)).astype(float)
     power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
-    f = (at + 1) / (2 * K + 1)
+    f = part * (at + 1) / (2 * K + 1)
     Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
     n = len(Ad)
     z = np.exp(2j * np.pi * f)[:, None, None]

@@ -27,6 +27,8 @@ _DAMPING = 0.01
 _SETTLED = 3e-3
 """squared joint standard deviations by which another noise would move the optimum, below which the
 relaxation of a noise that is a spectrum has ended"""
+_NEARLY = 0.1
+"""the same where a search by more of the data follows"""
 _SLOWER = 3.0
 """times the fall from one such move to the next may the following fall be"""
 _EXPLAINED = 2.0
@@ -104,16 +106,34 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     trace = [(int(best.steps), float(best.cost))]
     # Where the first search began says nothing of the noise.
     best, earlier = best._replace(moved=np.asarray(np.inf)), np.inf
+    if estimator.whole(noise) is not noise:
+        best, noise, rounds = _alternated(search, noise, best, earlier, nearly=True)
+        earlier, trace, noise = float(best.moved), [*trace, *rounds], estimator.whole(noise)
+        # From here on by all of the data: what a part of them said is no verdict.
+        best = best._replace(moved=np.asarray(np.inf), converged=np.asarray(True))
+    best, noise, rounds = _alternated(search, noise, best, earlier)
+    best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
+    return RelaxedOptimum(best, noise, (*trace, *rounds))
+
+
+def _alternated(
+    search: Search, noise: Noise, best: Optimum, earlier: float, *, nearly: bool = False
+) -> tuple[Optimum, Noise, list[tuple[int, float]]]:
+    """Optimum and noise that stay, and steps and cost of each search.
+
+    Args:
+        search: the optimiser over the problem.
+        noise: that `best` was found with.
+        best: the optimum to begin with.
+        earlier: how far the noise moved it the last time; inf where that is not known.
+        nearly: whether a search by more of the data follows.
+    """
+    layout, estimator = search.layout, search.layout.estimator
+    trace: list[tuple[int, float]] = []
     for _ in range(_ROUNDS):
         e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
-        fall = float(noise.log_variance_ratio - new.log_variance_ratio)
-        change = abs(fall) + max(
-            abs(float(np.log(sd[n] / before[n])))
-            for sd, before in zip(new.sd, noise.sd, strict=True)
-            for n in before
-        )
-        change += slopes_changed(noise, new) + float(own_changed(noise, new))
+        change = _changed(noise, new)
         # Residuals that overflowed show no noise, and where they do is no optimum.
         if not np.isfinite(change):
             best = best._replace(converged=np.asarray(False))
@@ -128,13 +148,27 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
             break
         if not moves:
             break
-        earlier = float(best.moved)
+        earlier = float(best.moved) if np.isfinite(best.moved) else earlier
         # Near its optimum a search needs no damping, which would only take it longer.
         nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None, :], nearing=nearing)
         trace.append((int(best.steps), float(best.cost)))
-    best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
-    return RelaxedOptimum(best, noise, tuple(trace))
+        # With less than that the noise stays as well; by more than a prediction where it is that of
+        # the intervals.
+        moved = float(best.moved)
+        if moved < _SETTLED or (nearly and _next_move(moved, earlier) < _NEARLY):
+            break
+    return best, noise, trace
+
+
+def _changed(noise: Noise, new: Noise) -> float:
+    """By how much in its logarithms."""
+    change = abs(float(noise.log_variance_ratio - new.log_variance_ratio)) + max(
+        abs(float(np.log(sd[n] / before[n])))
+        for sd, before in zip(new.sd, noise.sd, strict=True)
+        for n in before
+    )
+    return change + slopes_changed(noise, new) + float(own_changed(noise, new))
 
 
 def _next_move(moved: float, earlier: float) -> float:
