@@ -223,12 +223,8 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
                 f"{path}: fit.intervals.nuts: {package} is not installed, expected the extra "
                 "bayes: pip install 'heli_jax[bayes]'"
             )
-    if config.intervals.bootstrap and estimator_of(config.method).noise_spectrum:
-        raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "
-            "estimates the noise's spectrum; expected another method, or none"
-        )
-    if config.intervals.bootstrap and config.nuisance.time_shift:
+    in_frequency = estimator_of(config.method).noise_spectrum
+    if config.intervals.bootstrap and config.nuisance.time_shift and not in_frequency:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, expected "
             "one of the two"

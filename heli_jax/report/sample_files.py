@@ -25,8 +25,9 @@ _WHAT = {
     "flat in the optimiser's coordinates (the logarithm of a parameter of one sign) beside the "
     "priors of the configuration; the scale of the noise is integrated out (Jeffreys' prior), so "
     "that it has no draws.",
-    BOOTSTRAP: "Estimates from records that were simulated with the fit's estimates (parametric "
-    "bootstrap): how the estimator scatters about them. These are no draws from a posterior.",
+    BOOTSTRAP: "Estimates from records that were drawn about the fit's response (in time simulated "
+    "with its estimates, in frequency of its residual's lines): how the estimator scatters about "
+    "them. These are no draws from a posterior.",
 }
 _STATISTICS = {
     "diverging": "whether the energy error of the trajectory was too large",

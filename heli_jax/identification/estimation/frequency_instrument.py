@@ -18,7 +18,7 @@ from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations
-from heli_jax.identification.estimation.frequency_records import lines_of
+from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
 from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
@@ -155,14 +155,8 @@ def _parts(
         shared = shared + _ALONE * np.eye(shared.shape[1])
         part = np.linalg.solve(shared, (lines / size)[:, :, None])[:, :, 0]
         estimate = np.einsum("kur,kr->ku", S[:, :m, m:] / size[:, None, :], part)
-        out.append(_in_time(estimate, len(whole)) + whole.mean(axis=0))
+        out.append(in_time_of(estimate, len(whole)) + whole.mean(axis=0))
     return out
-
-
-def _in_time(lines: np.ndarray, N: int) -> Float[np.ndarray, "N c"]:
-    whole = np.zeros((N // 2 + 1, lines.shape[1]), complex)
-    whole[1 : 1 + len(lines)] = lines * np.sqrt(N)
-    return np.fft.irfft(whole, N, axis=0)
 
 
 class Strength(NamedTuple):

@@ -57,6 +57,18 @@ def lines_of(v: Float[np.ndarray, "N c"]) -> Complex[np.ndarray, "K c"]:
     return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (N - 1) // 2] / np.sqrt(N)
 
 
+def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndarray, "N c"]:
+    """The inverse of `lines_of`: signals without a mean.
+
+    Args:
+        lines: at a record's own frequencies.
+        samples: N of the record.
+    """
+    whole = np.zeros((samples // 2 + 1, lines.shape[1]), complex)
+    whole[1 : 1 + len(lines)] = lines * np.sqrt(samples)
+    return np.fft.irfft(whole, samples, axis=0)
+
+
 def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
     """First sample, and that behind the last, of each part in which all outputs are there; without
     those that are too short to be records. A flight without a missing sample is one part.

@@ -1,4 +1,4 @@
-"""Parametric bootstrap: the estimated machine is simulated and identified again, many times."""
+"""Bootstrap: records about the estimated machine's response are identified again, many times."""
 
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ from jaxtyping import Array
 from heli_jax.identification.estimation.many_runs import check_device, optimise_many
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
+from heli_jax.identification.uncertainty.spectrum_bootstrap import refits
 from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of
 
 _BATCH = 8
@@ -37,7 +38,8 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs.
+    are autocorrelated, noise with their covariance over time and between outputs. The methods in
+    frequency draw from the whitened residual's lines (`spectrum_bootstrap`).
 
     Args:
         fit: with the estimates, and the optimum that all refits begin from.
@@ -49,21 +51,24 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
     Raises:
         TypeError: a device that is none of JAX's.
         ValueError: no run; the fit has no program for a GPU, though one was given; the time shift
-            is free, or the data do not determine every parameter.
+            is free in a fit in time, or the data do not determine every parameter.
     """
     check_device(device)
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
     at = fit.reached
-    if at.layout.shift:
+    in_frequency = at.layout.estimator.noise_spectrum
+    if at.layout.shift and not in_frequency:
         raise ValueError("bootstrap: not available with a free time shift")
-    if at.layout.estimator.noise_spectrum:
-        raise ValueError(
-            f"bootstrap: not available with method {fit.method}, which estimates the noise's "
-            "spectrum"
-        )
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
+    if in_frequency:
+        if device is not None and device.platform != "cpu":
+            raise ValueError(
+                f"device: refits by method {fit.method} are no program for a GPU, expected none"
+            )
+        made = refits(at, runs, np.random.default_rng(seed))
+        return Bootstrap(made.values, runs - len(made.fitted), made.fitted)
     rng = np.random.default_rng(seed)
     outputs = _records(fit, at, runs, seed, rng)
     values = np.array([fit.estimates[n].value for n in at.layout.free])

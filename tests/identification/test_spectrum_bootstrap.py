@@ -1,0 +1,67 @@
+"""The bootstrap of fits in frequency: what is drawn, and how estimates scatter."""
+
+import jax
+import numpy as np
+import pytest
+
+from heli_jax import Free, Problem, fit, models
+from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
+from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.spectrum_bootstrap import _records
+from tests.identification.bench import BENCH, record, vehicle
+
+FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
+
+
+def fitted(method, **more):
+    flight = record(BENCH, seed=3, n=3000)
+    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, method=method, **more))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fitted("frequency-error")
+
+
+@pytest.mark.parametrize("N", [7, 100, 101])
+def test_lines_go_back_to_the_samples_they_came_of(N):
+    v = np.random.default_rng(N).standard_normal((N, 2))
+    lines = lines_of(v)
+    np.testing.assert_allclose(lines_of(in_time_of(lines, N)), lines, atol=1e-12)
+
+
+def test_a_record_that_is_drawn_differs_in_its_noise_alone(found):
+    at = found.reached
+    [errors], _ = jax.device_get(errors_of_lines(at.layout, at.data, at.noise, at.z))
+    drawn, powers = _records(at, np.random.default_rng(1)), []
+    for _ in range(40):
+        other = next(drawn)
+        [y], [before] = (list(d.flights[0].outputs.values()) for d in (other, at.data))
+        y, before = np.asarray(y), np.asarray(before)
+        # Measured less residual is what stays: what is new has the residual's size at each line.
+        new = lines_of((y - before)[:, None]) + errors
+        powers.append(np.abs(new[:, 0]) ** 2)
+        assert other.flights[0].inputs is at.data.flights[0].inputs
+    for band in (slice(0, 60), slice(60, 400), slice(400, None)):
+        ratio = np.mean(powers, axis=0)[band].sum() / np.sum(np.abs(errors[band]) ** 2)
+        assert ratio == pytest.approx(1.0, rel=0.2)
+
+
+def test_estimates_scatter_as_their_intervals_say(found):
+    booted = bootstrap(found, 40, seed=2)
+    assert booted.failures == 0
+    for name, one in found.estimates.items():
+        values = booted.values[name]
+        assert np.std(values, ddof=1) == pytest.approx(one.sd, rel=0.45)
+        assert abs(np.mean(values) - one.value) < 0.6 * one.sd
+
+
+def test_responses_are_drawn_of_the_residual_at_all_lines():
+    responses = fitted("frequency-response", frequency=ResponseOptions(window=10.0))
+    booted = bootstrap(responses, 6, seed=2)
+    assert booted.failures == 0
+    for name, one in responses.estimates.items():
+        scatter = np.sqrt(np.mean((booted.values[name] - one.value) ** 2))
+        assert 0.3 * one.sd < scatter < 2.2 * one.sd
