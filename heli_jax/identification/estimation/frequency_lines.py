@@ -140,12 +140,13 @@ def _orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
     # A state that no output shows has a column of rounding: that would make some direction of it,
     # another at each step, and what is taken off by it makes the sum of squares rough.
-    seen = sizes > _NO_END * jnp.max(sizes)
+    precision = float(jnp.finfo(gram.dtype).eps)
+    seen = sizes > max(_NO_END, 10.0 * precision) * jnp.max(sizes)
     over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
     values, vectors = jnp.linalg.eigh(gram * over[:, None] * over[None, :])
     # Squares of the sizes of directions. What remains along one that is dropped is small where the
     # others have sizes that a record can tell.
-    kept = values > _ROUNDING * values[-1]
+    kept = values > max(_ROUNDING, 100.0 * precision) * values[-1]
     root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
     return over[:, None] * vectors * root[None, :]
 
