@@ -40,7 +40,7 @@ def density(window: float) -> np.ndarray:
 def main(runs: int, window: float, first: int) -> None:
     known = density(window)
 
-    def told(w, at, E) -> np.ndarray:
+    def told(w, at, E, described=None) -> np.ndarray:
         return known / at.power[:, None, None]
 
     cases = {
