@@ -4,7 +4,8 @@
 
 The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
 told the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
-estimates it; and estimates it by a mean over two lines of the window whatever the averages.
+estimates it; estimates it by a mean over lines alone, without what the machine makes of gusts; and
+by one over two lines of the window whatever the averages.
 """
 
 from unittest import mock
@@ -40,13 +41,19 @@ def density(window: float) -> np.ndarray:
 def main(runs: int, window: float, first: int) -> None:
     known = density(window)
 
-    def told(w, at, E) -> np.ndarray:
+    def told(w, at, E, described=None) -> np.ndarray:
         return known / at.power[:, None, None]
 
+    # No machine says what gusts look like.
+    alone = mock.patch.object(frequency_response, "gusts_through", return_value=None)
     cases = {
         "known": [mock.patch.object(m, "noise_density", told) for m in MODULES],
         "estimated": [],
-        "estimated over two lines": [mock.patch.object(response_errors, "_ENOUGH", np.inf)],
+        "mean alone": [alone],
+        "mean alone, over two lines": [
+            alone,
+            mock.patch.object(response_errors, "_ENOUGH", np.inf),
+        ],
     }
     print("| spectrum | " + " | ".join(NAMES) + " |\n|---|" + "---|" * len(NAMES))
     for name, patches in cases.items():
@@ -74,7 +81,7 @@ if __name__ == "__main__":
 
     options = asked(
         __doc__,
-        "three minutes",
+        "four minutes",
         Size("runs", 40, 2, "records"),
         Size("window", 10.0, 10.0, "[s]"),
         Size("first", 0, 0, "seed of the first record"),

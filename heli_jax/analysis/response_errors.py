@@ -13,6 +13,7 @@ Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schouke
 2, for the estimate by instrument.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from jaxtyping import Bool, Complex, Float
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.analysis.spectral import inverse
-from heli_jax.analysis.windowed import PER_AVERAGE, Windowed, hann
+from heli_jax.analysis.windowed import PER_AVERAGE, STEPS, Windowed, hann
 
 _WIDEST = 2.0
 """sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window: half
@@ -31,7 +32,7 @@ _PART = 0.04
 _ENOUGH = 30.0
 """independent averages for each output that a spectral matrix is taken from. A wider mean takes a
 mode of gusts for a wide one: with twice the width errors were by 20 % larger"""
-_LINES = 2.0 * np.pi**0.5 / 1.95
+_LINES = 2.0 * np.pi**0.5 / (STEPS / PER_AVERAGE)
 """independent lines in a Gaussian of one line, of Hann windows"""
 _NEIGHBOURS = 3
 """lines to either side with which a line is correlated in Hann windows"""
@@ -58,17 +59,6 @@ class Averages(NamedTuple):
     mean takes a part"""
 
 
-class _Correlations(NamedTuple):
-    """Of the transforms of white noise at each line with those at the d-th line after it, (k,)."""
-
-    same: np.ndarray
-    """in one window"""
-    before: np.ndarray
-    """in the window half a length after it"""
-    after: np.ndarray
-    """in the window half a length before it"""
-
-
 def averages(w: Windowed) -> Averages:
     """Of flights in windows."""
     p, m, k = len(w.outputs), len(w.inputs), len(w.numbers)
@@ -76,7 +66,7 @@ def averages(w: Windowed) -> Averages:
     turns = np.outer(w.lines, np.arange(w.length)) / w.length
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
-    near = [_correlations(g, d) for d in range(min(_NEIGHBOURS + 1, k))]
+    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, k))]
     # Most outputs miss samples in the same windows, or nowhere: each case once.
     inverses: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
@@ -94,7 +84,7 @@ def averages(w: Windowed) -> Averages:
             inverses[first] = of_case, _share(w, seen, np.nan_to_num(of_case), near)
         P.append(inverses[first][0])
         share.append(inverses[first][1])
-    return Averages(np.stack(P), V, np.stack(share), np.real(near[0].same))
+    return Averages(np.stack(P), V, np.stack(share), np.real(near[0][0]))
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -102,38 +92,50 @@ def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
 
 
-def _correlations(g: np.ndarray, d: int) -> _Correlations:
-    """Of windows times the turning of each line (k, samples), less their means."""
-    half, size = g.shape[1] // 2, np.sum(hann(g.shape[1]) ** 2)
+def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
+    """Of the transform of white noise at each line in a window with that at the d-th line after it
+    in another window, (k - d,), by how many steps that one begins later.
+
+    Args:
+        g: windows times the turning of each line (k, samples), less their means.
+        d: lines.
+        step: from a window to the next, in samples.
+    """
     a, b = g[: len(g) - d], np.conj(g[d:])
-    same = np.sum(a * b, axis=1)
-    before = np.sum(a[:, half:] * b[:, :half], axis=1)
-    after = np.sum(a[:, :half] * b[:, half:], axis=1)
-    return _Correlations(same / size, before / size, after / size)
+    size, found = np.sum(hann(g.shape[1]) ** 2), {}
+    for j in range(1 - STEPS, STEPS):
+        first, second = max(j, 0) * step, max(-j, 0) * step
+        shared = g.shape[1] - abs(j) * step
+        products = a[:, first : first + shared] * b[:, second : second + shared]
+        found[j] = np.sum(products, axis=1) / size
+    return found
 
 
-def _spread(w: Windowed, first: np.ndarray, second: np.ndarray, c: _Correlations) -> np.ndarray:
+def _spread(
+    w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
+) -> np.ndarray:
     """(k - d, m, m) covariance of two means of conj(Z) E of white noise E of density 1, the second
     at the d-th line after the first."""
-    d = len(w.numbers) - len(c.same)
-    a = first[:, None, None] * w.Z[:, : len(c.same)]
-    b = second[:, None, None] * w.Z[:, d:]
-    both = w.follows
-
-    def summed(x: np.ndarray, y: np.ndarray, correlation: np.ndarray) -> np.ndarray:
+    k = len(c[0])
+    a = first[:, None, None] * w.Z[:, :k]
+    b = second[:, None, None] * w.Z[:, len(w.numbers) - k :]
+    total = np.zeros((k, *a.shape[2:], b.shape[2]), complex)
+    for j, correlation in c.items():
+        later = w.later(abs(j))
+        here, there = slice(max(-j, 0), len(a) - max(j, 0)), slice(max(j, 0), len(a) - max(-j, 0))
+        x, y = a[here][later], b[there][later]
         products = np.einsum("wkx,wky->kxy", np.conj(x), y, optimize=True)
-        return correlation[:, None, None] * products
-
-    total = summed(a, b, c.same) + summed(a[:-1][both], b[1:][both], c.before)
-    total = total + summed(a[1:][both], b[:-1][both], c.after)
+        total += correlation[:, None, None] * products
     return total / (np.sum(first) * np.sum(second))
 
 
-def _share(w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[_Correlations]) -> np.ndarray:
+def _share(
+    w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[dict[int, np.ndarray]]
+) -> np.ndarray:
     """(k, m) one over the sum of an error's correlations with those at the lines around it."""
     size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
     for d, c in enumerate(near):
-        k = len(c.same)
+        k = len(c[0])
         V = _spread(w, seen, seen, c)
         C = np.real(np.einsum("kxa,kab,kxb->kx", P[:k], V, np.conj(P[d:]), optimize=True))
         if d == 0:
@@ -162,7 +164,10 @@ def response_of(
 
 
 def noise_density(
-    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+    w: Windowed,
+    at: Averages,
+    E: Complex[np.ndarray, "W k p"],
+    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None = None,
 ) -> Complex[np.ndarray, "k p p"]:
     """The spectral matrix of what no response explains of the errors, smoothed over frequency.
 
@@ -170,22 +175,56 @@ def noise_density(
         w: the flights in windows.
         at: of these.
         E: errors (W, k, p); zero in windows that an output does not have.
+        described: of raw spectral matrices (k, q, q) of some outputs, by their place, what is known
+            of their shape: the mean over lines is taken of what is left by that (`None`: nothing).
     """
     own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
-    power = np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    p, power = own.shape[1], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
     floor = np.maximum(_ROUNDING * power, 1e-300)
+    kernel = _kernel(w)
     if not w.together:
-        return _definite(own[:, :, None] * np.eye(own.shape[1]), floor) / at.power[:, None, None]
+        each = [_smoothed(kernel, own[:, i, None, None], [i], described) for i in range(p)]
+        S = np.concatenate(each, axis=1) * np.eye(p)
+        return _definite(S, floor) / at.power[:, None, None]
     # Coherences from windows that all outputs have: those of pairs would contradict one another,
     # and the noise that seems to be left of several outputs with a common one would be anything.
-    S = _left(w, E, np.repeat(w.common[:, None], own.shape[1], axis=1))
-    size = np.sqrt(np.maximum(own, floor) / np.maximum(np.real(np.einsum("kii->ki", S)), floor))
+    S = _left(w, E, np.repeat(w.common[:, None], p, axis=1))
+    common = np.real(np.einsum("kii->ki", S))
+    S = _smoothed(kernel, S, list(range(p)), described)
+    shape = np.real(np.einsum("kii->ki", S))
+    own, common = (kernel @ (v / np.maximum(shape, floor)) for v in (own, common))
+    size = np.sqrt(np.maximum(own, _ROUNDING) / np.maximum(common, _ROUNDING))
     return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
 
 
+def _kernel(w: Windowed) -> Float[np.ndarray, "k k"]:
+    """Weights of the mean over lines."""
+    freedom = np.maximum(np.sum(w.seen, axis=0) / PER_AVERAGE - len(w.inputs), 0.5)
+    least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(freedom)))
+    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
+    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
+    return kernel / np.sum(kernel, axis=1, keepdims=True)
+
+
+def _smoothed(
+    kernel: Float[np.ndarray, "k k"],
+    S: Complex[np.ndarray, "k q q"],
+    outputs: list[int],
+    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None,
+) -> Complex[np.ndarray, "k q q"]:
+    """The mean over lines of spectral matrices, divided by what is known of their shape."""
+    known = None if described is None else described(S, outputs)
+    if known is None:
+        return np.einsum("kl,lij->kij", kernel, S)
+    L = np.linalg.cholesky(known)
+    white = np.linalg.inv(L)
+    flat = np.einsum("kl,lij->kij", kernel, white @ S @ np.conj(np.swapaxes(white, 1, 2)))
+    return L @ flat @ np.conj(np.swapaxes(L, 1, 2))
+
+
 def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, p, p) smooth spectral matrix of what inputs (their instruments) leave of errors in the
-    windows seen (W, p); of outputs with different windows only the diagonal is sound."""
+    """(k, p, p) spectral matrix of what inputs (their instruments) leave of errors in the windows
+    seen (W, p); of outputs with different windows only the diagonal is sound."""
     P = []
     for mask in seen.T:
         # By what follows the instruments in the errors themselves, not by a response by instrument:
@@ -199,12 +238,7 @@ def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
     # Each input takes one of the independent averages for its own response.
     freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
     S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
-    S = S / np.sqrt(freedom[:, None] * freedom[None, :])
-    averages = float(np.min(freedom)) / PER_AVERAGE
-    least = _ENOUGH * E.shape[2] / (_LINES * averages)
-    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
-    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
-    return np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
+    return S / np.sqrt(freedom[:, None] * freedom[None, :])
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:

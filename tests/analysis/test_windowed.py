@@ -42,7 +42,7 @@ def by_hand(flights: list[Flight], output: str, line: int) -> np.ndarray:
     turn = turn - np.mean(turn)
     S_uu, rows = np.zeros((2, 2), complex), np.zeros((2, 2 * N), complex)
     for i, f in enumerate(flights):
-        for s in range(0, N - L + 1, L // 2):
+        for s in range(0, N - L + 1, -(-L // 3)):
             if np.isnan(f.outputs[output][s : s + L]).any():
                 continue
             U = np.array([f.inputs[n][s : s + L] @ turn for n in ("a", "b")])
@@ -58,7 +58,7 @@ def test_errors_of_responses_are_those_of_the_linear_map_from_samples():
     all_of_them = flights(noise)
     w = windowed(all_of_them, ResponseOptions(window=L * DT))
     at = averages(w)
-    assert w.seen.sum(axis=0).tolist() == [22.0, 20.0]
+    assert w.seen.sum(axis=0).tolist() == [30.0, 27.0]
     maps = {n: [by_hand(all_of_them, n, k) for k in w.numbers[:4]] for n in ("p", "q")}
     E = response_of(w, at, w.Y)
     white = {n: np.nan_to_num(np.concatenate([f.outputs[n] for f in all_of_them])) for n in "pq"}

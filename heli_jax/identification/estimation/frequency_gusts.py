@@ -119,7 +119,7 @@ def _before(
         of_length = {K: [e for e in errors if len(e) == K] for K in lengths}
         at = {K: _cells(machine, of_length[K], size, part) for K in lengths}
         cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
-        corners = _corners(cells.f)
+        corners = corners_of(cells.f)
         # A line on a mode that does not decay has no finite response.
         cells = _Cells(*(v[np.isfinite(cells.H).all((1, 2))] for v in cells))
         if not cells.f.size:
@@ -130,7 +130,7 @@ def _before(
     q, r = parameters
     made = {}
     for K, of in at.items():
-        S0 = _spectrum(np.nan_to_num(of.H), q @ _shapes(of.f, corners), r)
+        S0 = _spectrum(np.nan_to_num(of.H), q @ shapes_of(of.f, corners), r)
         root = np.linalg.inv(np.linalg.cholesky(S0))
         _, (low, share) = knots_of(K, *_CELLS)
         made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
@@ -162,15 +162,25 @@ def _cells(
     return _Cells(f, np.where(seen, H, 0.0), power, count * len(errors))
 
 
-def _corners(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
+def corners_of(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
+    """Of first-order lags, from half of the rate down to the lowest of some frequencies.
+
+    Args:
+        f: in cycles a sample.
+    """
     first, last = float(np.min(f)), 0.5
     return last * 0.5 ** np.arange(1.0, np.log2(last / first), _OCTAVES)
 
 
-def _shapes(
+def shapes_of(
     f: Float[np.ndarray, " c"], corners: Float[np.ndarray, " b"]
 ) -> Float[np.ndarray, "b1 c"]:
-    """Spectra that a gust's is a sum of: a white one and first-order lags."""
+    """Spectra that a gust's is a sum of: a white one and first-order lags.
+
+    Args:
+        f: in cycles a sample.
+        corners: of the lags.
+    """
     return np.concatenate([np.ones((1, f.size)), 1.0 / (1.0 + (f / corners[:, None]) ** 2)])
 
 
@@ -184,21 +194,42 @@ def _described(
     cells: _Cells, corners: Float[np.ndarray, " b"]
 ) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
     """Powers of the gusts, by state and shape, and of the outputs' own noise."""
-    shapes, own = _shapes(cells.f, corners), np.real(np.einsum("cii->ci", cells.power))
-    gains = np.abs(cells.H) ** 2
+    h = np.swapaxes(cells.H, 1, 2)
+    ways = h[:, :, :, None] * np.conj(h[:, :, None, :])
+    return powers_of(ways, shapes_of(cells.f, corners), cells.power, cells.lines)
+
+
+def powers_of(
+    ways: Complex[np.ndarray, "c n p p"],
+    shapes: Float[np.ndarray, "b1 c"],
+    power: Complex[np.ndarray, "c p p"],
+    lines: Float[np.ndarray, " c"],
+) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
+    """Powers of gusts, by state and shape, and of the outputs' own white noise, that are the most
+    likely for complex normal errors.
+
+    Args:
+        ways: by cell and state what a gust of power 1 at the state makes of the outputs.
+        shapes: spectra that a gust's is a sum of; the first is white.
+        power: by cell the mean of e e^H.
+        lines: in each cell.
+    """
+    own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
+    gains = np.swapaxes(gains, 1, 2)
     # To begin with as much as the output that shows least of a state leaves room for.
     room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
     room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
-    c, p, n = cells.H.shape
+    c, n, p, _ = ways.shape
     # An output's own noise comes by a way that leads to it alone, and is white: the first shape.
     powers = np.zeros((len(shapes), n + p))
     powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
     powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
-    # By cell and way h h^H, its numbers in a row: sums over ways, and what of a matrix comes by
-    # each, are then products of real matrices.
-    h = np.concatenate([np.swapaxes(cells.H, 1, 2), np.tile(np.eye(p), (c, 1, 1))], axis=1)
-    ways = (h[:, :, :, None] * np.conj(h[:, :, None, :])).reshape(c, n + p, -1).view(float)
-    by_way, by_shape = np.swapaxes(ways, 1, 2).copy(), shapes * cells.lines
+    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
+    # then products of real matrices.
+    alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
+    ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
+    ways = np.ascontiguousarray(ways.reshape(c, n + p, -1), complex).view(float)
+    by_way, by_shape = np.swapaxes(ways, 1, 2).copy(), shapes * lines
     matrices = np.empty((c, 2, p, p), complex)
     # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
     # a third more in the interval of If.
@@ -207,7 +238,7 @@ def _described(
         S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
         inverse = np.linalg.inv(S)
         # By way what of it the errors show, and what they should.
-        matrices[:, 0], matrices[:, 1] = inverse @ cells.power @ inverse, inverse
+        matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
         of_ways = matrices.view(float).reshape(c, 2, -1) @ by_way
         shown, due = np.moveaxis((by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * _part(shown, due), least)

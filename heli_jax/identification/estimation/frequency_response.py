@@ -36,6 +36,7 @@ from heli_jax.analysis.response_errors import noise_density, response_of
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
+from heli_jax.identification.estimation.gusts_in_windows import gusts_through
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.measured_signals import least_noise, signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -144,7 +145,8 @@ class FrequencyResponse(Estimator):
         weights = weights._replace(simulated=_forgetful(layout, data, u, weights))
         weights = weights._replace(begun=(u.states, u.offsets))
         errors = np.asarray(errors_in_windows(layout, data, on_device(weights), z))
-        density = noise_density(weights.windows, weights.averages, errors)
+        shape = gusts_through(layout, data, z, weights.windows)
+        density = noise_density(weights.windows, weights.averages, errors, shape)
         weights = weighed(weights, weights.simulated, density)
         level = -2.0 * weights.log_determinant / max(weights.numbers, 1.0)
         sd = _sd(layout, data, weights, z)
