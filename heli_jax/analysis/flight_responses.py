@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.response_parts import Names, groups, records_of
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import OVERLAP, CrossSpectra, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
-from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
@@ -89,8 +89,8 @@ class FlightResponses(NamedTuple):
     """inputs whose responses are taken by an excitation that was logged"""
     window: float
     """[s]"""
-    fits: tuple[tuple[Wanted, TransferFit], ...]
-    """in the order in which they were asked for"""
+    fits: tuple[tuple[Wanted, TransferFit | str], ...]
+    """in the order in which they were asked for; in words why there is none"""
     holds: dict[str, Hold]
     """by input what it does between samples"""
     notes: tuple[str, ...]
@@ -126,10 +126,14 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)
-    for group, parts in _groups(flights, round(window / dt), notes):
-        records = _records(flights, names, group, parts)
+    for group, parts in groups(flights, round(window / dt), notes):
+        records = records_of(flights, names, group, parts)
         made = _windows(records, omega, window, names)
-        outputs |= _outputs(made, dt, (names, group))
+        try:
+            outputs |= _outputs(made, dt, (names, group))
+        except ValueError as e:
+            # Outputs with fewer averages than inputs are no reason to keep back the others.
+            notes.append(f"{', '.join(group)}: no response, {e}")
         windows |= dict.fromkeys(group, made)
     if not outputs:
         raise ValueError("; ".join(notes[-3:]))
@@ -198,62 +202,7 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     return notes
 
 
-type _Parts = tuple[tuple[int, int, int], ...]
-type _Names = tuple[list[str], tuple[str, ...]]
-
-
-def _groups(
-    flights: Sequence[Flight], window: int, notes: list[str]
-) -> list[tuple[list[str], _Parts]]:
-    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
-    them; what has no part is noted."""
-    groups: dict[_Parts, list[str]] = {}
-    order = dict.fromkeys(n for f in flights for n in f.outputs)
-    for name in order:
-        parts = _parts(flights, name, window)
-        if isinstance(parts, str):
-            notes.append(parts)
-        else:
-            groups.setdefault(parts, []).append(name)
-    return [(names, parts) for parts, names in groups.items()]
-
-
-def _parts(flights: Sequence[Flight], output: str, window: int) -> _Parts | str:
-    """Flight, first and last sample of each part without a missing one, or why there is none."""
-    parts, longest = [], 0
-    for i, f in enumerate(flights):
-        if output not in f.outputs:
-            continue
-        for first, last in spans([f.outputs[output]]):
-            longest = max(longest, last - first)
-            if last - first >= window:
-                parts.append((i, first, last))
-    if parts:
-        return tuple(parts)
-    return (
-        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
-        f"missing one, got {longest} at most"
-    )
-
-
-def _records(
-    flights: Sequence[Flight], names: _Names, outputs: list[str], parts: _Parts
-) -> list[np.ndarray]:
-    """Inputs, instruments and outputs (signals, N) of each part."""
-    inputs, instruments = names
-    return [
-        np.stack(
-            [
-                *(flights[i].inputs[n][first:last] for n in inputs),
-                *(flights[i].instruments[n][first:last] for n in instruments),
-                *(flights[i].outputs[n][first:last] for n in outputs),
-            ]
-        )
-        for i, first, last in parts
-    ]
-
-
-def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: _Names) -> Windows:
+def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: Names) -> Windows:
     inputs, instruments = names
     m = len(inputs)
     z = [m + instruments.index(n) if n in instruments else i for i, n in enumerate(inputs)]
@@ -296,7 +245,7 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
     return notes
 
 
-def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> dict[str, Output]:
+def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dict[str, Output]:
     (inputs, instruments), outputs = names
     records, omega, window = windows.records, windows.omega, windows.seconds
     m, first = len(inputs), len(inputs) + len(instruments)
@@ -374,20 +323,19 @@ def _fits(
     outputs: dict[str, Output],
     windows: dict[str, Windows],
     holds: dict[str, Hold],
-) -> tuple[tuple[Wanted, TransferFit], ...]:
+) -> tuple[tuple[Wanted, TransferFit | str], ...]:
+    """The transfer functions, or why one cannot be fitted: the responses are there all the same."""
     fits = []
-    for i, request in enumerate(settings.transfer_functions):
-        place = f"transfer_functions[{i}]"
+    for request in settings.transfer_functions:
         output = outputs.get(request.output)
         if output is None or request.input not in output.pairs:
-            raise ValueError(
-                f"{place}: no response from {request.input} to {request.output} is to be had of "
-                "these flights"
-            )
+            why = f"these flights have no response from {request.input} to {request.output}"
+            fits.append((request, why))
+            continue
         try:
             fitted = _fitted(request, output.pairs[request.input], windows[request.output], holds)
         except ValueError as e:
-            raise ValueError(f"{place}: {e}") from e
+            fitted = str(e)
         fits.append((request, fitted))
     return tuple(fits)
 

@@ -86,7 +86,7 @@ def write_responses(
         fits=Table(
             ("input", "output", "averages", *FIT_HEAD),
             [
-                (w.input, w.output, number(responses.outputs[w.output].averages, 3), *fit_row(fit))
+                (w.input, w.output, _averages(responses, w), *fit_row(fit))
                 for w, fit in responses.fits
             ],
         ),
@@ -102,6 +102,12 @@ def write_responses(
     (directory / "responses.html").write_text(page, encoding="utf-8")
 
 
+def _averages(responses: FlightResponses, request: Wanted) -> str:
+    """Of the response that a transfer function is fitted to, as text."""
+    output = responses.outputs.get(request.output)
+    return "–" if output is None else number(output.averages, 3)
+
+
 def _stem(input: str, output: str) -> str:
     # A model's names are Python's: nothing in them that a file's name may not have.
     return f"{output}-{input}"
@@ -112,7 +118,9 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     curves = [
         (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(responses.omega, responses.holds[input]))
         for w, fit in responses.fits
-        if (w.input, w.output) == (input, output) and fit.determined
+        if (w.input, w.output) == (input, output)
+        and isinstance(fit, TransferFit)
+        and fit.determined
     ]
     by = "by its instrument" if input in responses.instruments else "direct"
     note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
@@ -210,13 +218,43 @@ def _write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, st
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
 
-def _content(request: Wanted, fit: TransferFit, window: float) -> dict[str, Any]:
+def transfer_status(fit: TransferFit | str) -> str:
+    """In the words of fit.json: converged, not-identifiable or not-converged.
+
+    Args:
+        fit: the transfer function, or why there is none.
+    """
+    if isinstance(fit, str):
+        return "not-identifiable"
+    if not fit.converged:
+        return "not-converged"
+    # A search that arrived is no result where a number is not determined.
+    delay = () if fit.delay is None else (fit.delay,)
+    known = all(c.determined for c in (*fit.numerator, *fit.denominator, *delay))
+    return "converged" if known else "not-identifiable"
+
+
+def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
+    status = transfer_status(fit)
+    if isinstance(fit, str):
+        return {
+            "input": request.input,
+            "output": request.output,
+            "numerator": [{}] * (request.zeros + 1),
+            "denominator": [{"value": 1.0}, *([{}] * request.poles)],
+            "delay_s": {} if request.delay else None,
+            "poles": None,
+            "zeros": None,
+            "chi_squared_per_degree": None,
+            "J": None,
+            "status": status,
+            "converged": False,
+            "determined": False,
+            "windows_taken_off": False,
+            "sentences": fit_sentences(fit, window),
+        }
     poles_known = all(c.determined for c in fit.denominator)
     zeros_known = all(c.determined for c in fit.numerator)
-    delay_known = fit.delay is None or fit.delay.determined
-    # In the words of fit.json: a search that arrived is no result where a number is not determined.
-    status = "converged" if poles_known and zeros_known and delay_known else "not-identifiable"
-    status = status if fit.converged else "not-converged"
     return {
         "input": request.input,
         "output": request.output,
@@ -243,13 +281,15 @@ def _number(c: Coefficient) -> dict[str, float]:
     return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
 
 
-def fit_sentences(fit: TransferFit, window: float) -> list[str]:
+def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     """What is to be heeded of a transfer function.
 
     Args:
-        fit: the transfer function.
+        fit: the transfer function, or why there is none.
         window: [s]
     """
+    if isinstance(fit, str):
+        return [f"not fitted: {fit}"]
     if not fit.determined:
         return ["the response does not determine it: fewer poles, or more excitation, is needed"]
     if not fit.converged:
@@ -284,8 +324,10 @@ def fit_sentences(fit: TransferFit, window: float) -> list[str]:
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
 
 
-def fit_row(fit: TransferFit) -> tuple[str, ...]:
+def fit_row(fit: TransferFit | str) -> tuple[str, ...]:
     """Numerator, denominator, delay with their sd, poles, chi-squared and J, as text."""
+    if isinstance(fit, str):
+        return ("not fitted", *("–" for _ in FIT_HEAD[1:]))
     delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
     return (
         _polynomial(fit.numerator, ""),
