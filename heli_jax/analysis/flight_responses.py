@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.response_parts import Names, groups, records_of
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
@@ -22,6 +23,8 @@ _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
 _ROUNDS = 2
 """in which a transfer function is fitted again without what the windows add to it"""
+_MOST_SAID = 3
+"""outputs of which a refusal says why they have no response"""
 _AS_ONE = 1e-6
 """less than 1, coherence of two inputs that move as one at all frequencies"""
 
@@ -64,6 +67,8 @@ class Pair(NamedTuple):
     """partial: what the other inputs explain is taken out"""
     picture: np.ndarray
     """H of the composite of several windows, for looking; NaN where there is none"""
+    half95: float = Z95
+    """half of a 95 % interval in sd: Student's t of the averages that there are"""
 
 
 class Output(NamedTuple):
@@ -126,17 +131,19 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)
-    for group, parts in groups(flights, round(window / dt), notes):
+    without: list[str] = []
+    for group, parts in groups(flights, round(window / dt), without):
         records = records_of(flights, names, group, parts)
         made = _windows(records, omega, window, names)
         try:
             outputs |= _outputs(made, dt, (names, group))
         except ValueError as e:
             # Outputs with fewer averages than inputs are no reason to keep back the others.
-            notes.append(f"{', '.join(group)}: no response, {e}")
+            without.append(f"{', '.join(group)}: no response, {e}")
         windows |= dict.fromkeys(group, made)
     if not outputs:
-        raise ValueError("; ".join(notes[-3:]))
+        raise ValueError("; ".join(without[:_MOST_SAID]))
+    notes += without
     notes += _moving_as_one(flights, inputs, outputs)
     notes += _weak(omega, instruments, outputs)
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
@@ -256,6 +263,8 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
     several = _several(records, dt, spectra, window, m)
+    averages = float(estimate.averages[0])
+    half95 = float(student95(np.asarray(2.0 * (averages - m))))
     result = {}
     for i, name in enumerate(outputs):
         seen = (driven & own[y[i]])[:, None]
@@ -264,9 +273,9 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
         )
         picture = _picture(several, omega, (u, y[i], by))
         pairs = {
-            n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j]) for j, n in enumerate(inputs)
+            n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j], half95)
+            for j, n in enumerate(inputs)
         }
-        averages = float(estimate.averages[0])
         result[name] = Output(pairs, estimate.multiple[:, i], estimate.noise[:, i], averages)
     return result
 
@@ -318,6 +327,27 @@ def _picture(
     return responses(composite(own, us, [place[y]]), us, [place[y]], zs).H[:, 0]
 
 
+def steady_sd(
+    omega: np.ndarray, output: Output, input: str, seconds: float
+) -> tuple[np.ndarray, float]:
+    """Of a response's real and imaginary part (k,), the noise a mean over frequencies where there
+    are few averages, and its degrees of freedom: for weights, which a single frequency's would
+    mislead.
+
+    Args:
+        omega: (k,) [rad/s]
+        output: of flights.
+        input: its name.
+        seconds: length of a window.
+    """
+    pair = output.pairs[input]
+    noise = np.where(np.isfinite(pair.H), output.noise, np.nan)
+    share = independent_shares(omega, seconds)
+    mean, freedom = averaged(noise, share, output.averages - len(output.pairs))
+    with np.errstate(all="ignore"):
+        return pair.sd * np.sqrt(mean / noise), freedom
+
+
 def _fits(
     settings: Settings,
     outputs: dict[str, Output],
@@ -333,22 +363,25 @@ def _fits(
             fits.append((request, why))
             continue
         try:
-            fitted = _fitted(request, output.pairs[request.input], windows[request.output], holds)
+            fitted = _fitted(request, output, windows[request.output], holds)
         except ValueError as e:
             fitted = str(e)
         fits.append((request, fitted))
     return tuple(fits)
 
 
-def _fitted(request: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold]) -> TransferFit:
-    omega = windows.omega
+def _fitted(
+    request: Wanted, output: Output, windows: Windows, holds: dict[str, Hold]
+) -> TransferFit:
+    omega, pair = windows.omega, output.pairs[request.input]
     hz = omega / (2.0 * np.pi)
     low, high = request.band or (0.0, np.inf)
     used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
     # With its hold, which is half a sample late, so that the delay is the machine's own.
     hold = holds[request.input]
-    measured = Measured(omega, H, pair.sd, windows.seconds, pair.coherence, hold)
+    sd, freedom = steady_sd(omega, output, request.input, windows.seconds)
+    measured = Measured(omega, H, sd, windows.seconds, pair.coherence, hold, freedom)
     orders = request.zeros, request.poles, request.delay
     fitted = fit_transfer(measured, *orders)
     for _ in range(_ROUNDS):

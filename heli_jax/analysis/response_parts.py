@@ -14,7 +14,7 @@ type Names = tuple[list[str], tuple[str, ...]]
 
 
 def groups(
-    flights: Sequence[Flight], window: int, notes: list[str]
+    flights: Sequence[Flight], window: int, without: list[str]
 ) -> list[tuple[list[str], Parts]]:
     """Outputs by the parts that they are known in, so that inputs are transformed once for all of
     them.
@@ -22,14 +22,14 @@ def groups(
     Args:
         flights: of one rate.
         window: samples of one, the least of a part.
-        notes: what has no part is added to them.
+        without: why an output has no part is added to them.
     """
     by_parts: dict[Parts, list[str]] = {}
     order = dict.fromkeys(n for f in flights for n in f.outputs)
     for name in order:
         parts = parts_of(flights, name, window)
         if isinstance(parts, str):
-            notes.append(parts)
+            without.append(parts)
         else:
             by_parts.setdefault(parts, []).append(name)
     return [(names, parts) for parts, names in by_parts.items()]

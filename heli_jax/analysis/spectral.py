@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.analysis.fieller import sd_of_ratio
+from heli_jax.analysis.noise_over_lines import student95
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
@@ -252,7 +253,8 @@ def responses(
     # Each input takes one of the averages for its own response.
     sd = np.sqrt(0.5 * error / (n - m)[:, :, None])
     if instruments is not None:
-        sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m))
+        half95 = student95(2.0 * (n - m))
+        sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m), half95)
         H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
     return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])

@@ -162,6 +162,7 @@ def table(responses: FlightResponses) -> dict[str, Any]:
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
                     "multiple_coherence": output.multiple,
+                    "half95_in_sd": np.full(k, pair.half95),
                 }
             for n, v in each.items():
                 numbers.setdefault(n, []).append(v)

@@ -83,7 +83,7 @@ def _draw_model(axes: Panels, pair: FittedPair, good: np.ndarray) -> None:
 
 def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.ndarray) -> None:
     w, H = pair.omega[known], pair.H[known]
-    relative = _Z95 * pair.sd[known] / np.abs(H)
+    relative = pair.half95 * pair.sd[known] / np.abs(H)
     gain, angle = _DB * np.log(np.abs(H)), np.degrees(np.angle(H))
     if modelled.all():
         # Beside the model: point by point, since data may have gaps.
@@ -119,9 +119,9 @@ def _draw_error(axes: Panels, pair: FittedPair, known: np.ndarray) -> None:
     w = pair.omega[known]
     error = pair.H[known] / pair.model.response[known]
     # The errors of both: the data's is of the random error, the model's of its parameters.
-    own = pair.sd[known] / np.abs(pair.H[known])
-    gain_sd = np.hypot(own, np.nan_to_num(pair.model.gain_sd[known]))
-    phase_sd = np.hypot(own, np.nan_to_num(pair.model.phase_sd[known]))
+    own = pair.half95 * pair.sd[known] / np.abs(pair.H[known])
+    gain_reach = np.hypot(own, _Z95 * np.nan_to_num(pair.model.gain_sd[known]))
+    phase_reach = np.hypot(own, _Z95 * np.nan_to_num(pair.model.phase_sd[known]))
     envelope = unnoticeable(pair.omega)
     for ax, (low, high), most in zip(
         axes, (envelope.gain_db, envelope.phase_deg), (_GAINS, _PHASES), strict=True
@@ -129,6 +129,6 @@ def _draw_error(axes: Panels, pair: FittedPair, known: np.ndarray) -> None:
         ax.fill_between(pair.omega, low, high, color=style.PALE, alpha=0.3, lw=0)
         ax.axhline(0.0, color=style.BLUE, lw=1.0)
         ax.set_ylim(-most, most)
-    _bars(axes[0], w, _DB * np.log(np.abs(error)), _Z95 * gain_sd)
-    reach = np.degrees(np.minimum(_Z95 * phase_sd, np.pi))
+    _bars(axes[0], w, _DB * np.log(np.abs(error)), gain_reach)
+    reach = np.degrees(np.minimum(phase_reach, np.pi))
     axes[1].errorbar(w, np.degrees(np.angle(error)), yerr=reach, color=style.BLACK, **_STYLE)
