@@ -8,17 +8,22 @@ import numpy as np
 from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.response_parts import Names, groups, records_of
+from heli_jax.analysis.response_pictures import picture_of, several_windows
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
-from heli_jax.analysis.spectral import OVERLAP, CrossSpectra, composite, cross_spectra, responses
+from heli_jax.analysis.spectral import (
+    OVERLAP,
+    TooFewAveragesError,
+    cross_spectra,
+    responses,
+)
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
+from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
-_LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
-"""of the windows of a composite, in that one's length"""
 _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
 _ROUNDS = 2
@@ -69,6 +74,8 @@ class Pair(NamedTuple):
     """H of the composite of several windows, for looking; NaN where there is none"""
     half95: float = Z95
     """half of a 95 % interval in sd: Student's t of the averages that there are"""
+    added: np.ndarray | float = 0.0
+    """what windows added to H at the ends of records and was taken off (`window_ends`)"""
 
 
 class Output(NamedTuple):
@@ -137,7 +144,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         made = _windows(records, omega, window, names)
         try:
             outputs |= _outputs(made, dt, (names, group))
-        except ValueError as e:
+        except TooFewAveragesError as e:
             # Outputs with fewer averages than inputs are no reason to keep back the others.
             without.append(f"{', '.join(group)}: no response, {e}")
         windows |= dict.fromkeys(group, made)
@@ -258,22 +265,27 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
     m, first = len(inputs), len(inputs) + len(instruments)
     u, y = list(range(m)), list(range(first, first + len(outputs)))
     by = None if windows.instruments is None else list(windows.instruments)
-    spectra = cross_spectra(records, dt, omega, window, OVERLAP)
+    spectra = cross_spectra(records, dt, omega, window, OVERLAP, sloped=m)
     estimate = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
-    several = _several(records, dt, spectra, window, m)
+    seen = (driven & own[y]).T[:, :, None]
+    H, sd, coherence = (
+        np.where(seen, v, np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
+    )
+    assert estimate.ends is not None
+    added, sd = without_ends(omega, H, sd, estimate.ends, window)
+    H = H - added
+    several = several_windows(records, dt, spectra, window, m)
     averages = float(estimate.averages[0])
     half95 = float(student95(np.asarray(2.0 * (averages - m))))
     result = {}
     for i, name in enumerate(outputs):
-        seen = (driven & own[y[i]])[:, None]
-        H, sd, coherence = (
-            np.where(seen, v[:, i], np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
-        )
-        picture = _picture(several, omega, (u, y[i], by))
+        picture = picture_of(several, omega, (u, y[i], by))
         pairs = {
-            n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j], half95)
+            n: Pair(
+                H[:, i, j], sd[:, i, j], coherence[:, i, j], picture[:, j], half95, added[:, i, j]
+            )
             for j, n in enumerate(inputs)
         }
         result[name] = Output(pairs, estimate.multiple[:, i], estimate.noise[:, i], averages)
@@ -293,38 +305,6 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
         power = power + np.sum(np.abs(transforms) ** 2, axis=1)
     own = np.stack([OWN * leakage(S) < S for S in np.transpose(power)])
     return own[:, np.clip(np.round(omega / lines[1]).astype(int), 0, own.shape[1] - 1)]
-
-
-def _several(
-    records: Sequence[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
-) -> list[CrossSpectra]:
-    """Spectra of several windows beside those of one, as far as the records have three of each."""
-    longest = max(r.shape[1] for r in records) * dt
-    several: list[CrossSpectra] = []
-    for length in _LENGTHS:
-        # Three windows are the least that a coherence can be taken from.
-        if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
-            continue
-        own = length == 1.0
-        spectra = one if own else cross_spectra(records, dt, one.omega, length * window, OVERLAP)
-        if np.min(spectra.averages) >= m + 1:
-            several.append(spectra)
-    return several
-
-
-def _picture(
-    several: list[CrossSpectra], omega: np.ndarray, which: tuple[list[int], int, list[int] | None]
-) -> np.ndarray:
-    """H (k, m) of several windows together; NaN where the record has no two of them."""
-    u, y, by = which
-    if len(several) < 2:
-        return np.full((omega.size, len(u)), np.nan)
-    # Without the other outputs, of which each has its own weights.
-    kept = [*dict.fromkeys([*u, *(by or u)]), y]
-    place = {i: j for j, i in enumerate(kept)}
-    own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
-    us, zs = [place[i] for i in u], None if by is None else [place[i] for i in by]
-    return responses(composite(own, us, [place[y]]), us, [place[y]], zs).H[:, 0]
 
 
 def steady_sd(
@@ -389,5 +369,6 @@ def _fitted(
         added = window_error(fitted, windows, list(holds).index(request.input), hold)
         if added is None:
             break
-        fitted = fit_transfer(measured._replace(H=H - added), *orders)
+        # All that they do, at the ends too.
+        fitted = fit_transfer(measured._replace(H=H + pair.added - added), *orders)
     return fitted

@@ -16,7 +16,7 @@ Z95 = 1.959963984540054
 """half of a 95 % interval in standard deviations that are known"""
 _ENOUGH = 40.0
 """degrees of freedom of a variance from which on weights by it are as good as by the true one"""
-_RESOLVED = 1.95
+RESOLVED = 1.95
 """frequencies closer than this over the window's length are not independent (Hann)"""
 _TRIANGLE = 1.5
 """equal terms whose mean is as certain as one in a triangle of half this half-width"""
@@ -31,7 +31,7 @@ def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[
     """
     # Half of the way to each neighbour.
     width = np.gradient(omega) if omega.size > 1 else np.ones(1)
-    return np.minimum(width * seconds / (2.0 * np.pi * _RESOLVED), 1.0)
+    return np.minimum(width * seconds / (2.0 * np.pi * RESOLVED), 1.0)
 
 
 def averaged(

@@ -35,6 +35,10 @@ _ROUNDING = 1e-14
 """of an output's density, what rounding leaves where the inputs explain all of it"""
 
 
+class TooFewAveragesError(ValueError):
+    """Of fewer averages than one more than the inputs no response is known."""
+
+
 class CrossSpectra(NamedTuple):
     """Spectral densities of several signals with one another."""
 
@@ -47,6 +51,8 @@ class CrossSpectra(NamedTuple):
     less than one"""
     seconds: float
     """length of a segment"""
+    slopes: np.ndarray | None = None
+    """(k, c, m) those of the signals with the first m of them in the window's slope [1/s]"""
 
 
 class Responses(NamedTuple):
@@ -68,6 +74,8 @@ class Responses(NamedTuple):
     """(k, l) density of what they leave, per Hz"""
     averages: np.ndarray
     """(k,) independent ones"""
+    ends: np.ndarray | None = None
+    """(k, m, m) what of each input in the window's slope counts as each input [1/s]"""
 
 
 def chirp_z(
@@ -118,6 +126,7 @@ def cross_spectra(
     omega: Float[np.ndarray, " k"],
     seconds: float,
     overlap: float = 0.5,
+    sloped: int = 0,
 ) -> CrossSpectra:
     """Averages over Hann windows of all records, each segment less its mean.
 
@@ -127,6 +136,7 @@ def cross_spectra(
         omega: (k,) [rad/s], above zero and below the Nyquist frequency.
         seconds: length of a segment; records that are shorter are left out.
         overlap: of one segment with the next, from 0 to below 1.
+        sloped: how many of the first signals are taken in the window's slope, too.
 
     Raises:
         ValueError: no record has a segment, a sample is missing, or a frequency is out of range.
@@ -139,14 +149,17 @@ def cross_spectra(
     total, averages = np.zeros(1), 0.0
     for record, count in zip(records, counts, strict=True):
         if count:
-            mean = _products(np.asarray(record, np.float64), window, dt, omega, step)
+            mean = _products(np.asarray(record, np.float64), window, dt, omega, step, sloped)
             total, averages = (
                 total + count * mean,
                 averages + _independent(window, step, count),
             )
     # One-sided: each frequency stands for its negative twin as well.
     density = 2.0 * dt / np.sum(window**2)
-    return CrossSpectra(np.asarray(omega), density / sum(counts) * total, averages, length * dt)
+    S = density / sum(counts) * total
+    c = records[0].shape[0]
+    slopes = S[:, :, c:] if sloped else None
+    return CrossSpectra(np.asarray(omega), S[:, :, :c], averages, length * dt, slopes)
 
 
 def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
@@ -172,8 +185,9 @@ def _products(
     dt: float,
     omega: Float[np.ndarray, " k"],
     step: int,
-) -> Complex[np.ndarray, "k c c"]:
-    """Mean over the segments of conj(X_a) X_b."""
+    sloped: int,
+) -> Complex[np.ndarray, "k c both"]:
+    """Mean over the segments of conj(X_a) X_b, then of the first signals in the window's slope."""
     c, n = record.shape[0], window.shape[0]
     count = 1 + (record.shape[1] - n) // step
     # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
@@ -181,10 +195,28 @@ def _products(
     segments = record[:, step * np.arange(count)[:, None] + np.arange(n)].reshape(c * count, n)
     # One product of matrices: for the few hundred frequencies of a band faster than fast Fourier
     # transforms of twice the length, and they may lie anywhere.
-    basis = window[:, None] * _turns(n, omega * dt)
-    X = segments @ basis - segments.mean(axis=1)[:, None] * basis.sum(axis=0)[None]
-    X = (X[:, : omega.size] + 1j * X[:, omega.size :]).reshape(c, count, -1)
-    return np.conj(X).transpose(2, 0, 1) @ X.transpose(2, 1, 0) / count
+    turns, means = _turns(n, omega * dt), segments.mean(axis=1)
+    X = _transforms(segments, means, window, turns, count)
+    # Of the window itself, a cosine, per second.
+    slope = np.pi / (n * dt) * np.sin(2.0 * np.pi * np.arange(n) / n)
+    rows = sloped * count
+    both = [X, _transforms(segments[:rows], means[:rows], slope, turns, count)] if sloped else [X]
+    Y = np.concatenate(both, axis=0)
+    return np.conj(X).transpose(2, 0, 1) @ Y.transpose(2, 1, 0) / count
+
+
+def _transforms(
+    segments: Float[np.ndarray, "rows n"],
+    means: Float[np.ndarray, " rows"],
+    window: Float[np.ndarray, " n"],
+    turns: Float[np.ndarray, "n 2*k"],
+    count: int,
+) -> Complex[np.ndarray, "c count k"]:
+    """Of segments less their means in a window."""
+    basis = window[:, None] * turns
+    X = segments @ basis - means[:, None] * basis.sum(axis=0)[None]
+    k = turns.shape[1] // 2
+    return (X[:, :k] + 1j * X[:, k:]).reshape(-1, count, k)
 
 
 def _turns(n: int, angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 2*k"]:
@@ -227,7 +259,8 @@ def responses(
             taken for ones that do not follow the outputs.
 
     Raises:
-        ValueError: too few averages for so many inputs, or not as many instruments as inputs.
+        TooFewAveragesError: for so many inputs.
+        ValueError: not as many instruments as inputs.
     """
     u, y = list(inputs), list(outputs)
     z = u if instruments is None else list(instruments)
@@ -235,7 +268,7 @@ def responses(
     if len(z) != m:
         raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
     if np.min(n) < m + 1:
-        raise ValueError(
+        raise TooFewAveragesError(
             f"expected at least {m + 1} independent averages for {m} inputs, got "
             f"{np.min(n):.2f}: a longer record, or a shorter window"
         )
@@ -257,7 +290,8 @@ def responses(
         sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m), half95)
         H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
-    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
+    ends = None if spectra.slopes is None else P @ spectra.slopes[:, z][:, :, u]
+    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0], ends)
 
 
 def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
