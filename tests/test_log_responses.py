@@ -96,6 +96,9 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     # The hold of the stick is half a sample late, which is not the machine's.
     assert fitted["delay_s"]["lower95"] < 0.0 < fitted["delay_s"]["upper95"]
     data = xr.open_dataset(out / "responses.nc", engine="scipy")
+    assert data["unit"].sel(input="lat", output="p") == "rad/s"
+    assert {data[n].attrs["units"] for n in ("real", "imaginary", "sd")} == {"rad/s"}
+    assert data["half95"].sel(output="p") == pytest.approx(2.0, abs=0.1)
     H = (data["real"] + 1j * data["imaginary"]).sel(input="lat", output="p").values
     omega = 2.0 * np.pi * data.frequency.values
     true = scipy.signal.freqz(ROLL[0].ravel(), ROLL[1], omega * DT)[1]

@@ -22,6 +22,7 @@ from heli_jax.report.handling_json import handling_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import picture
+from heli_jax.report.responses_netcdf import quotient, write_netcdf
 from heli_jax.report.tables.handling import handling as handling_table
 from heli_jax.report.tables.handling import handling_sentences
 from heli_jax.report.tables.table import Table
@@ -60,7 +61,7 @@ def write_responses(
         png: whether figures are PNG files too.
     """
     write_table(directory / "responses.csv", table(responses))
-    _write_netcdf(directory / "responses.nc", responses, units)
+    write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
     (directory / "transfer_functions.json").write_text(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
@@ -136,13 +137,6 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     )
 
 
-def quotient(output: str, input: str) -> str:
-    """The unit of output over input."""
-    if input == "1":
-        return output
-    return f"{output}/({input})" if "/" in input else f"{output}/{input}"
-
-
 def table(responses: FlightResponses) -> dict[str, Any]:
     """A row for each frequency of each pair: the columns of responses.csv."""
     columns: dict[str, list[Any]] = {n: [] for n in ("input", "output")}
@@ -167,56 +161,6 @@ def table(responses: FlightResponses) -> dict[str, Any]:
             for n, v in each.items():
                 numbers.setdefault(n, []).append(v)
     return {**columns, **{n: np.concatenate(v) for n, v in numbers.items()}}
-
-
-def _write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
-    import xarray as xr
-
-    inputs = list(next(iter(responses.outputs.values())).pairs)
-
-    def stacked(name: str) -> np.ndarray:
-        return np.stack(
-            [[getattr(o.pairs[i], name) for i in inputs] for o in responses.outputs.values()]
-        )
-
-    pairs, each = ("output", "input", "frequency"), ("output", "frequency")
-    H, picture = stacked("H"), stacked("picture")
-    data = xr.Dataset(
-        {
-            # NetCDF 3 has no complex numbers.
-            "real": (pairs, np.real(H)),
-            "imaginary": (pairs, np.imag(H)),
-            "sd": (pairs, stacked("sd"), {"long_name": "of the real and of the imaginary part"}),
-            "coherence": (pairs, stacked("coherence"), {"long_name": "partial coherence"}),
-            "composite_real": (
-                pairs,
-                np.real(picture),
-                {"long_name": "of several windows"},
-            ),
-            "composite_imaginary": (pairs, np.imag(picture)),
-            "multiple_coherence": (
-                each,
-                np.stack([o.multiple for o in responses.outputs.values()]),
-            ),
-            "noise": (
-                each,
-                np.stack([o.noise for o in responses.outputs.values()]),
-                {"long_name": "density of what the inputs leave", "units": "SI^2/Hz"},
-            ),
-        },
-        {
-            "output": list(responses.outputs),
-            "input": inputs,
-            "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
-        },
-        {
-            "window_s": responses.window,
-            "instruments": " ".join(responses.instruments),
-            "units_of_outputs": " ".join(units[n] for n in responses.outputs),
-            "units_of_inputs": " ".join(units[n] for n in inputs),
-        },
-    )
-    data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
 
 def transfer_status(fit: TransferFit | str) -> str:
