@@ -192,41 +192,57 @@ def _products(
     count = 1 + (record.shape[1] - n) // step
     # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
     record = record - record.mean(axis=1, keepdims=True)
-    segments = record[:, step * np.arange(count)[:, None] + np.arange(n)].reshape(c * count, n)
-    # One product of matrices: for the few hundred frequencies of a band faster than fast Fourier
+    segments = np.lib.stride_tricks.sliding_window_view(record, n, axis=1)[:, ::step]
+    even, odd, means = (part.reshape(c * count, -1) for part in _folded(segments))
+    # Products of matrices: for the few hundred frequencies of a band faster than fast Fourier
     # transforms of twice the length, and they may lie anywhere.
-    turns, means = _turns(n, omega * dt), segments.mean(axis=1)
-    X = _transforms(segments, means, window, turns, count)
-    # Of the window itself, a cosine, per second.
-    slope = np.pi / (n * dt) * np.sin(2.0 * np.pi * np.arange(n) / n)
-    rows = sloped * count
-    both = [X, _transforms(segments[:rows], means[:rows], slope, turns, count)] if sloped else [X]
+    late = np.arange((n + 1) // 2, n)
+    cosines, sines = _turns(late.size, omega * dt, (n + 1) // 2 - 0.5 * n)
+    ones = _folded(np.ones(n))[0]
+    w = window[late, None]
+    C = w * cosines
+    X = (even @ C - means * (ones @ C) - 1j * (odd @ (w * sines))).reshape(c, count, -1)
+    both, rows = [X], sloped * count
+    if sloped:
+        # Of the window itself, a cosine, per second.
+        v = (np.pi / (n * dt) * np.sin(2.0 * np.pi * late / n))[:, None]
+        S = v * sines
+        steep = odd[:rows] @ (v * cosines) - 1j * (even[:rows] @ S - means[:rows] * (ones @ S))
+        both.append(steep.reshape(sloped, count, -1))
     Y = np.concatenate(both, axis=0)
     return np.conj(X).transpose(2, 0, 1) @ Y.transpose(2, 1, 0) / count
 
 
-def _transforms(
-    segments: Float[np.ndarray, "rows n"],
-    means: Float[np.ndarray, " rows"],
-    window: Float[np.ndarray, " n"],
-    turns: Float[np.ndarray, "n 2*k"],
-    count: int,
-) -> Complex[np.ndarray, "c count k"]:
-    """Of segments less their means in a window."""
-    basis = window[:, None] * turns
-    X = segments @ basis - means[:, None] * basis.sum(axis=0)[None]
-    k = turns.shape[1] // 2
-    return (X[:, :k] + 1j * X[:, k:]).reshape(-1, count, k)
+def _folded(
+    segments: Float[np.ndarray, "... n"],
+) -> tuple[
+    Float[np.ndarray, "... half"], Float[np.ndarray, "... half"], Float[np.ndarray, "... 1"]
+]:
+    """Even and odd part of segments about their middle, twice each, and their means.
+
+    A window is even about its middle and its slope odd, so that cosines go with one part and sines
+    with the other: half of the products. Of the first sample neither makes anything.
+    """
+    n = segments.shape[-1]
+    late, early = segments[..., (n + 1) // 2 :], segments[..., n // 2 : 0 : -1]
+    even, odd = late + early, late - early
+    if n % 2 == 0:
+        # The middle itself, once.
+        even[..., 0] *= 0.5
+    return even, odd, ((even.sum(axis=-1) + segments[..., 0]) / n)[..., None]
 
 
-def _turns(n: int, angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 2*k"]:
-    """exp(-i m angle) of m from 0 to n - 1, real parts beside imaginary ones, by products of few
-    sines: so many would take as long as the transform."""
-    coarse = np.outer(_FINE * np.arange(-(-n // _FINE)), angle)[:, None]
+def _turns(
+    count: int, angle: Float[np.ndarray, " k"], first: float
+) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
+    """Cosines and sines of m angle, m from the first on in steps of one, by products of few: so
+    many would take as long as the transform."""
+    coarse = np.outer(first + _FINE * np.arange(-(-count // _FINE)), angle)[:, None]
     fine = np.outer(np.arange(_FINE), angle)[None]
     (c, s), (C, S) = ((np.cos(v), np.sin(v)) for v in (fine, coarse))
-    turns = np.concatenate([C * c - S * s, -(S * c + C * s)], axis=2)
-    return turns.reshape(-1, 2 * angle.shape[0])[:n]
+    k = angle.shape[0]
+    turns = C * c - S * s, S * c + C * s
+    return turns[0].reshape(-1, k)[:count], turns[1].reshape(-1, k)[:count]
 
 
 def _independent(window: np.ndarray, step: int, count: int) -> float:

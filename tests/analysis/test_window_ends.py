@@ -37,9 +37,11 @@ def test_between_missing_samples_intervals_hold_the_truth(gaps, noise):
     assert np.mean(with_ends) < 0.9 or not gaps
 
 
-def test_spectra_in_the_slope_of_the_window_are_those_of_scipy():
+@pytest.mark.parametrize("n", [99, 100])
+def test_spectra_in_a_window_and_in_its_slope_are_those_of_scipy(n):
+    """Of an even and of an odd number of samples, which are folded about their middle."""
     rng = np.random.default_rng(0)
-    x, n, w = rng.standard_normal((2, 500)), 100, np.array([3.0, 7.5])
+    x, w = 7.0 + rng.standard_normal((2, 500)), np.array([3.0, 7.5])
     found = cross_spectra([x], DT, w, n * DT, OVERLAP, sloped=1)
     at = np.arange(n)
     window = scipy.signal.windows.hann(n, sym=False)
@@ -52,3 +54,5 @@ def test_spectra_in_the_slope_of_the_window_are_those_of_scipy():
     assert found.slopes is not None
     expected = density * np.mean(S, axis=0)
     np.testing.assert_allclose(found.slopes[:, :, 0].T, expected, rtol=2e-3)
+    S = [np.conj((p * window) @ turns) * ((p[1] * window) @ turns) for p in parts]
+    np.testing.assert_allclose(found.S[:, :, 1].T, density * np.mean(S, axis=0), rtol=1e-10)
