@@ -245,9 +245,13 @@ def _fit(options: argparse.Namespace) -> int:
     return _fit_code(run.fit)
 
 
+def _status_code(status: str) -> int:
+    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(status, NOT_CONVERGED)
+
+
 def _fit_code(fitted: "Fit") -> int:
     """The exit code of a fit."""
-    code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(fitted.status, NOT_CONVERGED)
+    code = _status_code(fitted.status)
     # Converged onto a model worse than a constant, or one that foretells no better: a script that
     # looks at the code alone must not take these numbers.
     if code == DONE and (fitted.adequacy.less_than_mean or fitted.held_out_worse):
@@ -302,8 +306,10 @@ def _frf(options: argparse.Namespace) -> int:
     from heli_jax import log_responses, workflow
 
     experiment = workflow.load_config(options.config, options.set)
-    log_responses.run_responses(experiment, out, options.log, options.say)
-    return DONE
+    statuses = log_responses.run_responses(experiment, out, options.log, options.say)
+    # The responses are written whatever comes of a transfer function; a script that looks at the
+    # code alone must not take numbers that are not there.
+    return max(map(_status_code, statuses), default=DONE)
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -138,8 +138,9 @@ def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
 
 def run_responses(
     experiment: Experiment, out: Path, log: str | None, say: Callable[[str], None]
-) -> None:
-    """Write the responses into a new directory, and print them.
+) -> list[str]:
+    """Write the responses into a new directory, and print them; returns the statuses of the
+    transfer functions, those of fits.
 
     Args:
         experiment: the configuration.
@@ -147,7 +148,7 @@ def run_responses(
         log: in place of the configuration's.
         say: called with notes, and where the page is.
     """
-    from heli_jax.report.responses import write_responses
+    from heli_jax.report.responses import transfer_status, write_responses
     from heli_jax.report.tables.handling import handling_lines, handling_sentences
 
     responses = responses_of_log(experiment, log, say)
@@ -175,6 +176,7 @@ def run_responses(
     for sentence in (*handling_sentences(handling), *gaps):
         tell(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
+    return [transfer_status(fit) for _, fit in responses.fits]
 
 
 def not_usable(responses: FlightResponses) -> tuple[str, ...]:
@@ -207,7 +209,8 @@ def print_responses(responses: FlightResponses) -> None:
     for request, fit in responses.fits:
         orders = f"{request.zeros} zeros, {request.poles} poles"
         tell(f"{request.input} to {request.output}, {orders}:")
-        for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
-            tell(f"  {head}: {cell}")
+        if not isinstance(fit, str):
+            for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
+                tell(f"  {head}: {cell}")
         for sentence in fit_sentences(fit, responses.window):
             tell(f"  {plain_words(sentence)}")

@@ -198,7 +198,7 @@ def test_nothing_imports_the_command_line(name):
                 "studies",
                 "study_command.py",
                 "report/sweeps",
-                "report/responses.py",
+                "report/responses_netcdf.py",
                 "flights/array_table.py",
                 "flights/convert.py",
                 "exports.py",

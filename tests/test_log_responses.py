@@ -96,6 +96,9 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     # The hold of the stick is half a sample late, which is not the machine's.
     assert fitted["delay_s"]["lower95"] < 0.0 < fitted["delay_s"]["upper95"]
     data = xr.open_dataset(out / "responses.nc", engine="scipy")
+    assert data["unit"].sel(input="lat", output="p") == "rad/s"
+    assert {data[n].attrs["units"] for n in ("real", "imaginary", "sd")} == {"rad/s"}
+    assert data["half95"].sel(output="p") == pytest.approx(2.0, abs=0.1)
     H = (data["real"] + 1j * data["imaginary"]).sel(input="lat", output="p").values
     omega = 2.0 * np.pi * data.frequency.values
     true = scipy.signal.freqz(ROLL[0].ravel(), ROLL[1], omega * DT)[1]
@@ -292,6 +295,39 @@ def test_where_a_signal_has_no_power_of_its_own_there_is_no_response():
     assert np.isnan(H[hz > 15.0]).all()
 
 
+def test_a_transfer_function_that_cannot_be_fitted_keeps_nothing_else_back(
+    config, tmp_path, capsys
+):
+    with config.open("a") as file:
+        file.write("    - {input: lat, output: p, zeros: 7, poles: 8, band: [0.5, 1.2]}\n")
+        file.write("    - {input: lat, output: phi, poles: 1, delay: false}\n")
+    out = tmp_path / "out"
+    # As of a fit that is not identifiable: a script must not take numbers that are not there.
+    assert main(["frf", str(config), "--out", str(out)]) == 3
+    printed = capsys.readouterr().out
+    assert "delay [ms]: " in printed
+    assert "not fitted: expected more than 8.5 independent frequencies" in printed
+    one, many, other = json.loads((out / "transfer_functions.json").read_text())
+    assert one["status"] == "converged"
+    for none, poles in ((many, 8), (other, 1)):
+        assert none["status"] == "not-identifiable"
+        assert none["denominator"] == [{"value": 1.0}, *[{}] * poles]
+        assert none["poles"] is None
+    assert other["delay_s"] is None
+    assert other["sentences"] == ["not fitted: these flights have no response from lat to phi"]
+    assert "not fitted: expected more than 8.5" in (out / "responses.html").read_text()
+
+
+def test_an_output_of_too_few_averages_keeps_nothing_else_back():
+    whole = flight(0)
+    q = whole.outputs["p"].copy()
+    q[600:] = np.nan
+    both = Flight(dt=DT, inputs=whole.inputs, outputs={"p": whole.outputs["p"], "q": q})
+    found = flight_responses([both], Settings(window=10.0))
+    assert list(found.outputs) == ["p"]
+    assert any(n.startswith("q: no response, expected at least 2 indep") for n in found.notes)
+
+
 def test_flights_of_two_rates_are_refused():
     other = Flight(dt=0.01, inputs=flight(0).inputs, outputs=flight(0).outputs)
     with pytest.raises(ValueError, match="expected flights of one rate, got 50, 100 Hz"):
@@ -315,5 +351,6 @@ def test_a_fit_says_that_the_band_which_was_asked_for_has_no_responses(monkeypat
 def test_an_order_that_is_too_low_is_called_so():
     quick = [flight(s) for s in range(2)]
     wanted = Wanted("lat", "p", 0, 1, delay=False)
-    found = flight_responses(quick, Settings(window=10.0, transfer_functions=(wanted,)))
-    assert found.fits[0][1].chi_squared < 2.0
+    [(_, fit)] = flight_responses(quick, Settings(window=10.0, transfer_functions=(wanted,))).fits
+    assert isinstance(fit, TransferFit)
+    assert fit.chi_squared < 2.0

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.flight_responses import FlightResponses
+from heli_jax.analysis.flight_responses import FlightResponses, steady_sd
 from heli_jax.analysis.handling_qualities import (
     HandlingQualities,
     Kind,
@@ -120,12 +120,12 @@ def measured_handling(
     """
     output = flight_responses.outputs.get(pair.output)
     response = None if output is None else output.pairs.get(pair.input)
-    if response is None:
+    if output is None or response is None:
         return "the flights have no such response"
+    omega, window = flight_responses.omega, flight_responses.window
+    steady, _ = steady_sd(omega, output, pair.input, window)
     with np.errstate(all="ignore"):
-        H = without_hold(flight_responses.omega, response.H, flight_responses.holds[pair.input])
-        sd = response.sd * np.abs(H / response.H)
-    curve = measured_curve(
-        flight_responses.omega, H, sd, response.coherence, flight_responses.window
-    )
+        H = without_hold(omega, response.H, flight_responses.holds[pair.input])
+        sd = steady * np.abs(H / response.H)
+    curve = measured_curve(omega, H, sd, response.coherence, window)
     return curve if isinstance(curve, str) else handling_qualities(prepared(pair, curve), pair.kind)

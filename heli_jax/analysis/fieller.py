@@ -3,11 +3,11 @@
 With w_j the combination of the instruments that goes with input j alone, H_j = S_wy over S_wu, and
 a response H' agrees with the record where |S_we| of y - H' u is within its interval,
 
-    |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = 1.96^2 S_ww / (2 n),
+    |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = t^2 S_ww / (2 n),
 
-v being what of the input no instrument explains. That is a disc. Where the excitation is weak
-beside v it is larger than the first-order error and lies to one side, and where c S_vv reaches 1 it
-has no end: nothing is known of the response.
+t being Student's (1.96 of many averages) and v what of the input no instrument explains. That is a
+disc. Where the excitation is weak beside v it is larger than the first-order error and lies to one
+side, and where c S_vv reaches 1 it has no end: nothing is known of the response.
 
 Source: Fieller (1954); Anderson and Rubin (1949) for instruments.
 """
@@ -29,6 +29,7 @@ def sd_of_ratio(
     H: Complex[np.ndarray, "k l m"],
     left: Float[np.ndarray, "k l"],
     spread: Float[np.ndarray, "k m"],
+    half95: Float[np.ndarray, "k 1"],
 ) -> Float[np.ndarray, "k l m"]:
     """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
     NaN where these have no end.
@@ -40,6 +41,7 @@ def sd_of_ratio(
         H: the responses.
         left: density of what they leave.
         spread: density of w_j over the averages.
+        half95: half of a 95 % interval in standard deviations.
     """
     u, y, z = signals
     zz, zu = S[:, z][:, :, z], S[:, z][:, :, u]
@@ -50,7 +52,7 @@ def sd_of_ratio(
         own = np.maximum(np.real(S[:, u, u]) - explained, 0.0)
         # Of y - H u with each input.
         crossed = S[:, u][:, :, y] - np.einsum("kja,kla->kjl", S[:, u][:, :, u], H)
-        c = 0.5 * _Z95**2 * spread
+        c = 0.5 * half95**2 * spread
         # An input that is its own instrument has nothing of its own, but for rounding.
         direct = np.array([a == b for a, b in zip(u, z, strict=True)])
         room = np.where(direct, 1.0, 1.0 - c * own)[:, None, :]
@@ -61,5 +63,6 @@ def sd_of_ratio(
         share = explained / np.maximum(explained + own, 1e-300)
         around = np.stack([octave_mean(omega, v) for v in share.T], axis=1)
         # c S_vv again, with the octave's share of the input that instruments explain.
-        strong = direct | (c * explained * (1.0 - around) < _STRONG * around)
-        return np.where((room > 0) & strong[:, None, :], reach / _Z95, np.nan)
+        likely = 0.5 * _Z95**2 * spread
+        strong = direct | (likely * explained * (1.0 - around) < _STRONG * around)
+        return np.where((room > 0) & strong[:, None, :], reach / half95[:, None], np.nan)

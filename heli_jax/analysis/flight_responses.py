@@ -5,23 +5,31 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.response_parts import Names, groups, records_of
+from heli_jax.analysis.response_pictures import picture_of, several_windows
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
-from heli_jax.analysis.spectral import OVERLAP, CrossSpectra, composite, cross_spectra, responses
+from heli_jax.analysis.spectral import (
+    OVERLAP,
+    TooFewAveragesError,
+    cross_spectra,
+    responses,
+)
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
+from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
-from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
-_LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
-"""of the windows of a composite, in that one's length"""
 _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
 _ROUNDS = 2
 """in which a transfer function is fitted again without what the windows add to it"""
+_MOST_SAID = 3
+"""outputs of which a refusal says why they have no response"""
 _AS_ONE = 1e-6
 """less than 1, coherence of two inputs that move as one at all frequencies"""
 
@@ -64,6 +72,10 @@ class Pair(NamedTuple):
     """partial: what the other inputs explain is taken out"""
     picture: np.ndarray
     """H of the composite of several windows, for looking; NaN where there is none"""
+    half95: float = Z95
+    """half of a 95 % interval in sd: Student's t of the averages that there are"""
+    added: np.ndarray | float = 0.0
+    """what windows added to H at the ends of records and was taken off (`window_ends`)"""
 
 
 class Output(NamedTuple):
@@ -89,8 +101,8 @@ class FlightResponses(NamedTuple):
     """inputs whose responses are taken by an excitation that was logged"""
     window: float
     """[s]"""
-    fits: tuple[tuple[Wanted, TransferFit], ...]
-    """in the order in which they were asked for"""
+    fits: tuple[tuple[Wanted, TransferFit | str], ...]
+    """in the order in which they were asked for; in words why there is none"""
     holds: dict[str, Hold]
     """by input what it does between samples"""
     notes: tuple[str, ...]
@@ -126,13 +138,19 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)
-    for group, parts in _groups(flights, round(window / dt), notes):
-        records = _records(flights, names, group, parts)
+    without: list[str] = []
+    for group, parts in groups(flights, round(window / dt), without):
+        records = records_of(flights, names, group, parts)
         made = _windows(records, omega, window, names)
-        outputs |= _outputs(made, dt, (names, group))
+        try:
+            outputs |= _outputs(made, dt, (names, group))
+        except TooFewAveragesError as e:
+            # Outputs with fewer averages than inputs are no reason to keep back the others.
+            without.append(f"{', '.join(group)}: no response, {e}")
         windows |= dict.fromkeys(group, made)
     if not outputs:
-        raise ValueError("; ".join(notes[-3:]))
+        raise ValueError("; ".join(without[:_MOST_SAID]))
+    notes += without
     notes += _moving_as_one(flights, inputs, outputs)
     notes += _weak(omega, instruments, outputs)
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
@@ -198,62 +216,7 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     return notes
 
 
-type _Parts = tuple[tuple[int, int, int], ...]
-type _Names = tuple[list[str], tuple[str, ...]]
-
-
-def _groups(
-    flights: Sequence[Flight], window: int, notes: list[str]
-) -> list[tuple[list[str], _Parts]]:
-    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
-    them; what has no part is noted."""
-    groups: dict[_Parts, list[str]] = {}
-    order = dict.fromkeys(n for f in flights for n in f.outputs)
-    for name in order:
-        parts = _parts(flights, name, window)
-        if isinstance(parts, str):
-            notes.append(parts)
-        else:
-            groups.setdefault(parts, []).append(name)
-    return [(names, parts) for parts, names in groups.items()]
-
-
-def _parts(flights: Sequence[Flight], output: str, window: int) -> _Parts | str:
-    """Flight, first and last sample of each part without a missing one, or why there is none."""
-    parts, longest = [], 0
-    for i, f in enumerate(flights):
-        if output not in f.outputs:
-            continue
-        for first, last in spans([f.outputs[output]]):
-            longest = max(longest, last - first)
-            if last - first >= window:
-                parts.append((i, first, last))
-    if parts:
-        return tuple(parts)
-    return (
-        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
-        f"missing one, got {longest} at most"
-    )
-
-
-def _records(
-    flights: Sequence[Flight], names: _Names, outputs: list[str], parts: _Parts
-) -> list[np.ndarray]:
-    """Inputs, instruments and outputs (signals, N) of each part."""
-    inputs, instruments = names
-    return [
-        np.stack(
-            [
-                *(flights[i].inputs[n][first:last] for n in inputs),
-                *(flights[i].instruments[n][first:last] for n in instruments),
-                *(flights[i].outputs[n][first:last] for n in outputs),
-            ]
-        )
-        for i, first, last in parts
-    ]
-
-
-def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: _Names) -> Windows:
+def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: Names) -> Windows:
     inputs, instruments = names
     m = len(inputs)
     z = [m + instruments.index(n) if n in instruments else i for i, n in enumerate(inputs)]
@@ -296,28 +259,35 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
     return notes
 
 
-def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> dict[str, Output]:
+def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dict[str, Output]:
     (inputs, instruments), outputs = names
     records, omega, window = windows.records, windows.omega, windows.seconds
     m, first = len(inputs), len(inputs) + len(instruments)
     u, y = list(range(m)), list(range(first, first + len(outputs)))
     by = None if windows.instruments is None else list(windows.instruments)
-    spectra = cross_spectra(records, dt, omega, window, OVERLAP)
+    spectra = cross_spectra(records, dt, omega, window, OVERLAP, sloped=m)
     estimate = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
-    several = _several(records, dt, spectra, window, m)
+    seen = (driven & own[y]).T[:, :, None]
+    H, sd, coherence = (
+        np.where(seen, v, np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
+    )
+    assert estimate.ends is not None
+    added, sd = without_ends(omega, H, sd, estimate.ends, window)
+    H = H - added
+    several = several_windows(records, dt, spectra, window, m)
+    averages = float(estimate.averages[0])
+    half95 = float(student95(np.asarray(2.0 * (averages - m))))
     result = {}
     for i, name in enumerate(outputs):
-        seen = (driven & own[y[i]])[:, None]
-        H, sd, coherence = (
-            np.where(seen, v[:, i], np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
-        )
-        picture = _picture(several, omega, (u, y[i], by))
+        picture = picture_of(several, omega, (u, y[i], by))
         pairs = {
-            n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j]) for j, n in enumerate(inputs)
+            n: Pair(
+                H[:, i, j], sd[:, i, j], coherence[:, i, j], picture[:, j], half95, added[:, i, j]
+            )
+            for j, n in enumerate(inputs)
         }
-        averages = float(estimate.averages[0])
         result[name] = Output(pairs, estimate.multiple[:, i], estimate.noise[:, i], averages)
     return result
 
@@ -337,36 +307,25 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     return own[:, np.clip(np.round(omega / lines[1]).astype(int), 0, own.shape[1] - 1)]
 
 
-def _several(
-    records: Sequence[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
-) -> list[CrossSpectra]:
-    """Spectra of several windows beside those of one, as far as the records have three of each."""
-    longest = max(r.shape[1] for r in records) * dt
-    several: list[CrossSpectra] = []
-    for length in _LENGTHS:
-        # Three windows are the least that a coherence can be taken from.
-        if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
-            continue
-        own = length == 1.0
-        spectra = one if own else cross_spectra(records, dt, one.omega, length * window, OVERLAP)
-        if np.min(spectra.averages) >= m + 1:
-            several.append(spectra)
-    return several
+def steady_sd(
+    omega: np.ndarray, output: Output, input: str, seconds: float
+) -> tuple[np.ndarray, float]:
+    """Of a response's real and imaginary part (k,), the noise a mean over frequencies where there
+    are few averages, and its degrees of freedom: for weights, which a single frequency's would
+    mislead.
 
-
-def _picture(
-    several: list[CrossSpectra], omega: np.ndarray, which: tuple[list[int], int, list[int] | None]
-) -> np.ndarray:
-    """H (k, m) of several windows together; NaN where the record has no two of them."""
-    u, y, by = which
-    if len(several) < 2:
-        return np.full((omega.size, len(u)), np.nan)
-    # Without the other outputs, of which each has its own weights.
-    kept = [*dict.fromkeys([*u, *(by or u)]), y]
-    place = {i: j for j, i in enumerate(kept)}
-    own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
-    us, zs = [place[i] for i in u], None if by is None else [place[i] for i in by]
-    return responses(composite(own, us, [place[y]]), us, [place[y]], zs).H[:, 0]
+    Args:
+        omega: (k,) [rad/s]
+        output: of flights.
+        input: its name.
+        seconds: length of a window.
+    """
+    pair = output.pairs[input]
+    noise = np.where(np.isfinite(pair.H), output.noise, np.nan)
+    share = independent_shares(omega, seconds)
+    mean, freedom = averaged(noise, share, output.averages - len(output.pairs))
+    with np.errstate(all="ignore"):
+        return pair.sd * np.sqrt(mean / noise), freedom
 
 
 def _fits(
@@ -374,33 +333,35 @@ def _fits(
     outputs: dict[str, Output],
     windows: dict[str, Windows],
     holds: dict[str, Hold],
-) -> tuple[tuple[Wanted, TransferFit], ...]:
+) -> tuple[tuple[Wanted, TransferFit | str], ...]:
+    """The transfer functions, or why one cannot be fitted: the responses are there all the same."""
     fits = []
-    for i, request in enumerate(settings.transfer_functions):
-        place = f"transfer_functions[{i}]"
+    for request in settings.transfer_functions:
         output = outputs.get(request.output)
         if output is None or request.input not in output.pairs:
-            raise ValueError(
-                f"{place}: no response from {request.input} to {request.output} is to be had of "
-                "these flights"
-            )
+            why = f"these flights have no response from {request.input} to {request.output}"
+            fits.append((request, why))
+            continue
         try:
-            fitted = _fitted(request, output.pairs[request.input], windows[request.output], holds)
+            fitted = _fitted(request, output, windows[request.output], holds)
         except ValueError as e:
-            raise ValueError(f"{place}: {e}") from e
+            fitted = str(e)
         fits.append((request, fitted))
     return tuple(fits)
 
 
-def _fitted(request: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold]) -> TransferFit:
-    omega = windows.omega
+def _fitted(
+    request: Wanted, output: Output, windows: Windows, holds: dict[str, Hold]
+) -> TransferFit:
+    omega, pair = windows.omega, output.pairs[request.input]
     hz = omega / (2.0 * np.pi)
     low, high = request.band or (0.0, np.inf)
     used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
     # With its hold, which is half a sample late, so that the delay is the machine's own.
     hold = holds[request.input]
-    measured = Measured(omega, H, pair.sd, windows.seconds, pair.coherence, hold)
+    sd, freedom = steady_sd(omega, output, request.input, windows.seconds)
+    measured = Measured(omega, H, sd, windows.seconds, pair.coherence, hold, freedom)
     orders = request.zeros, request.poles, request.delay
     fitted = fit_transfer(measured, *orders)
     for _ in range(_ROUNDS):
@@ -408,5 +369,6 @@ def _fitted(request: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold
         added = window_error(fitted, windows, list(holds).index(request.input), hold)
         if added is None:
             break
-        fitted = fit_transfer(measured._replace(H=H - added), *orders)
+        # All that they do, at the ends too.
+        fitted = fit_transfer(measured._replace(H=H + pair.added - added), *orders)
     return fitted

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.analysis.fieller import sd_of_ratio
+from heli_jax.analysis.noise_over_lines import student95
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
@@ -32,6 +33,10 @@ all times, so that what they cut off of answers that end outside of them, in pro
 square's slope, cancels; of windows that overlap by half it does not"""
 _ROUNDING = 1e-14
 """of an output's density, what rounding leaves where the inputs explain all of it"""
+
+
+class TooFewAveragesError(ValueError):
+    """Of fewer averages than one more than the inputs no response is known."""
 
 
 class CrossSpectra(NamedTuple):
@@ -46,6 +51,8 @@ class CrossSpectra(NamedTuple):
     less than one"""
     seconds: float
     """length of a segment"""
+    slopes: np.ndarray | None = None
+    """(k, c, m) those of the signals with the first m of them in the window's slope [1/s]"""
 
 
 class Responses(NamedTuple):
@@ -67,6 +74,8 @@ class Responses(NamedTuple):
     """(k, l) density of what they leave, per Hz"""
     averages: np.ndarray
     """(k,) independent ones"""
+    ends: np.ndarray | None = None
+    """(k, m, m) what of each input in the window's slope counts as each input [1/s]"""
 
 
 def chirp_z(
@@ -117,6 +126,7 @@ def cross_spectra(
     omega: Float[np.ndarray, " k"],
     seconds: float,
     overlap: float = 0.5,
+    sloped: int = 0,
 ) -> CrossSpectra:
     """Averages over Hann windows of all records, each segment less its mean.
 
@@ -126,6 +136,7 @@ def cross_spectra(
         omega: (k,) [rad/s], above zero and below the Nyquist frequency.
         seconds: length of a segment; records that are shorter are left out.
         overlap: of one segment with the next, from 0 to below 1.
+        sloped: how many of the first signals are taken in the window's slope, too.
 
     Raises:
         ValueError: no record has a segment, a sample is missing, or a frequency is out of range.
@@ -138,14 +149,17 @@ def cross_spectra(
     total, averages = np.zeros(1), 0.0
     for record, count in zip(records, counts, strict=True):
         if count:
-            mean = _products(np.asarray(record, np.float64), window, dt, omega, step)
+            mean = _products(np.asarray(record, np.float64), window, dt, omega, step, sloped)
             total, averages = (
                 total + count * mean,
                 averages + _independent(window, step, count),
             )
     # One-sided: each frequency stands for its negative twin as well.
     density = 2.0 * dt / np.sum(window**2)
-    return CrossSpectra(np.asarray(omega), density / sum(counts) * total, averages, length * dt)
+    S = density / sum(counts) * total
+    c = records[0].shape[0]
+    slopes = S[:, :, c:] if sloped else None
+    return CrossSpectra(np.asarray(omega), S[:, :, :c], averages, length * dt, slopes)
 
 
 def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
@@ -171,29 +185,64 @@ def _products(
     dt: float,
     omega: Float[np.ndarray, " k"],
     step: int,
-) -> Complex[np.ndarray, "k c c"]:
-    """Mean over the segments of conj(X_a) X_b."""
+    sloped: int,
+) -> Complex[np.ndarray, "k c both"]:
+    """Mean over the segments of conj(X_a) X_b, then of the first signals in the window's slope."""
     c, n = record.shape[0], window.shape[0]
     count = 1 + (record.shape[1] - n) // step
     # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
     record = record - record.mean(axis=1, keepdims=True)
-    segments = record[:, step * np.arange(count)[:, None] + np.arange(n)].reshape(c * count, n)
-    # One product of matrices: for the few hundred frequencies of a band faster than fast Fourier
+    segments = np.lib.stride_tricks.sliding_window_view(record, n, axis=1)[:, ::step]
+    even, odd, means = (part.reshape(c * count, -1) for part in _folded(segments))
+    # Products of matrices: for the few hundred frequencies of a band faster than fast Fourier
     # transforms of twice the length, and they may lie anywhere.
-    basis = window[:, None] * _turns(n, omega * dt)
-    X = segments @ basis - segments.mean(axis=1)[:, None] * basis.sum(axis=0)[None]
-    X = (X[:, : omega.size] + 1j * X[:, omega.size :]).reshape(c, count, -1)
-    return np.conj(X).transpose(2, 0, 1) @ X.transpose(2, 1, 0) / count
+    late = np.arange((n + 1) // 2, n)
+    cosines, sines = _turns(late.size, omega * dt, (n + 1) // 2 - 0.5 * n)
+    ones = _folded(np.ones(n))[0]
+    w = window[late, None]
+    C = w * cosines
+    X = (even @ C - means * (ones @ C) - 1j * (odd @ (w * sines))).reshape(c, count, -1)
+    both, rows = [X], sloped * count
+    if sloped:
+        # Of the window itself, a cosine, per second.
+        v = (np.pi / (n * dt) * np.sin(2.0 * np.pi * late / n))[:, None]
+        S = v * sines
+        steep = odd[:rows] @ (v * cosines) - 1j * (even[:rows] @ S - means[:rows] * (ones @ S))
+        both.append(steep.reshape(sloped, count, -1))
+    Y = np.concatenate(both, axis=0)
+    return np.conj(X).transpose(2, 0, 1) @ Y.transpose(2, 1, 0) / count
 
 
-def _turns(n: int, angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 2*k"]:
-    """exp(-i m angle) of m from 0 to n - 1, real parts beside imaginary ones, by products of few
-    sines: so many would take as long as the transform."""
-    coarse = np.outer(_FINE * np.arange(-(-n // _FINE)), angle)[:, None]
+def _folded(
+    segments: Float[np.ndarray, "... n"],
+) -> tuple[
+    Float[np.ndarray, "... half"], Float[np.ndarray, "... half"], Float[np.ndarray, "... 1"]
+]:
+    """Even and odd part of segments about their middle, twice each, and their means.
+
+    A window is even about its middle and its slope odd, so that cosines go with one part and sines
+    with the other: half of the products. Of the first sample neither makes anything.
+    """
+    n = segments.shape[-1]
+    late, early = segments[..., (n + 1) // 2 :], segments[..., n // 2 : 0 : -1]
+    even, odd = late + early, late - early
+    if n % 2 == 0:
+        # The middle itself, once.
+        even[..., 0] *= 0.5
+    return even, odd, ((even.sum(axis=-1) + segments[..., 0]) / n)[..., None]
+
+
+def _turns(
+    count: int, angle: Float[np.ndarray, " k"], first: float
+) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
+    """Cosines and sines of m angle, m from the first on in steps of one, by products of few: so
+    many would take as long as the transform."""
+    coarse = np.outer(first + _FINE * np.arange(-(-count // _FINE)), angle)[:, None]
     fine = np.outer(np.arange(_FINE), angle)[None]
     (c, s), (C, S) = ((np.cos(v), np.sin(v)) for v in (fine, coarse))
-    turns = np.concatenate([C * c - S * s, -(S * c + C * s)], axis=2)
-    return turns.reshape(-1, 2 * angle.shape[0])[:n]
+    k = angle.shape[0]
+    turns = C * c - S * s, S * c + C * s
+    return turns[0].reshape(-1, k)[:count], turns[1].reshape(-1, k)[:count]
 
 
 def _independent(window: np.ndarray, step: int, count: int) -> float:
@@ -226,7 +275,8 @@ def responses(
             taken for ones that do not follow the outputs.
 
     Raises:
-        ValueError: too few averages for so many inputs, or not as many instruments as inputs.
+        TooFewAveragesError: for so many inputs.
+        ValueError: not as many instruments as inputs.
     """
     u, y = list(inputs), list(outputs)
     z = u if instruments is None else list(instruments)
@@ -234,7 +284,7 @@ def responses(
     if len(z) != m:
         raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
     if np.min(n) < m + 1:
-        raise ValueError(
+        raise TooFewAveragesError(
             f"expected at least {m + 1} independent averages for {m} inputs, got "
             f"{np.min(n):.2f}: a longer record, or a shorter window"
         )
@@ -252,10 +302,12 @@ def responses(
     # Each input takes one of the averages for its own response.
     sd = np.sqrt(0.5 * error / (n - m)[:, :, None])
     if instruments is not None:
-        sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m))
+        half95 = student95(2.0 * (n - m))
+        sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m), half95)
         H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
-    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
+    ends = None if spectra.slopes is None else P @ spectra.slopes[:, z][:, :, u]
+    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0], ends)
 
 
 def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from heli_jax.analysis.noise_over_lines import independent_shares, student95
+
 _ROUNDS = 12
 """of Sanathanan and Koerner's iteration; it settles in a handful"""
 _DELAYS = 13
@@ -22,8 +24,6 @@ _SEARCHES = 3
 _AS_LIKELY = 10.8
 """of squared errors over their variance, what one of two optima may be worse by chance (99.9 %, one
 degree of freedom)"""
-_RESOLVED = 1.95
-"""frequencies closer than this over the window's length are not independent (Hann)"""
 _SINGULAR = 1e-10
 """of the largest singular value of the Jacobian: below it a coefficient is not determined"""
 _IMAGES = 50
@@ -31,7 +31,6 @@ _IMAGES = 50
 _FAR = 10.0
 """sd of a coefficient past which nothing is known of it: of its own size, and in the middle of the
 band, where coefficients of the denominator and the delay's phase are of the order of 1"""
-Z95 = 1.959963984540054
 
 
 class Coefficient(NamedTuple):
@@ -119,6 +118,8 @@ class Measured(NamedTuple):
     coherence: np.ndarray
     hold: "Hold | None" = None
     """what the input does between samples; None for a response in continuous time"""
+    freedom: float = np.inf
+    """degrees of freedom of the variances"""
 
 
 class Hold(NamedTuple):
@@ -203,9 +204,7 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
 def _shares(m: Measured) -> np.ndarray:
     """Of each frequency (k,) how much of an independent one it is."""
     sound = np.isfinite(m.H) & np.isfinite(m.sd) & (m.sd > 0)
-    # Half of the way to each neighbour, used or not.
-    width = np.gradient(m.omega) if m.omega.size > 1 else np.ones(1)
-    return np.where(sound, np.minimum(width * m.seconds / (2.0 * np.pi * _RESOLVED), 1.0), 0.0)
+    return np.where(sound, independent_shares(m.omega, m.seconds), 0.0)
 
 
 def _scaled(m: Measured) -> _Scaled:
@@ -350,8 +349,9 @@ def _result(
     size = np.ones(optimum.x.size)
     size[: zeros + 1] = np.max(np.abs(scaled.H))
     sd = np.where(sd > _FAR * np.maximum(np.abs(optimum.x), size), np.inf, sd)
+    half = float(student95(np.asarray(measured.freedom)))
     values = [
-        Coefficient(v, d, v - Z95 * d, v + Z95 * d)
+        Coefficient(v, d, v - half * d, v + half * d)
         for v, d in zip((optimum.x * units).tolist(), (sd * units).tolist(), strict=True)
     ]
     whole = TransferFit(

@@ -45,19 +45,19 @@ def bode_overlay(
     above, below = panels(None, 4.0, [1.2, 1.0])
     if measured is not None:
         dots = {"ls": "", "marker": "o", "ms": 2.6, "mew": 0, "color": style.GREY}
-        above.plot(measured.omega, _decibels(measured), label="measured", **dots)
-        below.plot(measured.omega, phase(measured.H), label="measured", **dots)
+        above.plot(measured.omega / _TURN, _decibels(measured), label="measured", **dots)
+        below.plot(measured.omega / _TURN, phase(measured.H), label="measured", **dots)
     for i, (label, response) in enumerate(curves):
         look = {"color": style.CYCLE[i % len(style.CYCLE)], "lw": 1.2}
-        above.plot(response.omega, _decibels(response), label=label, **look)
-        below.plot(response.omega, phase(response.H), label=label, **look)
+        above.plot(response.omega / _TURN, _decibels(response), label=label, **look)
+        below.plot(response.omega / _TURN, phase(response.H), label=label, **look)
     above.set_xscale("log")
     style.plain_log_ticks(above)
     above.set_title(f"{input} to {output}, {flight}", loc="left")
     above.set_ylabel("magnitude [dB]")
     below.set_ylabel("phase [deg]")
     below.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
-    below.set_xlabel("frequency [rad/s]")
+    below.set_xlabel("frequency [Hz]")
     style.legend_above(above)
     return above.figure  # pyright: ignore[reportReturnType]
 
@@ -81,6 +81,8 @@ def _decibels(response: Empirical) -> np.ndarray:
     return 20.0 * np.log10(np.abs(response.H))
 
 
+_TURN = 2.0 * np.pi
+"""rad/s of 1 Hz"""
 _HUGE = 1e9
 """what no output of a machine reaches"""
 _FEWEST = 3

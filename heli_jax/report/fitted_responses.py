@@ -57,6 +57,8 @@ class FittedPair(NamedTuple):
     coherence: np.ndarray
     model: Point
     """of the machine in continuous time"""
+    half95: float = _Z95
+    """half of a 95 % interval of what was measured, in sd"""
 
 
 NO_RESPONSES = "no responses of the flights, nor handling qualities"
@@ -182,7 +184,8 @@ def _pairs(responses: FlightResponses, curves: _Curves) -> list[FittedPair]:
                 H = without_hold(responses.omega, pair.H, responses.holds[input])
                 sd = pair.sd * np.abs(H / pair.H)
             model = curves.curve(input, name).at(responses.omega)
-            fitted = FittedPair(input, name, responses.omega, H, sd, pair.coherence, model)
+            measured = responses.omega, H, sd, pair.coherence
+            fitted = FittedPair(input, name, *measured, model, pair.half95)
             ranked.append((float(np.sum(mean[used])), fitted))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
 

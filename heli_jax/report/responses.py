@@ -22,6 +22,7 @@ from heli_jax.report.handling_json import handling_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import picture
+from heli_jax.report.responses_netcdf import quotient, write_netcdf
 from heli_jax.report.tables.handling import handling as handling_table
 from heli_jax.report.tables.handling import handling_sentences
 from heli_jax.report.tables.table import Table
@@ -60,7 +61,7 @@ def write_responses(
         png: whether figures are PNG files too.
     """
     write_table(directory / "responses.csv", table(responses))
-    _write_netcdf(directory / "responses.nc", responses, units)
+    write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
     (directory / "transfer_functions.json").write_text(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
@@ -86,7 +87,7 @@ def write_responses(
         fits=Table(
             ("input", "output", "averages", *FIT_HEAD),
             [
-                (w.input, w.output, number(responses.outputs[w.output].averages, 3), *fit_row(fit))
+                (w.input, w.output, _averages(responses, w), *fit_row(fit))
                 for w, fit in responses.fits
             ],
         ),
@@ -102,6 +103,12 @@ def write_responses(
     (directory / "responses.html").write_text(page, encoding="utf-8")
 
 
+def _averages(responses: FlightResponses, request: Wanted) -> str:
+    """Of the response that a transfer function is fitted to, as text."""
+    output = responses.outputs.get(request.output)
+    return "–" if output is None else number(output.averages, 3)
+
+
 def _stem(input: str, output: str) -> str:
     # A model's names are Python's: nothing in them that a file's name may not have.
     return f"{output}-{input}"
@@ -112,7 +119,9 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     curves = [
         (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(responses.omega, responses.holds[input]))
         for w, fit in responses.fits
-        if (w.input, w.output) == (input, output) and fit.determined
+        if (w.input, w.output) == (input, output)
+        and isinstance(fit, TransferFit)
+        and fit.determined
     ]
     by = "by its instrument" if input in responses.instruments else "direct"
     note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
@@ -126,13 +135,6 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
         measured.averages,
         curves,
     )
-
-
-def quotient(output: str, input: str) -> str:
-    """The unit of output over input."""
-    if input == "1":
-        return output
-    return f"{output}/({input})" if "/" in input else f"{output}/{input}"
 
 
 def table(responses: FlightResponses) -> dict[str, Any]:
@@ -154,69 +156,50 @@ def table(responses: FlightResponses) -> dict[str, Any]:
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
                     "multiple_coherence": output.multiple,
+                    "half95_in_sd": np.full(k, pair.half95),
                 }
             for n, v in each.items():
                 numbers.setdefault(n, []).append(v)
     return {**columns, **{n: np.concatenate(v) for n, v in numbers.items()}}
 
 
-def _write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
-    import xarray as xr
+def transfer_status(fit: TransferFit | str) -> str:
+    """In the words of fit.json: converged, not-identifiable or not-converged.
 
-    inputs = list(next(iter(responses.outputs.values())).pairs)
-
-    def stacked(name: str) -> np.ndarray:
-        return np.stack(
-            [[getattr(o.pairs[i], name) for i in inputs] for o in responses.outputs.values()]
-        )
-
-    pairs, each = ("output", "input", "frequency"), ("output", "frequency")
-    H, picture = stacked("H"), stacked("picture")
-    data = xr.Dataset(
-        {
-            # NetCDF 3 has no complex numbers.
-            "real": (pairs, np.real(H)),
-            "imaginary": (pairs, np.imag(H)),
-            "sd": (pairs, stacked("sd"), {"long_name": "of the real and of the imaginary part"}),
-            "coherence": (pairs, stacked("coherence"), {"long_name": "partial coherence"}),
-            "composite_real": (
-                pairs,
-                np.real(picture),
-                {"long_name": "of several windows"},
-            ),
-            "composite_imaginary": (pairs, np.imag(picture)),
-            "multiple_coherence": (
-                each,
-                np.stack([o.multiple for o in responses.outputs.values()]),
-            ),
-            "noise": (
-                each,
-                np.stack([o.noise for o in responses.outputs.values()]),
-                {"long_name": "density of what the inputs leave", "units": "SI^2/Hz"},
-            ),
-        },
-        {
-            "output": list(responses.outputs),
-            "input": inputs,
-            "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
-        },
-        {
-            "window_s": responses.window,
-            "instruments": " ".join(responses.instruments),
-            "units_of_outputs": " ".join(units[n] for n in responses.outputs),
-            "units_of_inputs": " ".join(units[n] for n in inputs),
-        },
-    )
-    data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+    Args:
+        fit: the transfer function, or why there is none.
+    """
+    if isinstance(fit, str):
+        return "not-identifiable"
+    if not fit.converged:
+        return "not-converged"
+    # A search that arrived is no result where a number is not determined.
+    delay = () if fit.delay is None else (fit.delay,)
+    known = all(c.determined for c in (*fit.numerator, *fit.denominator, *delay))
+    return "converged" if known else "not-identifiable"
 
 
-def _content(request: Wanted, fit: TransferFit, window: float) -> dict[str, Any]:
+def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
+    status = transfer_status(fit)
+    if isinstance(fit, str):
+        return {
+            "input": request.input,
+            "output": request.output,
+            "numerator": [{}] * (request.zeros + 1),
+            "denominator": [{"value": 1.0}, *([{}] * request.poles)],
+            "delay_s": {} if request.delay else None,
+            "poles": None,
+            "zeros": None,
+            "chi_squared_per_degree": None,
+            "J": None,
+            "status": status,
+            "converged": False,
+            "determined": False,
+            "windows_taken_off": False,
+            "sentences": fit_sentences(fit, window),
+        }
     poles_known = all(c.determined for c in fit.denominator)
     zeros_known = all(c.determined for c in fit.numerator)
-    delay_known = fit.delay is None or fit.delay.determined
-    # In the words of fit.json: a search that arrived is no result where a number is not determined.
-    status = "converged" if poles_known and zeros_known and delay_known else "not-identifiable"
-    status = status if fit.converged else "not-converged"
     return {
         "input": request.input,
         "output": request.output,
@@ -243,13 +226,15 @@ def _number(c: Coefficient) -> dict[str, float]:
     return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
 
 
-def fit_sentences(fit: TransferFit, window: float) -> list[str]:
+def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     """What is to be heeded of a transfer function.
 
     Args:
-        fit: the transfer function.
+        fit: the transfer function, or why there is none.
         window: [s]
     """
+    if isinstance(fit, str):
+        return [f"not fitted: {fit}"]
     if not fit.determined:
         return ["the response does not determine it: fewer poles, or more excitation, is needed"]
     if not fit.converged:
@@ -284,8 +269,10 @@ def fit_sentences(fit: TransferFit, window: float) -> list[str]:
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
 
 
-def fit_row(fit: TransferFit) -> tuple[str, ...]:
+def fit_row(fit: TransferFit | str) -> tuple[str, ...]:
     """Numerator, denominator, delay with their sd, poles, chi-squared and J, as text."""
+    if isinstance(fit, str):
+        return ("not fitted", *("–" for _ in FIT_HEAD[1:]))
     delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
     return (
         _polynomial(fit.numerator, ""),

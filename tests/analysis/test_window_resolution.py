@@ -5,6 +5,7 @@ import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.transfer_fit import TransferFit
 
 DT, N = 0.02, 3000
 
@@ -24,6 +25,8 @@ def test_a_sweep_in_little_noise_gives_the_transfer_function_that_made_it():
     wanted = Wanted("lat", "phi", zeros=0, poles=2)
     settings = Settings((0.2, 6.0), 15.0, transfer_functions=(wanted,))
     [(_, found)] = flight_responses([flight], settings).fits
+    assert isinstance(found, TransferFit)
+    assert found.delay is not None
     # The order is right, and the windows' own error no sign of another one.
     assert found.chi_squared < 2.0
     truth = (80.0, 3.0, 40.0, 0.0)

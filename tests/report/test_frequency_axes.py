@@ -1,6 +1,7 @@
 """How far the frequency axis of a Bode figure reaches."""
 
 import numpy as np
+import pytest
 
 from heli_jax.analysis.response_curves import Point
 from heli_jax.report.figures.match import match
@@ -27,7 +28,10 @@ def _pair() -> FittedPair:
 def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     pair = _pair()
     axes = match(pair, "dB re rad/s", "")
-    assert axes[0].get_xlim()[1] / (2.0 * np.pi) < 6.0
+    # Both in Hz, as bands are stated.
+    assert axes[0].get_xlim()[1] < 6.0
+    assert axes[0].get_xlim()[0] == pytest.approx(0.1)
+    assert axes[-1].get_xlabel() == "frequency [Hz]"
     measured = type("Measured", (), {**pair._asdict(), "picture": np.full(OMEGA.size, np.nan)})
     figure = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
     assert figure.axes[0].get_xlim()[1] < 6.0

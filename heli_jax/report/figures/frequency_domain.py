@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _CONTINUOUS = "fit, continuous"
 _RLS = "RLS"
+_TURN = 2.0 * np.pi
+"""rad/s of 1 Hz, in which figures have frequencies, as configurations have bands"""
 _NYQUIST = "_nyquist"
 """a label with an underscore before it: matplotlib leaves it out of the legend"""
 
@@ -133,8 +135,8 @@ def _curve(
 ) -> None:
     # A zero of the response has no decibels and no phase.
     good = np.isfinite(H) & (np.abs(H) > 0)
-    axes[0].plot(omega[good], 20 * np.log10(np.abs(H[good])), **line_style)
-    axes[1].plot(omega[good], reference.along(omega[good], H[good]), **line_style)
+    axes[0].plot(omega[good] / _TURN, 20 * np.log10(np.abs(H[good])), **line_style)
+    axes[1].plot(omega[good] / _TURN, reference.along(omega[good], H[good]), **line_style)
 
 
 def _others_move(signals: Signals, input: str) -> bool:
@@ -152,16 +154,20 @@ def _draw_record(
     points: dict[str, Any] = {"ls": "", "marker": "o", "ms": 2.2, "mew": 0, "color": style.BLACK}
     name = "record" if coherent.any() else None
     # Behind the curves: many points would hide a fit that goes through them.
-    axes[0].plot(omega, 20 * np.log10(np.abs(H)), alpha=0.6, label=name, zorder=1.5, **points)
-    axes[1].plot(omega, reference.beside(omega, H), alpha=0.6, label=name, zorder=1.5, **points)
-    line(axes[2], record.omega, record.coherence, color=style.BLACK, lw=0.8)
+    axes[0].plot(
+        omega / _TURN, 20 * np.log10(np.abs(H)), alpha=0.6, label=name, zorder=1.5, **points
+    )
+    axes[1].plot(
+        omega / _TURN, reference.beside(omega, H), alpha=0.6, label=name, zorder=1.5, **points
+    )
+    line(axes[2], record.omega / _TURN, record.coherence, color=style.BLACK, lw=0.8)
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
     axes[2].set_ylabel("coherence")
     # Short: with the operating point before it, the note must fit the figure's width.
     note = f"record: {record.segments} segments, coherence > {COHERENT}"
     if record.lowest:
-        note += f", from {record.lowest:.2g} rad/s"
+        note += f", from {record.lowest / _TURN:.2g} Hz"
     if not coherent.any():
         note = f"no empirical response: coherence stays below {COHERENT}"
     # H = Suy / Suu is that of this input alone only where the others are uncorrelated with it.
@@ -180,16 +186,16 @@ def _finish_bode(
     axes: Panels, nyquist: float, limits: tuple[float, float], unit: str, note: str
 ) -> None:
     for ax in axes:
-        ax.axvline(nyquist, color=style.GREY, lw=0.9, ls="-.", label=_NYQUIST)
+        ax.axvline(nyquist / _TURN, color=style.GREY, lw=0.9, ls="-.", label=_NYQUIST)
     axes[0].set_xscale("log")
-    axes[0].set_xlim(*limits)
+    axes[0].set_xlim(limits[0] / _TURN, limits[1] / _TURN)
     style.plain_log_ticks(axes[0])
     axes[0].set_ylim(*_within(axes[0], 40.0))
     axes[1].set_ylim(*_within(axes[1], 180.0))
     if not isinstance(axes[0], SketchAxes):
         axes[0].annotate(
             "Nyquist ",
-            (nyquist, 0.03),
+            (nyquist / _TURN, 0.03),
             xycoords=("data", "axes fraction"),
             ha="right",
             fontsize=8,
@@ -198,7 +204,7 @@ def _finish_bode(
     axes[0].set_ylabel(f"magnitude [{unit}]")
     axes[1].set_ylabel("phase [deg]")
     style.phase_ticks(axes[1])
-    axes[-1].set_xlabel("frequency [rad/s]")
+    axes[-1].set_xlabel("frequency [Hz]")
     legend_above(axes[0])
     subtitle(axes[0], note, raised=True)
 

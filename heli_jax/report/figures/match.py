@@ -45,21 +45,26 @@ def match(
     modelled = np.isfinite(pair.model.log_gain) & np.isfinite(pair.model.phase)
     _draw_model(axes, pair, modelled)
     _draw_data(axes, pair, known, modelled)
-    axes[2].plot(pair.omega, pair.coherence, color=style.BLACK, lw=0.9)
+    axes[2].plot(_hz(pair), pair.coherence, color=style.BLACK, lw=0.9)
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
     _draw_error(axes[3:], pair, known & modelled)
     axes[0].set_xscale("log")
-    axes[0].set_xlim(pair.omega[0], pair.omega[last_of(pair.omega, pair.coherence, known)])
+    axes[0].set_xlim(_hz(pair)[0], _hz(pair)[last_of(pair.omega, pair.coherence, known)])
     style.plain_log_ticks(axes[0])
     labels = (f"gain [{unit}]", "phase [deg]", "coherence", "error [dB]", "error [deg]")
     for ax, words in zip(axes, labels, strict=True):
         ax.set_ylabel(words)
-    axes[-1].set_xlabel("frequency [rad/s]")
+    axes[-1].set_xlabel("frequency [Hz]")
     axes[0].set_title(f"{pair.input} to {pair.output}: model and data", loc="left")
     legend_above(axes[0])
     subtitle(axes[0], note, raised=True)
     return axes
+
+
+def _hz(pair: FittedPair) -> np.ndarray:
+    # As in the figures of `heli-jax frf`, and as the configuration states bands.
+    return pair.omega / (2.0 * np.pi)
 
 
 def _model_phase(pair: FittedPair) -> np.ndarray:
@@ -68,35 +73,35 @@ def _model_phase(pair: FittedPair) -> np.ndarray:
 
 
 def _draw_model(axes: Panels, pair: FittedPair, good: np.ndarray) -> None:
-    w, model = pair.omega[good], pair.model
+    hz, model = _hz(pair)[good], pair.model
     curves = (
         (axes[0], _DB * model.log_gain, _DB * model.gain_sd),
         (axes[1], _model_phase(pair), np.degrees(model.phase_sd)),
     )
     for ax, value, sd in curves:
-        ax.plot(w, value[good], color=style.BLUE, lw=1.4, label="model")
+        ax.plot(hz, value[good], color=style.BLUE, lw=1.4, label="model")
         reach = _Z95 * np.nan_to_num(sd[good])
         ax.fill_between(
-            w, value[good] - reach, value[good] + reach, color=style.SKY, alpha=0.5, lw=0
+            hz, value[good] - reach, value[good] + reach, color=style.SKY, alpha=0.5, lw=0
         )
 
 
 def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.ndarray) -> None:
-    w, H = pair.omega[known], pair.H[known]
-    relative = _Z95 * pair.sd[known] / np.abs(H)
+    hz, H = _hz(pair)[known], pair.H[known]
+    relative = pair.half95 * pair.sd[known] / np.abs(H)
     gain, angle = _DB * np.log(np.abs(H)), np.degrees(np.angle(H))
     if modelled.all():
         # Beside the model: point by point, since data may have gaps.
         near = _model_phase(pair)[known]
         angle = near + (angle - near + 180.0) % 360.0 - 180.0
-    _bars(axes[0], w, gain, relative, _DATA)
+    _bars(axes[0], hz, gain, relative, _DATA)
     reach = np.degrees(np.minimum(relative, np.pi))
-    axes[1].errorbar(w, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
+    axes[1].errorbar(hz, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
     # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
     # where there is room, and makes none.
     rule = pair.coherence[known] >= COHERENT
     rule = rule if np.count_nonzero(rule) >= _FEW else np.ones_like(rule)
-    if w.size:
+    if hz.size:
         axes[0].set_ylim(np.min(gain[rule]) - 6.0, np.max(gain[rule]) + 6.0)
         axes[1].set_ylim(np.min(angle[rule]) - 45.0, np.max(angle[rule]) + 45.0)
 
@@ -106,29 +111,31 @@ _STYLE: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "c
 
 
 def _bars(
-    ax: "Axes", w: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str = ""
+    ax: "Axes", hz: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str = ""
 ) -> None:
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
     up = 20.0 * np.log10(1.0 + relative)
-    ax.errorbar(w, gain, yerr=[down, up], color=style.BLACK, label=label or None, **_STYLE)
+    ax.errorbar(hz, gain, yerr=[down, up], color=style.BLACK, label=label or None, **_STYLE)
 
 
 def _draw_error(axes: Panels, pair: FittedPair, known: np.ndarray) -> None:
     """Data over model."""
-    w = pair.omega[known]
+    hz = _hz(pair)
     error = pair.H[known] / pair.model.response[known]
     # The errors of both: the data's is of the random error, the model's of its parameters.
-    own = pair.sd[known] / np.abs(pair.H[known])
-    gain_sd = np.hypot(own, np.nan_to_num(pair.model.gain_sd[known]))
-    phase_sd = np.hypot(own, np.nan_to_num(pair.model.phase_sd[known]))
+    own = pair.half95 * pair.sd[known] / np.abs(pair.H[known])
+    gain_reach = np.hypot(own, _Z95 * np.nan_to_num(pair.model.gain_sd[known]))
+    phase_reach = np.hypot(own, _Z95 * np.nan_to_num(pair.model.phase_sd[known]))
     envelope = unnoticeable(pair.omega)
     for ax, (low, high), most in zip(
         axes, (envelope.gain_db, envelope.phase_deg), (_GAINS, _PHASES), strict=True
     ):
-        ax.fill_between(pair.omega, low, high, color=style.PALE, alpha=0.3, lw=0)
+        ax.fill_between(hz, low, high, color=style.PALE, alpha=0.3, lw=0)
         ax.axhline(0.0, color=style.BLUE, lw=1.0)
         ax.set_ylim(-most, most)
-    _bars(axes[0], w, _DB * np.log(np.abs(error)), _Z95 * gain_sd)
-    reach = np.degrees(np.minimum(_Z95 * phase_sd, np.pi))
-    axes[1].errorbar(w, np.degrees(np.angle(error)), yerr=reach, color=style.BLACK, **_STYLE)
+    _bars(axes[0], hz[known], _DB * np.log(np.abs(error)), gain_reach)
+    reach = np.degrees(np.minimum(phase_reach, np.pi))
+    axes[1].errorbar(
+        hz[known], np.degrees(np.angle(error)), yerr=reach, color=style.BLACK, **_STYLE
+    )

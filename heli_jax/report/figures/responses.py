@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax.analysis.response_curves import COHERENT, octave_mean
-from heli_jax.analysis.transfer_fit import Z95
 from heli_jax.report import style
 from heli_jax.report.figures.frequency_axis import SEEN, last_of
 from heli_jax.report.figures.panels import Panels, panels
@@ -39,7 +38,7 @@ def draw_response(
     Args:
         names: of the input and the output.
         omega: (k,) [rad/s]
-        pair: with H, sd, coherence and picture, (k,) each (`flight_responses.Pair`).
+        pair: with H, sd, coherence and picture, (k,) each, and half95 (`flight_responses.Pair`).
         unit: of output over input.
         note: below the title.
         averages: independent ones.
@@ -130,7 +129,7 @@ def _draw_measured(
     axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray, branch: np.ndarray
 ) -> None:
     f, H = hz[known], pair.H[known]
-    relative = Z95 * pair.sd[known] / np.abs(H)
+    relative = pair.half95 * pair.sd[known] / np.abs(H)
     bars: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))

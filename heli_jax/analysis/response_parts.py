@@ -1,0 +1,83 @@
+"""Which parts of flights an output's response is taken from: those without a missing sample."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.parts import spans
+
+type Parts = tuple[tuple[int, int, int], ...]
+"""flight, first sample and the one behind the last of each part"""
+type Names = tuple[list[str], tuple[str, ...]]
+"""of the inputs, and of those with an instrument"""
+
+
+def groups(
+    flights: Sequence[Flight], window: int, without: list[str]
+) -> list[tuple[list[str], Parts]]:
+    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
+    them.
+
+    Args:
+        flights: of one rate.
+        window: samples of one, the least of a part.
+        without: why an output has no part is added to them.
+    """
+    by_parts: dict[Parts, list[str]] = {}
+    order = dict.fromkeys(n for f in flights for n in f.outputs)
+    for name in order:
+        parts = parts_of(flights, name, window)
+        if isinstance(parts, str):
+            without.append(parts)
+        else:
+            by_parts.setdefault(parts, []).append(name)
+    return [(names, parts) for parts, names in by_parts.items()]
+
+
+def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str:
+    """The parts without a missing sample, or in words why there is none.
+
+    Args:
+        flights: of one rate.
+        output: its name.
+        window: samples of one, the least of a part.
+    """
+    parts, longest = [], 0
+    for i, f in enumerate(flights):
+        if output not in f.outputs:
+            continue
+        for first, last in spans([f.outputs[output]]):
+            longest = max(longest, last - first)
+            if last - first >= window:
+                parts.append((i, first, last))
+    if parts:
+        return tuple(parts)
+    return (
+        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
+        f"missing one, got {longest} at most"
+    )
+
+
+def records_of(
+    flights: Sequence[Flight], names: Names, outputs: list[str], parts: Parts
+) -> list[np.ndarray]:
+    """Inputs, instruments and outputs (signals, N) of each part.
+
+    Args:
+        flights: of one rate.
+        names: inputs and instruments.
+        outputs: names.
+        parts: as outputs share them.
+    """
+    inputs, instruments = names
+    return [
+        np.stack(
+            [
+                *(flights[i].inputs[n][first:last] for n in inputs),
+                *(flights[i].instruments[n][first:last] for n in instruments),
+                *(flights[i].outputs[n][first:last] for n in outputs),
+            ]
+        )
+        for i, first, last in parts
+    ]

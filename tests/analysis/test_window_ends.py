@@ -1,0 +1,58 @@
+"""What windows add to responses at the ends of parts between missing samples."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight
+from heli_jax.analysis.flight_responses import Settings, flight_responses
+from heli_jax.analysis.spectral import OVERLAP, cross_spectra
+
+DT, N = 0.02, 6000
+B, A, _ = scipy.signal.cont2discrete(([80.0], [1.0, 5.0, 40.0]), DT)
+
+
+def swept(noise: float, gaps: int) -> Flight:
+    """A sweep of 120 s, with parts of half a second missing."""
+    rng = np.random.default_rng(4)
+    t = DT * np.arange(N)
+    u = scipy.signal.chirp(t, 0.15, t[-1], 6.0, "logarithmic", -90)
+    y = scipy.signal.lfilter(B.ravel(), A, u) + noise * rng.standard_normal(N)
+    for at in (np.arange(gaps) + rng.uniform(0.2, 0.8, gaps)) * N / max(gaps, 1):
+        y[round(at) : round(at) + 25] = np.nan
+    return Flight(dt=DT, inputs={"lat": u}, outputs={"p": y}, hold={"lat": "zero-order"})
+
+
+@pytest.mark.parametrize(("gaps", "noise"), [(0, 0.02), (3, 0.2), (9, 0.2)])
+def test_between_missing_samples_intervals_hold_the_truth(gaps, noise):
+    """With the ends left in a tenth lies outside, of intervals that allow for a fifth of them."""
+    found = flight_responses([swept(noise, gaps)], Settings((0.3, 5.0), 10.0))
+    pair = found.outputs["p"].pairs["lat"]
+    off = pair.H - scipy.signal.freqz(B.ravel(), A, found.omega * DT)[1]
+    assert isinstance(pair.added, np.ndarray)
+    inside, with_ends = (
+        np.abs(np.stack([e.real, e.imag])) < pair.half95 * pair.sd for e in (off, off + pair.added)
+    )
+    assert np.mean(inside) > 0.93
+    assert np.mean(with_ends) < 0.9 or not gaps
+
+
+@pytest.mark.parametrize("n", [99, 100])
+def test_spectra_in_a_window_and_in_its_slope_are_those_of_scipy(n):
+    """Of an even and of an odd number of samples, which are folded about their middle."""
+    rng = np.random.default_rng(0)
+    x, w = 7.0 + rng.standard_normal((2, 500)), np.array([3.0, 7.5])
+    found = cross_spectra([x], DT, w, n * DT, OVERLAP, sloped=1)
+    at = np.arange(n)
+    window = scipy.signal.windows.hann(n, sym=False)
+    slope = np.gradient(scipy.signal.windows.hann(64 * n, sym=False), DT / 64)[::64]
+    starts = range(0, 500 - n + 1, round(n * (1.0 - OVERLAP)))
+    parts = [x[:, s : s + n] - x[:, s : s + n].mean(axis=1, keepdims=True) for s in starts]
+    turns = np.exp(-1j * np.outer(at, w * DT))
+    S = [np.conj((p * window) @ turns) * ((p[:1] * slope) @ turns) for p in parts]
+    density = 2.0 * DT / np.sum(window**2)
+    assert found.slopes is not None
+    expected = density * np.mean(S, axis=0)
+    np.testing.assert_allclose(found.slopes[:, :, 0].T, expected, rtol=2e-3)
+    S = [np.conj((p * window) @ turns) * ((p[1] * window) @ turns) for p in parts]
+    np.testing.assert_allclose(found.S[:, :, 1].T, density * np.mean(S, axis=0), rtol=1e-10)
