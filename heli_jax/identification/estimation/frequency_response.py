@@ -97,7 +97,8 @@ class FrequencyResponse(Estimator):
         """
         if not problem.model.linear:
             return (
-                f"model {problem.model.name} is not linear; expected output-error or filter-error"
+                f"model {problem.model.name} is not linear; expected frequency-error, which "
+                "takes it linear about where it flies, output-error or filter-error"
             )
         refused = absent_instrument(problem)
         if refused is not None:
