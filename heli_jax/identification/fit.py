@@ -345,10 +345,12 @@ def _search(
     # Relaxation ends where its first weights of the outputs lead: tried from others too.
     optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
-    if further is not None and left_stability(problem, search, optimum):
+    # A search that began with a part of the data has not tried where all of them lead.
+    again = [] if quick is noise else [points]
+    if (further is not None or again) and left_stability(problem, search, optimum):
         report(SAID_STABLE)
-        more = further_starts(layout, problem, guess.z, further)
-        optimum = better_of_stable(problem, search, noise, more, optimum)
+        again += [] if further is None else [further_starts(layout, problem, guess.z, further)]
+        optimum = better_of_stable(problem, search, noise, jnp.concatenate(again), optimum)
     if disturbed:
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none

@@ -20,6 +20,9 @@ from heli_jax.numerics.white_noise import noise_guess
 
 _ROUNDS = 8
 """of the optimiser at most"""
+_ROUNDS_OF_SPECTRA = 30
+"""the same where the noise is a spectrum: in slow gusts it settles by a fifth a round, of which
+the later ones are an evaluation or two"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
 _DAMPING = 0.01
@@ -130,7 +133,7 @@ def _alternated(
     """
     layout, estimator = search.layout, search.layout.estimator
     trace: list[tuple[int, float]] = []
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if estimator.nearing is None else _ROUNDS_OF_SPECTRA):
         e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
         change = _changed(noise, new)
@@ -178,8 +181,9 @@ def _next_move(moved: float, earlier: float) -> float:
         moved: how far the last one did.
         earlier: how far the one before it did; inf where that is not known.
     """
-    # Moves get smaller less fast the later they are, by up to this much from one to the next.
-    falls = _SLOWER * moved / earlier if np.isfinite(earlier) else 1.0
+    # Moves get smaller less fast the later they are, by up to this much from one to the next. After
+    # a search that found no step that is not known.
+    falls = _SLOWER * moved / earlier if 0.0 < earlier < np.inf else 1.0
     return moved * min(falls, 1.0)
 
 
