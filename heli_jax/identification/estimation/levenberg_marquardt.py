@@ -189,7 +189,7 @@ def _in_blocks(
     z0: Float[Array, " q"],
     max_steps: int,
     trusted: np.ndarray,
-    count: int,
+    count: np.ndarray | int,
 ) -> _End:
     """A run by `_optimise_in_one_program`; where somebody looks, interrupted now and then to say
     how far it is.
@@ -297,6 +297,17 @@ def optimise(
     return optimum._replace(moved=np.sum((np.asarray(run.J) @ way) ** 2))
 
 
+def counted(data: Data, noise: Noise) -> np.ndarray:
+    """How many measured numbers a cost is the mean over.
+
+    Args:
+        data: the numbers of the problem.
+        noise: which may go by a part of them.
+    """
+    part = 1.0 if isinstance(noise.part, tuple) else float(noise.part)
+    return np.asarray(part * measured_count(data))
+
+
 class _Limits(NamedTuple):
     """Of one run."""
 
@@ -327,7 +338,7 @@ def _run(
         limits: how far it may go.
         known: residuals and Jacobian at z0, where they are at hand.
     """
-    (max_steps, trusted, held, nearing), count = limits, measured_count(data)
+    (max_steps, trusted, held, nearing), count = limits, counted(data, noise)
     if layout.estimator.one_program(layout) and held is None:
         end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
         _, units, state = end.standing

@@ -30,10 +30,13 @@ _DAMPING = 0.01
 _SETTLED = 3e-3
 """squared joint standard deviations by which another noise would move the optimum, below which the
 relaxation of a noise that is a spectrum has ended"""
-_NEARLY = 0.1
+_NEARLY = 0.4
 """the same where a search by more of the data follows"""
 _SLOWER = 3.0
 """times the fall from one such move to the next may the following fall be"""
+_NEAR = 1.0
+"""such a move, above which the fall after it says nothing: what moves fast is then done, and what
+moves slowly is still to come"""
 _EXPLAINED = 2.0
 """times the noise that a record shows by itself up to which its residual is that noise"""
 _WORTH_TELLING = 0.1
@@ -183,7 +186,7 @@ def _next_move(moved: float, earlier: float) -> float:
     """
     # Moves get smaller less fast the later they are, by up to this much from one to the next. After
     # a search that found no step that is not known.
-    falls = _SLOWER * moved / earlier if 0.0 < earlier < np.inf else 1.0
+    falls = _SLOWER * moved / earlier if 0.0 < earlier <= _NEAR else 1.0
     return moved * min(falls, 1.0)
 
 
