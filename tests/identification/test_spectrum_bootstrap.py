@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from heli_jax import Free, Problem, fit, models
+from heli_jax import Free, Problem, fit, models, stages
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
@@ -56,6 +56,23 @@ def test_estimates_scatter_as_their_intervals_say(found):
         values = booted.values[name]
         assert np.std(values, ddof=1) == pytest.approx(one.sd, rel=0.45)
         assert abs(np.mean(values) - one.value) < 0.6 * one.sd
+
+
+def test_the_stage_counts_records_and_no_steps_of_their_searches(found):
+    class Heard:
+        def __init__(self):
+            self.ended = []
+
+        def begin(self, stage):
+            pass
+
+        def end(self, stage):
+            self.ended.append((stage.words, stage.done))
+
+    heard = Heard()
+    with stages.observed_by(heard), stages.stage("bootstrap", total=3):
+        bootstrap(found, 3, seed=2)
+    assert ("bootstrap", 3) in heard.ended
 
 
 def test_responses_are_drawn_of_the_residual_at_all_lines():

@@ -74,7 +74,9 @@ def refits(at: Solution, runs: int, rng: np.random.Generator) -> Refits:
         best = Optimum(
             at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
         )
-        found = relax_noise_covariance(_FromOptimum(layout, other), at.noise, best).best
+        # Steps of its search are none of the stage's, which counts records.
+        with stages.stage("one record", shown=False):
+            found = relax_noise_covariance(_FromOptimum(layout, other), at.noise, best).best
         if bool(found.converged):
             fitted.append(run)
             estimates.append(
