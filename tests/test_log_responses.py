@@ -198,7 +198,7 @@ def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, ca
     text = config.read_text().replace("      instruments: {lat: {signal: sweep}}\n", "")
     config.write_text(text)
     assert main(["frf", str(config), "--out", str(tmp_path / "direct")]) == 0
-    assert "lat: taken for inputs that do not follow the outputs" in capsys.readouterr().err
+    assert "lat: taken for an input that does not follow the outputs" in capsys.readouterr().err
 
 
 def test_half_a_sample_of_delay_that_hangs_on_a_guess_is_said(config, tmp_path, capsys):

@@ -205,15 +205,26 @@ def _frequencies(settings: Settings, window: float, dt: float) -> np.ndarray:
 def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) -> list[str]:
     still = [n for n in flights[0].inputs if n not in inputs]
     notes = [f"{n} does not move: no response to it" for n in still]
+    outputs = dict.fromkeys(n for f in flights for n in f.outputs)
+    resting = [
+        n for n in outputs if not any(_moves(f.outputs[n]) for f in flights if n in f.outputs)
+    ]
+    notes += [f"{n} does not move: no input is seen to move it" for n in resting]
     # The bias has no sign of its own in any of the numbers below: it has to be said.
     without = [n for n in inputs if n not in by]
     if without:
+        taken = "inputs that do not follow" if len(without) > 1 else "an input that does not follow"
         notes.append(
-            f"{', '.join(without)}: taken for inputs that do not follow the outputs; where a pilot "
+            f"{', '.join(without)}: taken for {taken} the outputs; where a pilot "
             "or an autopilot closes a loop the response is biased towards minus one over its gain, "
             "and a logged excitation (signals.instruments) or a fit by filter error is needed"
         )
     return notes
+
+
+def _moves(y: np.ndarray) -> bool:
+    seen = y[np.isfinite(y)]
+    return bool(seen.size) and float(np.ptp(seen)) > 0.0
 
 
 def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: Names) -> Windows:

@@ -328,13 +328,15 @@ def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Findin
             "the start values."
         )
         return [Finding("signs and units", "doubt", words, size, criterion)]
+    others = [n for n in signs if n not in turned]
     return [
         Finding(
             "signs and units",
             "doubt",
             f"{label}: at the start values the simulated {name} moves against the measured one "
-            f"(correlation {c:+.2f}), though {' and '.join(n for n in signs if n not in turned)} "
-            f"does not: {name} has the wrong sign (invert: true) or is another column.",
+            f"(correlation {c:+.2f}), though {' and '.join(others)} "
+            f"{'do' if len(others) > 1 else 'does'} not: {name} has the wrong sign "
+            "(invert: true) or is another column.",
             c,
             criterion,
         )
