@@ -134,6 +134,7 @@ B: {p: {lat: L}}
 """
 
 
+@pytest.mark.slow
 def test_where_a_quarter_leads_to_an_unstable_model_all_lines_are_tried(tmp_path, monkeypatch):
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     (tmp_path / "mode.yaml").write_text(MODE)

@@ -116,8 +116,8 @@ def agree(problem, own):
     )
 
 
-# It compiles longest, and its parts are in other cases: a flight with nuisances in the test below.
-SLOW = ("two flights", "two flights without nuisances")
+# They compile longest, and their parts are in other cases: a flight with nuisances and RK4 below.
+SLOW = ("two flights", "two flights without nuisances", "rk4")
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,9 @@ def test_as_jax_makes_them(case):
     agree(CASES[case](), Own(False, True))
 
 
-@pytest.mark.parametrize("own", [Own(False, False), Own(True, True)])
+@pytest.mark.parametrize(
+    "own", [pytest.param(Own(False, False), marks=pytest.mark.slow), Own(True, True)]
+)
 def test_records_that_are_shared_and_records_of_each_runs_own(own):
     agree(problem(one()), own)
 

@@ -78,7 +78,7 @@ def fitted(seed: int, disturbance: float = 0.0):
 
 # Without the outputs' own factors, four of the first twenty said so; with them 57 of the first 60.
 @pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 8))]
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))]
 )
 def test_white_noise_of_four_outputs_has_no_disturbance(seed):
     found = fitted(seed)
