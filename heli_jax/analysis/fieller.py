@@ -15,9 +15,9 @@ Source: Fieller (1954); Anderson and Rubin (1949) for instruments.
 import numpy as np
 from jaxtyping import Complex, Float
 
+from heli_jax.analysis.noise_over_lines import Z95
 from heli_jax.analysis.response_curves import octave_mean
 
-_Z95 = 1.959963984540054
 _STRONG = 0.25
 """of c S_vv in the mean over an octave, up to which an instrument is strong enough: F of 7.7"""
 
@@ -63,6 +63,6 @@ def sd_of_ratio(
         share = explained / np.maximum(explained + own, 1e-300)
         around = np.stack([octave_mean(omega, v) for v in share.T], axis=1)
         # c S_vv again, with the octave's share of the input that instruments explain.
-        likely = 0.5 * _Z95**2 * spread
+        likely = 0.5 * Z95**2 * spread
         strong = direct | (likely * explained * (1.0 - around) < _STRONG * around)
         return np.where((room > 0) & strong[:, None, :], reach / half95[:, None], np.nan)

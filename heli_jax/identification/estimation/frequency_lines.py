@@ -180,18 +180,18 @@ def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
     )
 
 
-def at_lines(record: Record, v: Float[Array, "N c"]) -> Complex[Array, "K c"]:
+def at_lines(record: Record, v: Float[Array, "f N c"]) -> Complex[Array, "f K c"]:
     """The Fourier transform of a record's part of signals, over the root of its length.
 
     Args:
         record: which samples it is.
-        v: over the whole flight; columns behind delays, so that what acted in a part was logged
+        v: over the whole flights; columns behind delays, so that what acted in a part was logged
             before it.
     """
     # Without a mean: the zero line is not used, and rounding would carry it to the others.
-    part = v[record.first : record.last]
-    part = part - jnp.mean(part, axis=0, keepdims=True)
-    return jnp.fft.rfft(part, axis=0)[1 : 1 + record.lines] * float(record.samples) ** -0.5
+    part = v[:, record.first : record.last]
+    part = part - jnp.mean(part, axis=1, keepdims=True)
+    return jnp.fft.rfft(part, axis=1)[:, 1 : 1 + record.lines] * float(record.samples) ** -0.5
 
 
 def errors_of_some(
@@ -214,11 +214,10 @@ def errors_of_some(
     """
     blocks, f = at.blocks, y.shape[0]
     B, D = (M.T.astype(at.z.dtype) for M in (m.B, m.D))
-    of_flights = jax.vmap(lambda v: at_lines(record, v))
-    lines = Signals(*(of_flights(v) for v in signals))
-    beyond = of_flights(y) - lines.acting @ D
+    lines = Signals(*(at_lines(record, v) for v in signals))
+    beyond = at_lines(record, y) - lines.acting @ D
     # By instrument the states are those of the inputs alone: such a record has no ends.
-    inputs = [lines.U] if by is None else [lines.U, of_flights(by.U)]
+    inputs = [lines.U] if by is None else [lines.U, at_lines(record, by.U)]
     driving = blocks.cut(jnp.concatenate(inputs) @ B, axis=1)
     left = blocks.cut(beyond, axis=1)
 
@@ -302,7 +301,7 @@ def errors_of_lines(
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
 
         def ready(m: Matrices, parts: Any = parts) -> Any:
-            return m, [resolved(m, record, W, part_used(noise)) for record, W in parts]
+            return m, [resolved(m, record, W, jnp.asarray(noise.part_used)) for record, W in parts]
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> list[Array]:
             m, ats = common
@@ -319,12 +318,3 @@ def errors_of_lines(
             errors[i] = [v[k] for v in made]
     assert first is not None
     return [one for i in range(len(data.flights)) for one in errors[i]], first
-
-
-def part_used(noise: Noise) -> Array:
-    """The part of the lines, from the lowest, that a noise says of.
-
-    Args:
-        noise: of frequency error.
-    """
-    return jnp.asarray(1.0 if isinstance(noise.part, tuple) else noise.part)

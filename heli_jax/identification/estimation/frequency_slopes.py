@@ -19,7 +19,6 @@ from heli_jax.identification.estimation.frequency_lines import (
     Resolved,
     at_lines,
     errors_of_some,
-    part_used,
     real,
     resolved,
     stacked,
@@ -135,7 +134,11 @@ def products_of_lines(
 
         def ready(common: Any, parts: Any = parts) -> Any:
             m, dm = common
-            return m, dm, [resolved(m, record, W, part_used(noise)) for record, W in parts]
+            return (
+                m,
+                dm,
+                [resolved(m, record, W, jnp.asarray(noise.part_used)) for record, W in parts],
+            )
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> Products:
             m, dm, ats = common
@@ -174,7 +177,7 @@ def _of_record(
     driven: list[tuple[Any, Signals, Signals]] = [(e.X, e.signals, _lines(record, ds))]
     if instruments is not None:
         by, dby = instruments
-        lines = Signals(*(jax.vmap(lambda v: at_lines(record, v))(v) for v in by))
+        lines = Signals(*(at_lines(record, v) for v in by))
         driven.append((e.X_by, lines, _lines(record, dby)))
     return _summed(at, (m, dm), e, driven, by_instrument)
 
@@ -251,7 +254,7 @@ def _lines(record: Record, ds: Signals) -> Signals:
     """At the lines the derivatives (f, N, c, q) of signals; None where there are none."""
 
     def lines(v: Array) -> Array:
-        flat = jax.vmap(lambda v: at_lines(record, v))(v.reshape(*v.shape[:2], -1))
+        flat = at_lines(record, v.reshape(*v.shape[:2], -1))
         return flat.reshape(*flat.shape[:2], *v.shape[2:])
 
     return jax.tree.map(lines, ds)

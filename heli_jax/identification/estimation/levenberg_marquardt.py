@@ -297,17 +297,6 @@ def optimise(
     return optimum._replace(moved=np.sum((np.asarray(run.J) @ way) ** 2))
 
 
-def counted(data: Data, noise: Noise) -> np.ndarray:
-    """How many measured numbers a cost is the mean over.
-
-    Args:
-        data: the numbers of the problem.
-        noise: which may go by a part of them.
-    """
-    part = 1.0 if isinstance(noise.part, tuple) else float(noise.part)
-    return np.asarray(part * measured_count(data))
-
-
 class _Limits(NamedTuple):
     """Of one run."""
 
@@ -338,7 +327,10 @@ def _run(
         limits: how far it may go.
         known: residuals and Jacobian at z0, where they are at hand.
     """
-    (max_steps, trusted, held, nearing), count = limits, counted(data, noise)
+    (max_steps, trusted, held, nearing), count = (
+        limits,
+        measured_count(data) * np.asarray(noise.part_used),
+    )
     if layout.estimator.one_program(layout) and held is None:
         end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
         _, units, state = end.standing

@@ -1,5 +1,6 @@
 """Bootstrap: records about the estimated machine's response are identified again, many times."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -62,32 +63,22 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
         raise ValueError("bootstrap: not available with a free time shift")
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
+    rng = np.random.default_rng(seed)
+    notes: list[str] = []
     if in_frequency:
         if device is not None and device.platform != "cpu":
             raise ValueError(
                 f"device: refits by method {fit.method} are no program for a GPU, expected none"
             )
-        made = refits(at, runs, np.random.default_rng(seed))
-        return Bootstrap(made.values, runs - len(made.fitted), made.fitted)
-    rng = np.random.default_rng(seed)
-    outputs = _records(fit, at, runs, seed, rng)
-    values = np.array([fit.estimates[n].value for n in at.layout.free])
-    # The means of priors are drawn anew as well: they are measurements too, of another kind.
-    prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
-    means = values + prior_sd * rng.standard_normal((runs, values.size))
-
-    def data(record: tuple[tuple[dict[str, Array], ...], Array]) -> Data:
-        flights = tuple(
-            flight._replace(outputs=outputs)
-            for flight, outputs in zip(at.data.flights, record[0], strict=True)
+        optima = refits(at, _prior_means(fit, at, runs, rng), rng)
+    else:
+        outputs = _records(fit, at, runs, seed, rng)
+        # Every refit from the optimum, which is where the record was simulated.
+        starts = jnp.tile(at.z[None, :], (runs, 1))
+        each = (outputs, jnp.asarray(_prior_means(fit, at, runs, rng), at.z.dtype))
+        optima = optimise_many(
+            at, _data_of(at), starts, each, batch=_BATCH, device=device, say=notes.append
         )
-        return at.data._replace(flights=flights, prior_mean=record[1])
-
-    # Every refit from the optimum, which is where the record was simulated.
-    starts = jnp.tile(at.z[None, :], (runs, 1))
-    each = (outputs, jnp.asarray(means, at.z.dtype))
-    notes: list[str] = []
-    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device, say=notes.append)
     converged = np.asarray(optima.converged)
     # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
     # than they are uncertain.
@@ -97,6 +88,26 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
     }
     fitted = tuple(int(i) for i in np.flatnonzero(converged))
     return Bootstrap(estimates, runs - len(fitted), fitted, " ".join(notes))
+
+
+def _prior_means(fit: Fit, at: Solution, runs: int, rng: np.random.Generator) -> np.ndarray:
+    """(runs, p) means of priors, drawn anew as well: they are measurements too, of another kind."""
+    values = np.array([fit.estimates[n].value for n in at.layout.free])
+    prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
+    return values + prior_sd * rng.standard_normal((runs, values.size))
+
+
+def _data_of(at: Solution) -> Callable[[tuple[tuple[dict[str, Array], ...], Array]], Data]:
+    """The numbers of the problem with a record and the means of priors that were drawn for it."""
+
+    def data(record: tuple[tuple[dict[str, Array], ...], Array]) -> Data:
+        flights = tuple(
+            flight._replace(outputs=outputs)
+            for flight, outputs in zip(at.data.flights, record[0], strict=True)
+        )
+        return at.data._replace(flights=flights, prior_mean=record[1])
+
+    return data
 
 
 def _records(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from heli_jax import naming, stages
 from heli_jax.flights.flight import Flight
@@ -32,7 +32,7 @@ from heli_jax.identification.estimation.frequency_records import (
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, value_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
 _ROUNDS = 3
 """of residual and spectrum in turn, for an estimate by responses, which has no spectrum of lines"""
@@ -41,50 +41,36 @@ _STEPS = 200
 
 
 class Refits(NamedTuple):
-    """Estimates from records that were drawn."""
+    """Where fits of records that were drawn ended."""
 
-    values: dict[str, np.ndarray]
-    """by free parameter, (runs that converged,)"""
-    fitted: tuple[int, ...]
-    """the numbers of those records"""
+    z: Float[np.ndarray, "runs q"]
+    converged: Bool[np.ndarray, " runs"]
 
 
-def refits(at: Solution, runs: int, rng: np.random.Generator) -> Refits:
+def refits(at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator) -> Refits:
     """Fit records again that differ in their noise.
 
     Args:
         at: where a fit in frequency ended.
-        runs: how many records.
+        means: of each record the priors' means of the free parameters.
         rng: what is drawn from.
 
     Raises:
         ValueError: no part of a flight has all outputs.
     """
-    layout, data = at.layout, at.data
-    drawn = _records(at, rng)
-    values = np.array(
-        [value_of(layout, data, i, at.z[i]) for i in range(len(layout.free))], np.float64
+    z, converged = [], []
+    begun = Optimum(
+        at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
     )
-    # The means of priors are drawn anew as well: they are measurements too, of another kind.
-    prior_sd = np.where(np.isfinite(data.prior_sd), data.prior_sd, 0.0)
-    estimates, fitted = [], []
-    for run in range(runs):
-        means = values + prior_sd * rng.standard_normal(values.size)
-        other = next(drawn)._replace(prior_mean=jnp.asarray(means, at.z.dtype))
-        best = Optimum(
-            at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
-        )
+    for mean, data in zip(means, _records(at, rng), strict=False):
+        search = _FromOptimum(at.layout, data._replace(prior_mean=jnp.asarray(mean, at.z.dtype)))
         # Steps of its search are none of the stage's, which counts records.
         with stages.stage("one record", shown=False):
-            found = relax_noise_covariance(_FromOptimum(layout, other), at.noise, best).best
-        if bool(found.converged):
-            fitted.append(run)
-            estimates.append(
-                [float(value_of(layout, data, i, found.z[i])) for i in range(len(layout.free))]
-            )
+            found = relax_noise_covariance(search, at.noise, begun).best
+        z.append(np.asarray(found.z))
+        converged.append(bool(found.converged))
         stages.advance()
-    columns = np.array(estimates).reshape(-1, len(layout.free)).T
-    return Refits(dict(zip(layout.free, columns, strict=True)), tuple(fitted))
+    return Refits(np.array(z), np.array(converged))
 
 
 class _FromOptimum(Search):

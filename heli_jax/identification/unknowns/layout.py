@@ -208,6 +208,11 @@ class Noise(NamedTuple):
     parameters of the mean take up by its logarithm, and that logarithm (2,), see
     `restricted_likelihood`; () where there is none"""
 
+    @property
+    def part_used(self) -> Any:
+        """Of the lines; 1 where a method has none."""
+        return 1.0 if isinstance(self.part, tuple) else self.part
+
 
 class Solution(NamedTuple):
     """Where a fit ended, for what goes on from there."""
