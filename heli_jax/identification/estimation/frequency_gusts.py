@@ -35,6 +35,8 @@ from heli_jax.identification.estimation.frequency_machines import (
 )
 from heli_jax.identification.estimation.frequency_spectrum import (
     averages,
+    inverse_roots,
+    inverses,
     knots_of,
     smoothed,
     whitening_of,
@@ -131,7 +133,7 @@ def _before(
     made = {}
     for K, of in at.items():
         S0 = _spectrum(np.nan_to_num(of.H), q @ shapes_of(of.f, corners), r)
-        root = np.linalg.inv(np.linalg.cholesky(S0))
+        root = inverse_roots(S0)
         _, (low, share) = knots_of(K, *_CELLS)
         made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
     return made
@@ -236,14 +238,11 @@ def powers_of(
     for _ in range(_STEPS):
         # Without the root that would make sure that each step gains: half as many are enough.
         S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
-        inverse = np.linalg.inv(S)
+        inverse = inverses(S)
         # By way what of it the errors show, and what they should.
         matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
         of_ways = matrices.view(float).reshape(c, 2, -1) @ by_way
         shown, due = np.moveaxis((by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p), 1, 0)
-        powers = np.maximum(powers * _part(shown, due), least)
+        part = np.maximum(shown, 0.0) / np.where(due > 0, due, 1.0)
+        powers = np.maximum(powers * part, least)
     return powers[:, :n].T, powers[0, n:]
-
-
-def _part(shown: np.ndarray, due: np.ndarray) -> np.ndarray:
-    return np.maximum(shown, 0.0) / np.where(due > 0, due, 1.0)

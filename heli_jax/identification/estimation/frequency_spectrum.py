@@ -122,8 +122,27 @@ def whitening_of(
     # Records of one length share their spectrum.
     spectra = tuple(spectra)
     made = {id(S): S for S in spectra}
-    made = {key: np.linalg.inv(np.linalg.cholesky(S)) for key, S in made.items()}
+    made = {key: inverse_roots(S) for key, S in made.items()}
     return tuple(made[id(S)] for S in spectra)
+
+
+def inverses(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
+    """S^-1."""
+    # Of one output thousands of numbers, not of matrices.
+    return 1.0 / S if S.shape[1] == 1 else np.linalg.inv(S)
+
+
+def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
+    """L^-1, where S = L L^H.
+
+    Raises:
+        numpy.linalg.LinAlgError: one is not positive definite.
+    """
+    if S.shape[1] > 1:
+        return np.linalg.inv(np.linalg.cholesky(S))
+    if not (np.real(S) > 0).all():
+        raise np.linalg.LinAlgError("a spectrum is not positive")
+    return S**-0.5
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
