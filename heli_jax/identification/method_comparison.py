@@ -8,7 +8,7 @@ from typing import NamedTuple
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Fit
+from heli_jax.identification.result import Estimate, Fit
 
 APART = 2.0
 """joint standard deviations from which on two estimates differ"""
@@ -49,8 +49,29 @@ class MethodComparison(NamedTuple):
 
     results: tuple[MethodResult, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what is compared: the free parameters, and the delay and the gains of inputs that
+        were free beside them."""
+        main = self.results[0].fit
+        if main is None:
+            return ()
+        beside = (n for n in main.nuisance if n == "time_shift" or n.startswith("gain "))
+        return (*main.estimates, *beside)
+
+    def estimate(self, result: MethodResult, name: str) -> Estimate | None:
+        """A method's estimate; None where it has none.
+
+        Args:
+            result: one of the results.
+            name: of a parameter, delay or gain.
+        """
+        if result.fit is None or result.reason:
+            return None
+        return {**result.fit.nuisance, **result.fit.estimates}.get(name)
+
     def difference(self, other: MethodResult, name: str) -> float | None:
-        """A free parameter's estimate less the main method's, in their joint standard deviations.
+        """An estimate less the main method's, in their joint standard deviations.
 
         The two are taken as independent. Both come from the same records, so that they differ by
         less than this where both are right: a difference that it shows is one.
@@ -59,10 +80,9 @@ class MethodComparison(NamedTuple):
             other: one of the results.
             name: of the parameter.
         """
-        first = self.results[0]
-        if first.fit is None or other.fit is None or first.reason or other.reason:
+        a, b = self.estimate(self.results[0], name), self.estimate(other, name)
+        if a is None or b is None:
             return None
-        a, b = first.fit.estimates[name], other.fit.estimates[name]
         if a.sd is None or b.sd is None or a.sd == b.sd == 0.0:
             return None
         return (b.value - a.value) / math.hypot(a.sd, b.sd)
@@ -75,7 +95,7 @@ class MethodComparison(NamedTuple):
         if main.fit is None:
             return tuple(said)
         for other in others:
-            differences = {n: self.difference(other, n) for n in main.fit.estimates}
+            differences = {n: self.difference(other, n) for n in self.names}
             known = {n: d for n, d in differences.items() if d is not None}
             apart = [f"{n} by {abs(d):.1f}" for n, d in known.items() if abs(d) > APART]
             if apart:

@@ -76,6 +76,8 @@ class FittedResponses(NamedTuple):
     about: str
     """where the model was linearised, in words; empty for a linear one"""
     notes: tuple[str, ...]
+    incoherent: tuple[str, ...] = ()
+    """those without a coherence worth showing, as `lat to p`; they have no figure"""
 
 
 def fitted_responses(
@@ -112,7 +114,10 @@ def fitted_responses(
         if p.input in responses.holds and p.output in responses.outputs
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
-    return FittedResponses(tuple(pairs[:MOST_PAIRS]), left_out, handling, at.words, responses.notes)
+    drawn = tuple(pairs[:MOST_PAIRS])
+    return FittedResponses(
+        drawn, left_out, handling, at.words, responses.notes, _incoherent(responses)
+    )
 
 
 class _Curves(NamedTuple):
@@ -188,6 +193,15 @@ def _pairs(responses: FlightResponses, curves: _Curves) -> list[FittedPair]:
             fitted = FittedPair(input, name, *measured, model, pair.half95)
             ranked.append((float(np.sum(mean[used])), fitted))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
+
+
+def _incoherent(responses: FlightResponses) -> tuple[str, ...]:
+    return tuple(
+        f"{input} to {name}"
+        for name, output in responses.outputs.items()
+        for input, pair in output.pairs.items()
+        if not (octave_mean(responses.omega, pair.coherence) >= COHERENT).any()
+    )
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:

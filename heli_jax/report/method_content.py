@@ -28,7 +28,8 @@ def methods_content(comparison: MethodComparison | None) -> dict[str, Any] | Non
         return None
     results = {}
     for r in comparison.results:
-        estimates = {} if r.fit is None or r.reason else r.fit.estimates
+        found = {n: comparison.estimate(r, n) for n in comparison.names}
+        estimates = {n: e for n, e in found.items() if e is not None}
         results[r.method] = {
             "status": "refused" if r.fit is None else r.fit.status,
             "verdict": r.word,

@@ -15,7 +15,7 @@ from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.analysis.window_resolution import forgets
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
-from heli_jax.numbers import number
+from heli_jax.numbers import number, with_sd
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.responses import branch_of, draw_response, seen_of
 from heli_jax.report.handling_json import handling_json
@@ -314,7 +314,7 @@ def _power(n: int) -> str:
 def _measured(c: Coefficient, factor: float = 1.0) -> str:
     if not c.determined:
         return "not determined"
-    return f"{number(c.value * factor, 4)} ± {number(c.sd * factor, 2)}"
+    return with_sd(c.value * factor, c.sd * factor)
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:

@@ -314,6 +314,18 @@ def test_methods_are_laid_side_by_side(by):
     away = results[1]._replace(fit=dataclasses.replace(other, estimates=moved))
     assert "differ in If by 5.0 joint" in MethodComparison((results[0], away)).sentences[0]
     assert _why_none(stuck) == "The optimiser stopped."
+    # A delay that was free beside them is compared too.
+    late = [
+        r._replace(fit=dataclasses.replace(r.fit, nuisance={**r.fit.nuisance, "time_shift": delay}))
+        for r, delay in zip(
+            results[:2], (a._replace(value=0.03, sd=3e-4), a._replace(value=0.031, sd=4e-4)),
+            strict=True,
+        )
+    ]  # fmt: skip
+    compared = MethodComparison(tuple(late))
+    assert compared.difference(late[1], "time_shift") == pytest.approx(2.0)
+    assert [row[0] for row in methods(compared).rows][3:] == ["time_shift", "verdict", "time"]
+    assert "time_shift" in methods_content(compared)["results"]["frequency-error"]["parameters"]
 
 
 def hardening(p, s, u):

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from heli_jax import Nuisance, check, fit
+from heli_jax import Flight, Nuisance, check, fit
+from heli_jax.identification.validation.other_hold import _taken
 
 
 @pytest.fixture(scope="module")
@@ -108,3 +109,23 @@ def test_an_input_that_is_seen_directly(held_inputs):
     model = replace(roll, output=output, Outputs=Seen)
     problem = held_inputs.late_problem(held_inputs.late_record(0, "linear"))
     assert told(words(check(replace(problem, model=model)).notes)[0], "time_shift") < -10
+
+
+def test_an_input_of_several_flights_is_named_once():
+    """Each hold with the first flight's reason."""
+    shares = ((90, 100), (100, 90), (100, 100))
+    flights = tuple(
+        Flight(
+            dt=0.01,
+            inputs={"lat": np.zeros(9), "lon": np.zeros(9)},
+            outputs={"p": np.zeros(9)},
+            hold={"lat": "linear", "lon": "linear" if i < 2 else "zero-order"},
+            hold_reason={"lat": f"moves at {a} %", "lon": f"moves at {b} %"},
+        )
+        for i, (a, b) in enumerate(shares)
+    )
+    assert _taken(flights, [{"lat", "lon"}] * 3) == [
+        "lat is taken as linear (it moves at 90 %)",
+        "lon is taken as linear (it moves at 100 %)",
+        "lon is taken as zero-order (it moves at 100 %)",
+    ]

@@ -86,6 +86,15 @@ def _with_noise(pair):
     return pair._replace(H=H, coherence=coherence, sd=sd)
 
 
+def test_responses_without_a_figure_are_named(sound, shown):
+    fit, problem, baseline = sound
+    assert shown.incoherent == ()
+    lacking = shown._replace(incoherent=("lon to p", "ped to p"))
+    analysis = Analysis(fit, problem, baseline, SupplementaryAnalyses(responses=lacking))
+    words = "No figure: lon to p, ped to p, whose coherence stays below 0.6"
+    assert words in render(analysis, "title", {}, [])
+
+
 def test_flights_that_are_too_short_say_so(sound):
     fit, problem, _ = sound
     told = fitted_responses(fit, problem, Settings(window=100.0), ())

@@ -2,8 +2,10 @@
 
 import pytest
 
+from heli_jax.analysis.handling_qualities import Number
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
-from heli_jax.report.responses import fit_sentences
+from heli_jax.report.responses import fit_row, fit_sentences
+from heli_jax.report.tables.handling import _shown
 
 WINDOW = 20.0
 
@@ -31,3 +33,13 @@ def test_what_is_to_be_heeded_of_a_transfer_function(fit: TransferFit, words: li
     assert bool(said) == bool(words)
     assert all(w in said for w in words)
     assert ("integrator" in said) == ("integrator" in words)
+
+
+def test_numbers_have_the_digits_that_their_deviation_leaves() -> None:
+    """As all tables of the package have them."""
+    delay = Coefficient(0.0341197, 0.00109, 0.0319, 0.0363)
+    row = fit_row(_fit(2.0)._replace(delay=delay))
+    assert row[0] == "(10.00 ± 0.10)"
+    assert row[3] == "34.1 ± 1.1"
+    phase_delay = Number(0.065356, 0.0009, 0.06360, 0.06712)
+    assert _shown(phase_delay, 1e3) == "65.36 (63.60 to 67.12)"

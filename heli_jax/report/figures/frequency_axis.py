@@ -4,7 +4,7 @@ import numpy as np
 
 from heli_jax.analysis.response_curves import octave_mean
 
-SEEN, _BEYOND_CHANCE = 0.1, 0.3
+SEEN, BEYOND_CHANCE = 0.1, 0.3
 """mean coherence over an octave: below the first it is chance, the second is hardly made by it, of
 three or four averages either, and up to the last such bin frequencies are drawn"""
 
@@ -20,7 +20,7 @@ def last_of(omega: np.ndarray, coherence: np.ndarray, known: np.ndarray) -> int:
         known: (k,) bool, bins that are drawn where there is room.
     """
     mean = octave_mean(omega, coherence)
-    for bins in (known & (mean >= _BEYOND_CHANCE), known & (mean >= SEEN), known):
+    for bins in (known & (mean >= BEYOND_CHANCE), known & (mean >= SEEN), known):
         if bins.any():
             return int(np.flatnonzero(bins)[-1])
     return omega.size - 1

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax.analysis.mismatch import unnoticeable
-from heli_jax.analysis.response_curves import COHERENT
+from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.report import style
-from heli_jax.report.figures.frequency_axis import last_of
+from heli_jax.report.figures.frequency_axis import BEYOND_CHANCE, last_of
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import phase
@@ -98,8 +98,10 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
     reach = np.degrees(np.minimum(relative, np.pi))
     axes[1].errorbar(hz, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
     # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
-    # where there is room, and makes none.
-    rule = pair.coherence[known] >= COHERENT
+    # where there is room, and makes none. In gusts a response has a coherence of 0.3 to 0.6, and
+    # intervals that are read: such bins have to be within the axes.
+    mean = octave_mean(pair.omega, pair.coherence)
+    rule = (np.minimum(pair.coherence, mean) >= BEYOND_CHANCE)[known]
     rule = rule if np.count_nonzero(rule) >= _FEW else np.ones_like(rule)
     if hz.size:
         axes[0].set_ylim(np.min(gain[rule]) - 6.0, np.max(gain[rule]) + 6.0)

@@ -78,15 +78,15 @@ def responses(fit: Fit) -> Table | None:
             f"{number(p.low, 2)} to {number(p.high, 2)}",
             f"{p.lines}/{p.of}",
             number(p.coherence, 2),
-            number(p.chi_squared, 2),
+            number(p.chi_squared, 3),
             number(p.J, 3) if math.isfinite(p.J) else NOTHING,
             "in windows" if p.simulated else "in windows, ends free",
         )
         for p in agreement.pairs
         if p.lines
     ]
-    between = f"{number(agreement.lower95, 2)} to {number(agreement.upper95, 2)}"
-    rows.append(("all together", "", "", "", number(agreement.chi_squared, 2), "", ""))
+    between = f"{number(agreement.lower95, 3)} to {number(agreement.upper95, 3)}"
+    rows.append(("all together", "", "", "", number(agreement.chi_squared, 3), "", ""))
     rows.append(("expected", "", "", "", between, "", ""))
     return Table(head, rows)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
-from heli_jax.numbers import number
+from heli_jax.numbers import measured, number
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
 
 _WORDS = {
@@ -60,7 +60,9 @@ def _unit(name: str) -> tuple[str, float]:
 
 
 def _shown(n: Number, times: float) -> str:
-    value, low, high = (number(times * v, 3) for v in (n.value, n.lower95, n.upper95))
+    value, low, high, _ = measured(
+        times * n.sd, *(times * v for v in (n.value, n.lower95, n.upper95))
+    )
     return f"{value} ({low} to {high})"
 
 

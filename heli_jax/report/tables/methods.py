@@ -12,7 +12,7 @@ def methods(comparison: MethodComparison) -> Table:
     head = ["", main.label]
     for other in others:
         head += [other.label, "difference [joint sd]"]
-    rows = [_row(comparison, name) for name in main.fit.estimates]
+    rows = [_row(comparison, name) for name in comparison.names]
     verdicts, times = ["verdict", main.word], ["time", _seconds(main)]
     for other in others:
         verdicts += [other.word, ""]
@@ -22,18 +22,21 @@ def methods(comparison: MethodComparison) -> Table:
 
 def _row(comparison: MethodComparison, name: str) -> tuple[str, ...]:
     main, *others = comparison.results
-    cells = [name, _cell(main, name)]
+    cells = [name, _cell(comparison, main, name)]
     for other in others:
         d = comparison.difference(other, name)
-        cells += [_cell(other, name), NOTHING if d is None else f"{d:+.1f}".replace("-", "−")]
+        cells += [
+            _cell(comparison, other, name),
+            NOTHING if d is None else f"{d:+.1f}".replace("-", "−"),
+        ]
     return tuple(cells)
 
 
-def _cell(result: MethodResult, name: str) -> str:
+def _cell(comparison: MethodComparison, result: MethodResult, name: str) -> str:
     """`0.02403 (0.02395 to 0.02411)`"""
-    if result.fit is None or result.reason:
+    e = comparison.estimate(result, name)
+    if e is None:
         return NOTHING
-    e = result.fit.estimates[name]
     if e.sd is None:
         return NOT_DETERMINED
     value, low, high, _ = measured(e.sd, e.value, e.lower95, e.upper95)
