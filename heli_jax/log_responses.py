@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +79,8 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         flights: of one rate.
         inputs: by name.
     """
-    notes = []
+    notes: list[str] = []
+    guessed: dict[str, str] = {}
     for name in inputs:
         holds = [f.hold[name] for f in flights]
         if len(set(holds)) > 1:
@@ -93,13 +94,35 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
             # be no other than linear.
             if is_low_passed(reason):
                 continue
-            notes.append(
-                f"{name}: {_HOLDS['linear']} between samples, as it {reason}, which is a guess; if "
-                "it is a command that is held from sample to sample, delays and phase delays are "
-                f"half a sample, {500.0 * flights[0].dt:.3g} ms, shorter and bandwidths higher: "
-                f"state signals.inputs.{name}.hold"
-            )
-    return notes
+            guessed[name] = reason
+    return [*notes, *_straight_lines(guessed, 500.0 * flights[0].dt)]
+
+
+def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
+    """In one sentence that inputs were taken to move in straight lines, which is a guess.
+
+    Args:
+        guessed: by input the reason.
+        half: a sample's half [ms].
+    """
+    if not guessed:
+        return []
+    names, reasons = list(guessed), set(guessed.values())
+    several = len(names) > 1
+    reason = reasons.pop() if len(reasons) == 1 else ""
+    # Reasons are of one input each: `moves at 100 % of the samples`.
+    why = (
+        f"as {'each' if several else 'it'} {reason}"
+        if reason
+        else "as " + "; ".join(f"{n} {r}" for n, r in guessed.items())
+    )
+    whose = "NAME" if several else names[0]
+    return [
+        f"{', '.join(names)}: {_HOLDS['linear']} between samples, {why}, which is a guess; if "
+        f"{'one' if several else 'it'} is a command that is held from sample to sample, "
+        f"{'its ' if several else ''}delays and phase delays are half a sample, {half:.3g} ms, "
+        f"shorter and bandwidths higher: state signals.inputs.{whose}.hold"
+    ]
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[str, ...]:

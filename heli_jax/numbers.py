@@ -31,6 +31,12 @@ def number(value: float | None, digits: int = 4) -> str:
     return _signed(text) + _times(power)
 
 
+def p_value(p: float) -> str:
+    """A chance of something, without digits where it is none to speak of."""
+    # The tail of a distribution is known to no such digits, and 0 is a number that underflowed.
+    return f"{p:.2g}" if p >= 1e-6 else "below 1e-6"
+
+
 def percent(value: float | None, digits: int = 2) -> str:
     """A share (1 is 100 %) as a percentage."""
     if value is None or not math.isfinite(value):

@@ -21,3 +21,19 @@ def test_what_a_log_decided_of_an_input_between_samples_is_said_with_what_hangs_
     assert not between_samples([_flight("zero-order", {"lat": "jumps once and stays"})], ["lat"])
     (note,) = between_samples([decided, _flight("zero-order", {})], ["lat"])
     assert "all are taken as the first" in note
+
+
+def test_several_inputs_that_were_guessed_are_told_of_in_one_sentence() -> None:
+    flight = _flight("linear", {"lat": "moves at 100 % of the samples"})
+    lat = flight.inputs["lat"]
+    both = Flight(
+        0.02,
+        {"lat": lat, "lon": lat},
+        {"p": lat},
+        hold={"lat": "linear", "lon": "linear"},
+        hold_reason=dict.fromkeys(("lat", "lon"), "moves at 100 % of the samples"),
+    )
+    (note,) = between_samples([both], ["lat", "lon"])
+    assert note.startswith("lat, lon: taken to move in straight lines")
+    assert "as each moves at 100 % of the samples" in note
+    assert "signals.inputs.NAME.hold" in note

@@ -118,3 +118,7 @@ def test_exponents_within_a_sentence_are_written_by_the_same_rule(python, page, 
 def test_what_is_rounded_up_to_a_power_has_that_power():
     assert numbers.number(0.00099996, 3) == "0.001"
     assert numbers.number(99999.7, 3) == "1·10⁵"
+
+
+def test_a_chance_has_no_digits_where_it_is_none_to_speak_of():
+    assert [numbers.p_value(p) for p in (0.0, 1e-200, 0.0123)] == ["below 1e-6"] * 2 + ["0.012"]

@@ -187,6 +187,13 @@ def _frequencies(settings: Settings, window: float, dt: float) -> np.ndarray:
     # Fewer than two periods in a window are not told from its own shape.
     low, high = settings.band or (2.0 / window, _HIGHEST / dt)
     if not low < high:
+        if settings.window is None and settings.band is None:
+            least = 2.0 * dt / _HIGHEST
+            raise ValueError(
+                f"the longest flight is {5.0 * window:.3g} s, too short for responses at "
+                f"{1.0 / dt:.4g} Hz; expected more than {5.0 * least:.3g} s, five windows of "
+                "two periods at the highest frequency"
+            )
         raise ValueError(
             f"window: expected one of more than {2.0 * dt / _HIGHEST:.3g} s, got {window:g} s"
         )

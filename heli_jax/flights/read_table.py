@@ -372,4 +372,6 @@ def _check_rate(stamps: _Stamps, rate: float) -> None:
     # The product can overflow where the rate alone is finite.
     if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
-        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")
+        # A thousandth of such a step is one of a flight.
+        unit = "; is its time in ms (time.unit)?" if 1.0 <= usual <= 1e3 else ""
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much{unit}")

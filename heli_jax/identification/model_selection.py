@@ -15,6 +15,7 @@ from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.result import Fit, Status
+from heli_jax.numbers import p_value
 
 
 class Candidate(NamedTuple):
@@ -343,12 +344,8 @@ def _sentences(ranked: tuple[Candidate, ...], tests: list[Nested]) -> list[str]:
         sentences.append(f"Did not converge, so not compared: {', '.join(failed)}.")
     sentences += [
         f"{t.small} within {t.large}: twice the log-likelihood gained is {t.ratio:.3g} for "
-        f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {_shown(t.p_value)})."
+        f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {p_value(t.p_value)})."
         for t in tests
         if not {t.small, t.large} & set(failed)
     ]
     return sentences
-
-
-def _shown(p: float) -> str:
-    return f"{p:.2g}" if p >= 1e-6 else "below 1e-6"

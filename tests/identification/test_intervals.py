@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 
 from heli_jax import Free, Prior, Problem, fit, models
-from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.identification.uncertainty.profile_likelihood import profile
@@ -115,3 +115,11 @@ def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
     assert found.bootstrap is None
     with pytest.raises(ValueError, match="bootstrap: the data do not determine If"):
         bootstrap(poor, 5)
+
+
+def test_what_a_bootstrap_estimates_without_an_interval_is_named(white):
+    shifted = dataclasses.replace(white, nuisance={"time_shift": white.estimates["Ixx"]})
+    booted = Bootstrap({n: np.zeros(2) for n in white.estimates}, 0, (0, 1))
+    assert _sentences(white, {}, booted, None) == []
+    [said] = _sentences(shifted, {}, booted, None)
+    assert "without an interval of it here: time_shift" in said

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
+from heli_jax.identification.estimation.noise_covariance import (
+    RelaxedOptimum,
+    relax_noise_covariance,
+)
 from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.unknowns.layout import Noise
 
@@ -40,13 +43,17 @@ class Slowly:
         return [Optimum(z, jnp.ones(()), np.asarray(1), np.asarray(True), moved)]
 
 
-def relaxed(estimator: Slowly, part: float) -> float:
+def optimum_of(estimator: Slowly, part: float) -> RelaxedOptimum:
     search: Any = SimpleNamespace(
         layout=SimpleNamespace(estimator=estimator), data=None, problem=None, run=estimator.run
     )
     noise = Noise(({"p": np.ones(())},), np.zeros(()), part=part)
     begun = Optimum(jnp.zeros(1), jnp.ones(()), np.asarray(1), np.asarray(True))
-    return float(relax_noise_covariance(search, noise, begun).best.z[0])
+    return relax_noise_covariance(search, noise, begun)
+
+
+def relaxed(estimator: Slowly, part: float) -> float:
+    return float(optimum_of(estimator, part).best.z[0])
 
 
 def test_a_spectrum_that_settles_slowly_is_relaxed_until_it_has():
@@ -64,3 +71,10 @@ def test_a_large_move_does_not_say_how_small_ones_fall():
     # What is fast is done at once, and what is slow goes on as it would have alone.
     slow = [0.2 * 0.8**k for k in range(100)]
     assert relaxed(Slowly([2.5, *slow]), 1.0) == pytest.approx(3.5, abs=0.3)
+
+
+def test_rounds_that_run_out_before_a_spectrum_settles_are_said():
+    (note,) = optimum_of(Slowly([0.95**k for k in range(100)]), 1.0).notes
+    assert "had not settled after 30 rounds" in note
+    assert "by 0.23 joint standard deviations" in note
+    assert optimum_of(Slowly([0.8**k for k in range(100)]), 1.0).notes == ()

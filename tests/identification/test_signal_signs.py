@@ -279,3 +279,38 @@ def test_a_delay_that_the_model_has_is_not_said():
     known = with_filters(SWING, {"phi": ()}, {"phi": 0.1})
     assert late_said(phi, p)
     assert late_said(phi, p, known) == []
+
+
+def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):
+    """A rate in gusts, held by a pilot late by 0.1 s and perhaps swept too; and what its stick
+    alone makes of a right model."""
+    rng = np.random.default_rng(seed)
+    u, p, answer = np.zeros(N), np.zeros(N), np.zeros(N)
+    gust = scipy.signal.lfilter([1.0], [1.0, -0.98], 0.1 * rng.standard_normal(N))
+    chirp = scipy.signal.chirp(np.arange(N) * DT, 0.3, N * DT, 2.0)
+    for k in range(N - 1):
+        u[k] = swept * chirp[k] - held_by * p[max(k - 5, 0)]
+        p[k + 1] = p[k] + DT * (-2.0 * p[k] + 8.0 * u[k] + 4.0 * gust[k])
+        answer[k + 1] = answer[k] + DT * (-2.0 * answer[k] + 8.0 * u[k])
+    return Flight(dt=DT, inputs={"u": u}, outputs={"p": sign * p}), {"p": answer}
+
+
+def test_a_stick_that_holds_in_one_flight_and_sweeps_in_another_has_the_right_sign():
+    held, swept = swept_and_held(), swept_and_held(1, swept=1.0)
+    [finding] = against_start([("held", held[0])], [held[1]])
+    # Alone it may be either, and that is said.
+    assert finding.value < -0.3
+    assert "not swept in this flight and holds p against gusts" in finding.sentence
+    flights = [("held", held[0]), ("swept", swept[0])]
+    assert against_start(flights, [held[1], swept[1]]) == []
+    # A column that is turned is found in the flight that sweeps it, in one log as in both.
+    for sign in (1.0, -1.0):
+        turned = swept_and_held(1, swept=1.0, sign=-1.0)
+        other = swept_and_held(sign=sign)
+        flights = [("held", other[0]), ("swept", turned[0])]
+        findings = against_start(flights, [other[1], turned[1]])
+        assert any(f.sentence.startswith("swept: ") for f in findings)
+    # Of two flights that sweep alike the one that is turned is found.
+    flights = [("turned", turned[0]), ("swept", swept[0])]
+    [finding] = against_start(flights, [turned[1], swept[1]])
+    assert finding.sentence.startswith("turned: ")

@@ -118,8 +118,21 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # From here on by all of the data: what a part of them said is no verdict.
         best = best._replace(moved=np.asarray(np.inf), converged=np.asarray(True))
     best, noise, rounds = _alternated(search, noise, best, earlier)
+    notes = _not_settled(best, len(rounds))
     best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
-    return RelaxedOptimum(best, noise, (*trace, *rounds))
+    return RelaxedOptimum(best, noise, (*trace, *rounds), notes=notes)
+
+
+def _not_settled(best: Optimum, rounds: int) -> tuple[str, ...]:
+    """In words that a spectrum still moved the optimum in the last of all its rounds."""
+    moved = float(best.moved)
+    if rounds < _ROUNDS_OF_SPECTRA or not bool(best.converged) or not _SETTLED <= moved < np.inf:
+        return ()
+    return (
+        f"The noise's spectrum had not settled after {rounds} rounds, which are all there are: the "
+        f"last one moved the estimates by {moved**0.5:.2g} joint standard deviations, and further "
+        "ones may move them on, by several times as much together.",
+    )
 
 
 def _alternated(

@@ -144,6 +144,12 @@ def _sentences(
             f"{booted.failures} of the bootstrap's records could not be fitted and are left out: "
             "its intervals are too narrow by what those would have said."
         )
+    beside = [n for n in fit.nuisance if n == "time_shift" or n.startswith("gain ")]
+    if beside and booted is not None:
+        sentences.append(
+            f"Estimated in each record of the bootstrap too, without an interval of it here: "
+            f"{', '.join(beside)}. The Gaussian one stands beside the parameters' estimates."
+        )
     # The numbers with their limits: a reader can see whether a few more draws will do.
     if posterior is not None and not posterior.trusted:
         sentences.append(

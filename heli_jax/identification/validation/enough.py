@@ -33,6 +33,7 @@ from heli_jax.identification.validation.signal_signs import (
 )
 from heli_jax.identification.validation.smoothed import smoothed
 from heli_jax.identification.validation.turned_sensors import turned_sensors
+from heli_jax.numbers import p_value
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -116,7 +117,7 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
         return [*doubts, *aside]
     words = (
         "no input follows what is unforeseen of the response (p-value "
-        f"{least.p_value:.2g} for {least.input})."
+        f"{p_value(least.p_value)} for {least.input})."
     )
     # The loop is closed, and nothing is to be doubted of inputs that are taken by an instrument.
     if least.present:
@@ -124,7 +125,7 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
         follow = "follows" if len(closed) == 1 else "follow"
         words = (
             f"{', '.join(closed)} {follow} what is unforeseen of the response (p-value "
-            f"{least.p_value:.2g} for {least.input}): the loop is closed, which the logged "
+            f"{p_value(least.p_value)} for {least.input}): the loop is closed, which the logged "
             "excitation (instrument) allows for."
         )
     return [Finding("feedback", "ok", words, least.p_value, criterion), *aside]

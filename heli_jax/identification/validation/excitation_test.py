@@ -26,6 +26,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import p_value
 
 WRONG_OPTIMUM = (
     "An unstable model whose residual follows the inputs is a wrong optimum, or feedback made it: "
@@ -61,7 +62,7 @@ def _in_words(followed: Followed) -> str:
     part = f"{100 * followed.explained:.0f} % explained"
     # No share of anything: with no model at all less would be left.
     part = part if followed.explained >= 0.0 else "the model is worse there than none"
-    return f"p {followed.p_value:.2g}, {part}"
+    return f"p {p_value(followed.p_value)}, {part}"
 
 
 def by_excitation(
@@ -122,7 +123,7 @@ def unless_unrelated(problem: Problem, adequacy: Adequacy) -> Adequacy:
     if not p_values or min(p_values.values()) < LEVEL / len(p_values):
         return adequacy
     what = "excitation" if instruments_of(problem) else "inputs"
-    numbers = ", ".join(f"{n} (p {p:.2g})" for n, p in p_values.items())
+    numbers = ", ".join(f"{n} (p {p_value(p)})" for n, p in p_values.items())
     return Adequacy(
         False,
         False,

@@ -5,6 +5,7 @@ as much. And with start values of the right signs the simulated outputs move wit
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -48,6 +49,8 @@ _LAG = 0.25
 """[s] to either side: later, a swing of the right sign looks like one of the wrong sign"""
 _LARGER = 1.3
 """by how much the correlation of the wrong sign exceeds any of the right one"""
+_MORE = 1.3
+"""times as far an output is simulated to move in a flight that says more of it"""
 
 
 def rate_against_angle(problem: Problem) -> list[Finding]:
@@ -280,18 +283,19 @@ def against_start(
     """A doubt for outputs that move against those simulated at the start values: for all that a
     stick moves together, or for one of them that others do not go with.
 
+    A stick that only holds an output against gusts moves against it by feedback alone. So what
+    another flight shows, in which it moves the output further and the right way, goes before it.
+
     Args:
         flights: by what each is called.
         simulated: by flight and output (N,), SI.
         sticks: by output the input that moves it, of `sticks_of`; without it any of them may.
     """
     findings = []
-    for (label, flight), run in zip(flights, simulated, strict=True):
-        signs = {
-            name: c
-            for name, measured in flight.outputs.items()
-            if (c := _surely(measured, run[name], flight.dt)) is not None
-        }
+    by_flight = [_signs(f, run) for (_, f), run in zip(flights, simulated, strict=True)]
+    for (label, flight), of_flight in zip(flights, by_flight, strict=True):
+        counting = {n: s for n, s in of_flight.items() if _counts(n, s, by_flight)}
+        signs = {n: s.correlation for n, s in counting.items()}
         groups: dict[str, dict[str, float]] = {}
         for name, c in signs.items():
             stick = (sticks or {}).get(name, " or ".join(flight.inputs))
@@ -312,6 +316,31 @@ def sticks_of(model: Model) -> dict[str, str]:
     return sticks
 
 
+class _Sign(NamedTuple):
+    """How an output goes with the simulated one in a flight, where that is sure."""
+
+    correlation: float
+    size: float
+    """standard deviation of the simulated one, SI"""
+
+
+def _signs(flight: Flight, run: Mapping[str, np.ndarray]) -> dict[str, _Sign]:
+    """By output of a flight, those that are sure."""
+    return {
+        name: _Sign(c, float(np.std(run[name])))
+        for name, measured in flight.outputs.items()
+        if (c := _surely(measured, run[name], flight.dt)) is not None
+    }
+
+
+def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) -> bool:
+    """Whether no flight that says more of an output says that its sign is right."""
+    others = (signs[name] for signs in by_flight if name in signs)
+    return sign.correlation > 0 or not any(
+        o.correlation > 0 and o.size > _MORE * sign.size for o in others
+    )
+
+
 def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Finding]:
     """Of the outputs that one input moves, by the correlation of each with what is simulated."""
     turned = {n: c for n, c in signs.items() if c < 0}
@@ -325,7 +354,7 @@ def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Findin
             f"{label}: at the start values the simulated {names} {moves} (correlation "
             f"{', '.join(f'{c:+.2f}' for c in turned.values())}): {whose} has the wrong sign "
             f"(invert: true) or is another column, or the effect of {stick} has the wrong sign at "
-            "the start values."
+            f"the start values. {_or_held(names)}"
         )
         return [Finding("signs and units", "doubt", words, size, criterion)]
     others = [n for n in signs if n not in turned]
@@ -336,12 +365,19 @@ def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Findin
             f"{label}: at the start values the simulated {name} moves against the measured one "
             f"(correlation {c:+.2f}), though {' and '.join(others)} "
             f"{'do' if len(others) > 1 else 'does'} not: {name} has the wrong sign "
-            "(invert: true) or is another column.",
+            f"(invert: true) or is another column. {_or_held(name)}",
             c,
             criterion,
         )
         for name, c in turned.items()
     ]
+
+
+def _or_held(outputs: str) -> str:
+    return (
+        f"An input that is not swept in this flight and holds {outputs} against gusts makes that "
+        "by itself: then nothing is wrong."
+    )
 
 
 def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
