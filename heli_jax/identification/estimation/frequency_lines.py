@@ -35,6 +35,8 @@ _NO_END = 1e-10
 _ROUNDING = 1e-12
 """part of the largest power of a direction of the ends below which it is rounding: a millionth of
 its size"""
+_SMALL = 6
+"""states up to which a substitution is written out"""
 _SPARED = 0.1
 """part of a record's numbers that its ends may take, those of gusts among them"""
 
@@ -263,6 +265,7 @@ def states(
 
 def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array:
     """(zI - T)^-1 b at each line (k, ...), or b (zI - T)^-1, with T of `_triangle`."""
+    n = T.shape[0]
     M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype)[None] - T[None]
     b = jnp.broadcast_to(b, (z.shape[0], *b.shape[1:]))
 
@@ -273,7 +276,16 @@ def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array
         return jnp.swapaxes(turned, 1, 2)
 
     def triangle(M: Array, b: Array) -> Array:
-        return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
+        if n > _SMALL:
+            return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
+        # Written out, since for each line a routine would be called that takes longer to call.
+        rows = [b[:, i] if left else b[:, :, i] for i in range(n)]
+        over = 1.0 / jnp.diagonal(M, axis1=1, axis2=2)
+        for i in reversed(range(n)) if left else range(n):
+            for j in range(i + 1, n) if left else range(i):
+                rows[i] = rows[i] - (M[:, i, j] if left else M[:, j, i])[:, None] * rows[j]
+            rows[i] = over[:, i, None] * rows[i]
+        return jnp.stack(rows, axis=1 if left else 2)
 
     return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
