@@ -31,6 +31,17 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add(sa
     np.testing.assert_allclose(solution @ (Q.T @ left), ends, rtol=1e-6)
 
 
+def test_a_state_that_no_output_shows_adds_nothing():
+    """Its effect is rounding; along that column something else would be taken off the errors."""
+    rng = np.random.default_rng(2)
+    basis = rng.standard_normal((40, 3))
+    basis[:, 1] = 1e-15 * rng.standard_normal(40)
+    Q, solution = (np.asarray(v) for v in span(jnp.asarray(basis)))
+    shown, _ = np.linalg.qr(basis[:, [0, 2]])
+    np.testing.assert_allclose(Q @ Q.T, shown @ shown.T, atol=1e-12)
+    assert not solution[1].any()
+
+
 def test_a_stick_is_no_instrument_of_itself():
     u, r = np.random.default_rng(1).standard_normal((2, 50))
 

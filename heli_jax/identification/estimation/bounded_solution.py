@@ -59,7 +59,9 @@ def span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, 
         basis: what spans it.
     """
     sizes = jnp.linalg.norm(basis, axis=0)
-    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    # A state that no output shows has a column of rounding, which would take some direction off.
+    seen = sizes > max(_NO_END, 10.0 * float(jnp.finfo(basis.dtype).eps)) * jnp.max(sizes)
+    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
     Q, R = jnp.linalg.qr(basis * over[None, :])
     U, values, Vt = jnp.linalg.svd(R)
     kept = values > _NO_END * values[0]
