@@ -47,28 +47,30 @@ def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tupl
         v: where.
     """
 
-    def along(direction: Array) -> tuple[T, T]:
-        return jax.jvp(make, (v,), (direction,))
-
-    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
-    leaves, structure = jax.tree.flatten(slopes)
-    kept = [d if moves else None for d, moves in zip(leaves, _moving(make, v), strict=True)]
-    return value, jax.tree.unflatten(structure, kept)
-
-
-def _moving[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> list[bool]:
-    """Of each array whether it hangs on v: what does not costs nothing then."""
     moving: list[bool] = []
 
+    # Called beside `make`: which derivatives are zero shows as they are made, and to trace a model
+    # once more for it takes as long as to differentiate it.
     @jax.custom_jvp
     def look(*leaves: Array) -> Array:
         return jnp.zeros((), v.dtype)
 
     def rule(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
         zero = jax.custom_derivatives.SymbolicZero
-        moving.extend(not isinstance(t, zero) for t in tangents)
+        moving[:] = [not isinstance(t, zero) for t in tangents]
         return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
 
     look.defjvp(rule, symbolic_zeros=True)
-    jax.eval_shape(lambda t: jax.jvp(lambda v: look(*jax.tree.leaves(make(v))), (v,), (t,)), v)
-    return moving
+
+    def looked_at(v: Array) -> T:
+        made = make(v)
+        look(*jax.tree.leaves(made))
+        return made
+
+    def along(direction: Array) -> tuple[T, T]:
+        return jax.jvp(looked_at, (v,), (direction,))
+
+    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    leaves, structure = jax.tree.flatten(slopes)
+    kept = [d if moves else None for d, moves in zip(leaves, moving, strict=True)]
+    return value, jax.tree.unflatten(structure, kept)
