@@ -13,6 +13,8 @@ from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
 from heli_jax.errors import InputError
 from heli_jax.identification.estimation.linear_machine import Machine, forgets
+from heli_jax.identification.estimation.residual import differentiate, rows_of
+from heli_jax.identification.fit import first_guess
 from heli_jax.report import tables
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, record, vehicle
@@ -76,6 +78,27 @@ def test_only_outputs_that_forget_within_a_window_are_simulated():
     assert forgets(matrices, 0.02, np.ones(1), 500, 6000).tolist() == [True, False, False]
     # Shorter than the lag remembers.
     assert not forgets(matrices, 0.02, np.ones(1), 80, 6000)[0]
+
+
+def test_rows_of_flights_of_several_lengths_and_their_slopes():
+    """What differs in numbers alone is evaluated together, with slopes of its own."""
+    flights = [record(BENCH, seed=3, n=n) for n in (1500, 1300, 1500)]
+    problem = Problem(
+        models.roll_on_stand, vehicle(BENCH), flights, FREE, Nuisance(bias=False),
+        method="frequency-response", frequency=ResponseOptions(window=6.0, band=(0.4, 6.0)),
+    )  # fmt: skip
+    at = first_guess(problem)
+    z = np.array(at.z)
+    made = differentiate(at.layout, at.data, at.noise, jnp.asarray(z))
+    rows = eqx.filter_jit(rows_of)
+    for i in range(3):
+        step = 1e-5 * np.eye(z.size)[i]
+        up, down = (rows(at.layout, at.data, at.noise, jnp.asarray(z + s * step)) for s in (1, -1))
+        slope = np.asarray(up - down) / 2e-5
+        assert np.linalg.norm(slope) > 0
+        np.testing.assert_allclose(made.J[:, i], slope, atol=1e-6 * np.max(np.abs(slope)))
+    # Initial states are numbers here.
+    assert not np.asarray(made.J)[: -z.size, 3:].any()
 
 
 @pytest.mark.slow

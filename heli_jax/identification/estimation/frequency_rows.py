@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.frequency_slopes import Products, products_of_lines
+from heli_jax.identification.estimation.shared_unknowns import shared_of, with_shared
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 _NOTHING = 100.0
@@ -31,9 +32,9 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
         noise: with the whitening of each record, and whether instruments are used.
         u: the unknowns, in the units of the model.
     """
-    v = _vector(layout, u)
+    v = shared_of(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
-    made = products_of_lines(layout, data, noise, at, lambda v: _with(layout, rest, v))
+    made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
     r, M = _weighed(made)
     left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
     left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
@@ -52,21 +53,3 @@ def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
     along = root[:, None] * vectors.T * over[None, :]
     return along @ of.Ze, along @ of.ZJ
-
-
-def _vector(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
-    """The unknowns that lines depend on: all but initial states, biases and offsets."""
-    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
-    shift = [] if u.shift is None else [u.shift]
-    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
-
-
-def _with(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
-    """The unknowns with those of a vector in place."""
-    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
-    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
-    return u._replace(
-        params={n: values[n] for n in layout.free},
-        gains={n: values[n] for n in layout.gains},
-        shift=None if u.shift is None else v[-1],
-    )

@@ -24,7 +24,6 @@ from heli_jax.identification.estimation.frequency_lines import (
     stacked,
 )
 from heli_jax.identification.estimation.frequency_machines import (
-    Machines,
     Matrices,
     Signals,
     alike,
@@ -34,6 +33,7 @@ from heli_jax.identification.estimation.frequency_machines import (
     parts_of_group,
 )
 from heli_jax.identification.estimation.frequency_records import Record
+from heli_jax.identification.estimation.shared_unknowns import differentiated
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 
@@ -128,7 +128,7 @@ def products_of_lines(
     total = []
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
-        machines, slopes = _differentiated(
+        machines, slopes = differentiated(
             lambda v, members=members: machines_of(layout, data, unknowns(v), members), v
         )
 
@@ -296,35 +296,3 @@ def _moved(
         part = jnp.einsum("ar,ksrq->ksaq", G, stacked(du)).reshape(K, 2 * G.shape[0], -1)
         total = part if total is None else total + part
     return total
-
-
-def _differentiated(
-    make: Callable[[Array], Machines], v: Float[Array, " q"]
-) -> tuple[Machines, Machines]:
-    """Machines and their derivatives by v, a last axis; None in place of those that are zero."""
-
-    def along(direction: Array) -> tuple[Machines, Machines]:
-        return jax.jvp(make, (v,), (direction,))
-
-    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
-    leaves, structure = jax.tree.flatten(slopes)
-    kept = [d if moves else None for d, moves in zip(leaves, _moving(make, v), strict=True)]
-    return value, jax.tree.unflatten(structure, kept)
-
-
-def _moving(make: Callable[[Array], Machines], v: Float[Array, " q"]) -> list[bool]:
-    """Of each array of the machines whether it hangs on v: what does not costs nothing then."""
-    moving: list[bool] = []
-
-    @jax.custom_jvp
-    def look(*leaves: Array) -> Array:
-        return jnp.zeros((), v.dtype)
-
-    def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
-        zero = jax.custom_derivatives.SymbolicZero
-        moving.extend(not isinstance(t, zero) for t in tangents)
-        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
-
-    look.defjvp(rule, symbolic_zeros=True)
-    jax.eval_shape(lambda t: jax.jvp(lambda v: look(*jax.tree.leaves(make(v))), (v,), (t,)), v)
-    return moving
