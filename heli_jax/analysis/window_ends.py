@@ -53,16 +53,20 @@ def without_ends(
     known = np.isfinite(H) & np.isfinite(sd) & (sd > 0)
     # Where an input has no response of its own it has none to take off.
     ends = np.where(np.isfinite(ends), ends, 0.0)
-    added = np.zeros_like(H)
+    added, now = np.zeros_like(H), sd
+    size = part = chance = np.zeros(H.shape)
     for _ in range(_ROUNDS):
         rest = np.where(known, H - added, 0.0)
-        slopes, variances = _derivative(omega, rest, known, sd, seconds)
-        added = 1j * np.einsum("kij,koj->koi", ends, slopes)
-    chance = np.einsum("kij,koj->koi", np.abs(ends) ** 2, variances)
-    # Of what is noise as much as not, only as much as makes the error least.
-    size = np.abs(added) ** 2
-    part = size / np.maximum(size + 2.0 * chance, np.finfo(float).tiny)
-    return part * added, np.sqrt(sd**2 + (_UNKNOWN * part) ** 2 * size + part**2 * chance)
+        # What is taken off has errors, and its derivative has them too: where a window ends in the
+        # middle of a sweep they would grow by a factor a round.
+        slopes, variances = _derivative(omega, rest, known, now, seconds)
+        whole = 1j * np.einsum("kij,koj->koi", ends, slopes)
+        chance = np.einsum("kij,koj->koi", np.abs(ends) ** 2, variances)
+        # Of what is noise as much as not, only as much as makes the error least.
+        size = np.abs(whole) ** 2
+        part = size / np.maximum(size + 2.0 * chance, np.finfo(float).tiny)
+        added, now = part * whole, np.sqrt(sd**2 + part**2 * chance)
+    return added, np.sqrt(now**2 + (_UNKNOWN * part) ** 2 * size)
 
 
 def _derivative(

@@ -37,7 +37,10 @@ class MethodResult(NamedTuple):
         if self.fit.status == "not-converged":
             return "not converged"
         words = [] if self.fit.status == "converged" else ["not identifiable"]
-        words += [] if self.fit.adequate else ["not adequate"]
+        # `in size only`, `one step ahead only`: its reasons are those of a fit by that method.
+        how = self.fit.adequacy.summary.split(" (")[0].split(",")[0]
+        limited = [f"adequate {how}"] if how != "yes" else []
+        words += limited if self.fit.adequate else ["not adequate"]
         words += ["intervals too narrow"] if self.fit.overconfident else []
         doubted = self.fit.untrusted
         words += [f"{', '.join(doubted)} not to be trusted"] if doubted else []

@@ -2,6 +2,7 @@
 exchanged, bounds, and swings that the samples hardly show."""
 
 import json
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -10,6 +11,9 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
 from heli_jax.identification.frequency_start import frequency_error_start
+from heli_jax.identification.problem import MAX_TIME_SHIFT
+from heli_jax.identification.result import Estimate
+from heli_jax.identification.uncertainty.estimates import bound_notes, with_limits
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
@@ -160,6 +164,28 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure(method):
     assert estimate.at_bound
     assert estimate.lower95 == -0.5
     assert not any("stuck" in note for note in found.notes)
+
+
+def test_no_interval_of_a_time_shift_is_wider_than_its_search():
+    # The likelihood and the slopes are taken on past the last value that a shift can have.
+    end = 0.49999
+    shift = Estimate(end, 0.18, 0.1, 0.85, "s", 0.0, 0.0, at_bound=True)
+    found = with_limits({"time_shift": shift}, {"time_shift": (0.003, 1.26)})["time_shift"]
+    assert (found.lower95, found.upper95) == (0.003, MAX_TIME_SHIFT)
+    [note] = bound_notes({"time_shift": found})
+    # No key widens that bound.
+    assert "widen the bound" not in note
+    assert "searched for no further" in note
+
+
+@pytest.mark.slow
+def test_a_shift_beyond_its_search_ends_there():
+    late = replace(FIRST, inputs={"u": np.roll(U, -40)})
+    free = {"K": Free(8.0)}
+    fitted = fit(Problem(SUM, TRUTH, [late], free, Nuisance(bias=False, time_shift=True)))
+    estimate = fitted.nuisance["time_shift"]
+    assert estimate.at_bound
+    assert estimate.upper95 is None or estimate.upper95 <= MAX_TIME_SHIFT
 
 
 def test_a_fast_swing_is_no_white_noise():

@@ -307,6 +307,12 @@ def test_methods_are_laid_side_by_side(by):
     assert [row[0] for row in rows] == ["Ixx", "If", "kappa", "verdict", "time"]
     assert rows[3] == ("verdict", "converged, adequate", "converged, adequate", "", "refused", "")
     assert rows[0][4:] == ("–", "–")
+    # No plain word beside a fit that has a doubt of its own.
+    doubted = dataclasses.replace(
+        other, adequacy=other.adequacy._replace(limited="the response of roll depends on amplitude")
+    )
+    of_doubt = MethodResult("frequency-error", doubted, "", 0.5)
+    assert of_doubt.word == "adequate in size only"
     written = methods_content(compared)["results"]
     assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
     assert written["filter-error"]["reason"] == "there is no disturbance"

@@ -137,6 +137,9 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     assert feedback_trust_notes(moved, Loop(loops, ("lat", "lon"))) == []
     [note] = feedback_trust_notes({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
     assert note.startswith("Closed loop without an instrument for lon: ")
+    # A part that rounds to none is no `up to 0 %`.
+    [note] = feedback_trust_notes({"Lp": Moved(0.0, 0.003)}, Loop(loops))
+    assert "less than 1 % of the input may be gusts" in note
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]
     assert untrusted(moved, Loop(open_loop)) == ()

@@ -311,6 +311,12 @@ def test_what_moves_no_estimate_is_said_and_takes_nothing_off_a_yes():
     assert with_unmodelled(yes, ()) is yes
 
 
+def test_chances_have_no_digits_where_they_are_none_to_speak_of():
+    # The tail of the F distribution is known to no such digits.
+    assert "p below 1e-6)" in lacking(0.1)._replace(p_value=2e-63).sentence
+    assert "p 0.0031)" in lacking(0.1)._replace(p_value=0.0031).sentence
+
+
 def test_squared_errors_of_responses_above_their_interval_are_no_plain_yes():
     said = []
     for chi_squared in (1.0, 1.9, 2.1):

@@ -63,6 +63,7 @@ def estimates_of(
             low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
         if u.at_bound and free is not None:
             low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
+        low, high = _searched(u.name, (low, high))
         not_identifiable = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
         estimates[u.name] = Estimate(
@@ -89,12 +90,21 @@ def with_limits(
         estimates: by name.
         limits: by name lower and upper end, in the parameter's unit.
     """
-    return {
-        n: estimate._replace(lower95=limits[n][0], upper95=limits[n][1])
-        if n in limits and estimate.sd is not None
-        else estimate
-        for n, estimate in estimates.items()
-    }
+    found = dict(estimates)
+    for n, ends in limits.items():
+        if n in found and found[n].sd is not None:
+            lower, upper = _searched(n, ends)
+            found[n] = found[n]._replace(lower95=lower, upper95=upper)
+    return found
+
+
+def _searched(name: str, ends: tuple[float, float]) -> tuple[float, float]:
+    """The ends of an interval, of a time shift no further than it is searched for [s]."""
+    if name != "time_shift":
+        return ends
+    # Through a tanh, which has no value beyond: slopes and likelihood are taken on past it.
+    low, high = (float(v) for v in np.clip(ends, -MAX_TIME_SHIFT, MAX_TIME_SHIFT))
+    return low, high
 
 
 def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -156,10 +166,20 @@ def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     return [
         f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. Its interval "
         "ends there and does not hold, and the other estimates are those of a bound that the data "
-        "do not bear out. Remedy: widen the bound, or mend what makes the data want that."
+        f"do not bear out. Remedy: {_remedy(name)}."
         for name, estimate in estimates.items()
         if estimate.at_bound
     ]
+
+
+def _remedy(name: str) -> str:
+    if name == "time_shift":
+        # No key widens that one.
+        return (
+            "it is searched for no further, so mend what makes the data want that: an input or an "
+            "output of another column or sign, or two logs whose clocks differ"
+        )
+    return "widen the bound, or mend what makes the data want that"
 
 
 def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:

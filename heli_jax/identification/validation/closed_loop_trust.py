@@ -386,9 +386,10 @@ def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
     if not any(one.present for one in loop.found):
         of += " (the model is unstable, and the record does not grow: somebody holds the machine)"
     if not doubted:
-        most = max(m.part for m in moved.values())
+        most = 100 * max(m.part for m in moved.values())
+        share = f"up to {most:.0f}" if most >= 1 else "less than 1"
         return [
-            f"Closed loop without an instrument{of}: up to {100 * most:.0f} % of the input may be "
+            f"Closed loop without an instrument{of}: {share} % of the input may be "
             "gusts that feedback brought in, where these parameters show; no interval allows for "
             "that. Nothing shows that it moved them, and nothing that it did not."
         ]
@@ -399,7 +400,7 @@ def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
         f"Closed loop without an instrument{of}: this fit cannot be trusted on "
         f"{', '.join(doubted)}. Where these show, so much of {inputs} may be gusts that feedback "
         f"brought in: {words}; no interval allows for that. "
-        + (f"Less of it is where {', '.join(rest)} show. " if rest else "")
+        + (f"There is less of it for {', '.join(rest)}. " if rest else "")
         + "Remedy: log the excitation and name it (signals.instruments), or method: filter-error "
         "with a disturbance."
     ]

@@ -41,6 +41,7 @@ from heli_jax.identification.validation.score_test import (
     lines_of,
     strongest,
 )
+from heli_jax.numbers import p_value
 
 LEVEL, IN_COLOUR = 0.01, 1e-3
 """of all outputs and questions together; and where residuals in time are autocorrelated, as in
@@ -102,7 +103,7 @@ class Unmodelled(NamedTuple):
     @property
     def sentence(self) -> str:
         """For the notes of a fit."""
-        chance = f"twice the log-likelihood gains {self.gain:.3g}, p {self.p_value:.1g}"
+        chance = f"twice the log-likelihood gains {self.gain:.3g}, p {p_value(self.p_value)}"
         if self.by_amplitude:
             said = (
                 f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
