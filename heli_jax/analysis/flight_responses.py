@@ -8,7 +8,7 @@ import numpy as np
 from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.response_parts import Names, groups, records_of
-from heli_jax.analysis.response_pictures import picture_of, several_windows
+from heli_jax.analysis.response_pictures import pictures_of, several_windows
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import (
     OVERLAP,
@@ -297,12 +297,17 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
     several = several_windows(records, dt, spectra, window, m)
     averages = float(estimate.averages[0])
     half95 = float(student95(np.asarray(2.0 * (averages - m))))
+    pictures = pictures_of(several, omega, (u, y, by))
     result = {}
     for i, name in enumerate(outputs):
-        picture = picture_of(several, omega, (u, y[i], by))
         pairs = {
             n: Pair(
-                H[:, i, j], sd[:, i, j], coherence[:, i, j], picture[:, j], half95, added[:, i, j]
+                H[:, i, j],
+                sd[:, i, j],
+                coherence[:, i, j],
+                pictures[:, i, j],
+                half95,
+                added[:, i, j],
             )
             for j, n in enumerate(inputs)
         }

@@ -4,7 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heli_jax.analysis.spectral import OVERLAP, CrossSpectra, composite, cross_spectra, responses
+from heli_jax.analysis.spectral import (
+    OVERLAP,
+    CrossSpectra,
+    combined,
+    cross_spectra,
+    responses,
+    weights_by_output,
+)
 
 _LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
 """of the windows of a composite, in that one's length"""
@@ -35,22 +42,29 @@ def several_windows(
     return several
 
 
-def picture_of(
-    several: list[CrossSpectra], omega: np.ndarray, which: tuple[list[int], int, list[int] | None]
+def pictures_of(
+    several: list[CrossSpectra],
+    omega: np.ndarray,
+    which: tuple[list[int], list[int], list[int] | None],
 ) -> np.ndarray:
-    """H (k, m) of several windows together; NaN where the record has no two of them.
+    """H (k, l, m) of several windows together; NaN where the record has no two of them.
 
     Args:
         several: spectra of each.
         omega: (k,) [rad/s]
-        which: places of the inputs, of the output and of the instruments.
+        which: places of the m inputs, of the l outputs and of the instruments.
     """
-    u, y, by = which
+    u, outputs, by = which
+    made = np.full((omega.size, len(outputs), len(u)), np.nan, complex)
     if len(several) < 2:
-        return np.full((omega.size, len(u)), np.nan)
-    # Without the other outputs, of which each has its own weights.
-    kept = [*dict.fromkeys([*u, *(by or u)]), y]
-    place = {i: j for j, i in enumerate(kept)}
-    own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
-    us, zs = [place[i] for i in u], None if by is None else [place[i] for i in by]
-    return responses(composite(own, us, [place[y]]), us, [place[y]], zs).H[:, 0]
+        return made
+    weights = weights_by_output(several, u, outputs)
+    for i, y in enumerate(outputs):
+        # Without the other outputs, of which each has its own weights.
+        kept = [*dict.fromkeys([*u, *(by or u)]), y]
+        place = {signal: j for j, signal in enumerate(kept)}
+        own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
+        us, zs = [place[k] for k in u], None if by is None else [place[k] for k in by]
+        both = combined(own, weights[:, :, i])
+        made[:, i] = responses(both, us, [place[y]], zs).H[:, 0]
+    return made

@@ -355,11 +355,33 @@ def composite(
 
     Source: Tischler and Remple (2012), chapter 10, without its last search.
     """
-    omega = several[0].omega
-    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
-        raise ValueError("several: expected the same frequencies in all")
-    weights = np.stack([_weights(s, inputs, outputs) for s in several])
-    total = np.sum(weights, axis=0)
+    return combined(several, _weights(several, inputs, outputs, (2, 3)))
+
+
+def weights_by_output(
+    several: Sequence[CrossSpectra], inputs: Sequence[int], outputs: Sequence[int]
+) -> Float[np.ndarray, "w k l"]:
+    """What `composite` weighs each length by where it is made for one output alone.
+
+    Args:
+        several: of the same signals and frequencies, of segments of different length.
+        inputs: those whose responses decide, by their place among the signals.
+        outputs: likewise.
+
+    Raises:
+        ValueError: the frequencies differ.
+    """
+    return _weights(several, inputs, outputs, (3,))
+
+
+def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"]) -> CrossSpectra:
+    """Their mean.
+
+    Args:
+        several: of the same signals and frequencies.
+        weights: of each; where all are zero all count the same.
+    """
+    omega, total = several[0].omega, np.sum(weights, axis=0)
     # Inputs that move as one have no response that could decide.
     weights = np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / len(several))
     S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
@@ -367,15 +389,27 @@ def composite(
     return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
 
 
-def _weights(s: CrossSpectra, inputs: Sequence[int], outputs: Sequence[int]) -> np.ndarray:
-    """(k,) one over the random error, to the fourth power."""
-    estimate = responses(s, inputs, outputs)
+def _weights(
+    several: Sequence[CrossSpectra],
+    inputs: Sequence[int],
+    outputs: Sequence[int],
+    over: tuple[int, ...],
+) -> np.ndarray:
+    """(w, k, ...) one over the random error, to the fourth power, of (w, k, l, m) a mean over some
+    axes."""
+    omega = several[0].omega
+    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
+        raise ValueError("several: expected the same frequencies in all")
+    estimates = [responses(s, inputs, outputs) for s in several]
     with np.errstate(all="ignore"):
-        each = np.abs(estimate.H / estimate.sd) ** 2
+        each = np.abs(np.stack([e.H / e.sd for e in estimates])) ** 2
     seen = np.isfinite(each)
-    information = np.sum(np.where(seen, each, 0.0), axis=(1, 2)) / np.maximum(
-        np.sum(seen, axis=(1, 2)), 1
+    information = np.sum(np.where(seen, each, 0.0), axis=over) / np.maximum(
+        np.sum(seen, axis=over), 1
     )
     # Two periods within a segment are the least that a window resolves.
-    resolved = s.omega >= 4.0 * np.pi / s.seconds * (1.0 - 1e-9)
-    return np.where(resolved, information, 1e-12 / s.seconds) ** 2
+    seconds = np.array([s.seconds for s in several])[:, None]
+    resolved, least = omega >= 4.0 * np.pi / seconds * (1.0 - 1e-9), 1e-12 / seconds
+    if information.ndim > 2:
+        resolved, least = resolved[:, :, None], least[:, :, None]
+    return np.where(resolved, information, least) ** 2
