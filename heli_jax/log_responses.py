@@ -68,8 +68,26 @@ def responses_of_log(
             f"(a sweep, doublets) for longer than a few windows of {estimate.window:.3g} s, got "
             f"{longest:.3g} s"
         )
-    notes = (*_read_in_degrees(experiment, flights), *between_samples(flights, estimate.holds))
+    notes = (
+        *_held_out(flights),
+        *_read_in_degrees(experiment, flights),
+        *between_samples(flights, estimate.holds),
+    )
     return estimate._replace(notes=(*estimate.notes, *notes))
+
+
+def _held_out(flights: Sequence[Flight]) -> tuple[str, ...]:
+    """That flights which a fit holds out count here: its report shows other responses."""
+    from heli_jax.identification.unknowns.nuisances import labels
+
+    named = zip(labels(tuple(flights)), flights, strict=True)
+    names = [label for label, flight in named if flight.hold_out]
+    if not names:
+        return ()
+    return (
+        f"{', '.join(names)}: used here as the other flights are, hold_out: true or not; a fit, "
+        "and the responses in its report, leave held-out flights out",
+    )
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[str]:
@@ -79,22 +97,25 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         flights: of one rate.
         inputs: by name.
     """
-    notes: list[str] = []
+    mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:
         holds = [f.hold[name] for f in flights]
         if len(set(holds)) > 1:
-            notes.append(
-                f"{name}: of the first flight {_HOLDS[holds[0]]} between samples, of others "
-                f"{_HOLDS[next(h for h in holds if h != holds[0])]}; all are taken as the first: "
-                "state signals.inputs.*.hold, or take responses of like flights together"
-            )
+            other = next(h for h in holds if h != holds[0])
+            mixed.setdefault((holds[0], other), []).append(name)
         elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
             # The other way round nobody is misled: a stick that jumps is held. A low-passed one can
             # be no other than linear.
             if is_low_passed(reason):
                 continue
             guessed[name] = reason
+    notes = [
+        f"{', '.join(names)}: of the first flight {_HOLDS[first]} between samples, of others "
+        f"{_HOLDS[other]}; all are taken as the first: state signals.inputs.*.hold, or take "
+        "responses of like flights together"
+        for (first, other), names in mixed.items()
+    ]
     return [*notes, *_straight_lines(guessed, 500.0 * flights[0].dt)]
 
 

@@ -219,6 +219,13 @@ def test_half_a_sample_of_delay_that_hangs_on_a_guess_is_said(config, tmp_path, 
     assert late["delay_s"]["value"] - right["delay_s"]["value"] == pytest.approx(0.01, abs=1e-3)
 
 
+def test_flights_that_a_fit_holds_out_are_said_to_count_here(config, tmp_path, capsys):
+    held = "  - {log: log.csv, name: doublets, signals: *signals, hold_out: true}\nfrequency:"
+    config.write_text(CONFIG.replace("frequency:", held))
+    assert main(["frf", str(config), "--out", str(tmp_path / "out")]) == 0
+    assert "doublets: used here as the other flights are" in capsys.readouterr().err
+
+
 def test_degrees_that_are_read_as_radians_are_said(config, tmp_path, capsys):
     log = tmp_path / "log.csv"
     head, *rows = [line.split(",") for line in log.read_text().splitlines()]

@@ -17,7 +17,7 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
-from heli_jax.identification.fit_notes import Numbers, fit_notes
+from heli_jax.identification.fit_notes import Numbers, fit_notes, open_directions
 from heli_jax.identification.identifiability.as_likely import unless_as_likely
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
@@ -162,6 +162,8 @@ def assemble(
     errors, numbers = judged.errors, judged.numbers
     layout, status = search.layout, _status(end, errors.verdict)
     held = _held_out(problem, search, optimum)
+    # Of rounding, and of numbers that are none, notes of their own speak.
+    astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
     notes = [
         *fit_notes(
             problem,
@@ -172,6 +174,7 @@ def assemble(
             end.correlated if errors.coloured else {},
             end.all_white,
         ),
+        *(open_directions(run.before, errors.verdict) if astray else ()),
         *limit_notes(errors.limits),
         *excitation.aliasing(fast),
         *judged.notes,

@@ -11,6 +11,7 @@ from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import (
@@ -206,4 +207,22 @@ def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> li
         f"The optimiser stopped after {steps} step{'s' * (steps != 1)} without arriving: these "
         "numbers are no result. "
         f"Remedy: {remedy}."
+    ]
+
+
+def open_directions(before: Verdict, at_end: Verdict) -> list[str]:
+    """Why a search that has not arrived may never do so: what the data leave open from the start.
+
+    Args:
+        before: at the start values.
+        at_end: where the search stopped.
+    """
+    either = [{*v.undetermined, *v.without_effect} for v in (before, at_end)]
+    names = [n for n in at_end.names if n in either[0] & either[1]]
+    if not names:
+        return []
+    return [
+        "Where the search began and where it stopped alike the data do not determine "
+        f"{listed(names)}, and along what they leave open a search may go on without end: fix some "
+        "of these or give them priors, before more steps are allowed."
     ]

@@ -16,8 +16,8 @@ _CAPTIONS = {
     "response": "From above, over time: measured and simulated, what is left between them, inputs.",
     "residual": "From above, by lag: its correlation with itself, then with each input; of white "
     "noise 99 % of the lags lie within the band.",
-    "bode": "Magnitude and phase of the fitted model, of the recursive least squares where there "
-    "are some, and of the record where its coherence allows.",
+    "bode": "Magnitude and phase of the fitted model, and of the record where its coherence "
+    "allows.",
     "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
     "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
     "did not notice (Wood and Hodgkinson, 1980).",
@@ -31,13 +31,24 @@ _CAPTIONS = {
     "intervals and correlations.",
 }
 """by group, what a figure shows, after its title"""
+_BODE_RLS = (
+    "Magnitude and phase of the fitted model, of the recursive least squares, and of the record "
+    "where its coherence allows."
+)
 GROUPS = tuple(_CAPTIONS)
 # The template asks for figures by what their names begin with: no group may begin another's name.
 
 
-def caption(picture: Picture) -> str:
-    """What a figure shows, and the name of its files."""
+def caption(picture: Picture, *, rls: bool) -> str:
+    """What a figure shows, and the name of its files.
+
+    Args:
+        picture: as it was drawn.
+        rls: whether recursive least squares were asked for.
+    """
     [words] = [w for group, w in _CAPTIONS.items() if picture.name.startswith(group)]
+    if rls and picture.name.startswith("bode"):
+        words = _BODE_RLS
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 

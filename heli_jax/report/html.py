@@ -97,7 +97,11 @@ def render(
         origin=origin,
         unshown=max(0, len(analysis.fit.signals) - MOST_FLIGHTS),
         pictures={
-            group: [(p, caption(p)) for p in pictures if p.name.startswith(group)]
+            group: [
+                (p, caption(p, rls=analysis.baseline is not None))
+                for p in pictures
+                if p.name.startswith(group)
+            ]
             for group in GROUPS
         },
         numbers=(numbers or Numbers()).content(),

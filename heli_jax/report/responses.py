@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ _FILES = (
 _DB = 20.0 / np.log(10.0)
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom from which on a transfer function is called too simple"""
+_NEAR_ZERO = 0.1
+"""of a pole's size, within which a zero all but cancels it"""
 
 
 def write_responses(
@@ -263,7 +265,24 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
             "the machine is not, a stick logged late, feedback or a wrong order makes it so"
         )
+    if known and all(c.determined for c in fit.numerator) and (beside := _cancelled(fit)):
+        said.append(
+            f"beside {_root_words(beside)} lie zeros, within a tenth, that all but cancel them: "
+            "they may be no modes of the machine, and a lower order may say as much "
+            "(see whether chi² stays)"
+        )
     return said
+
+
+def _cancelled(fit: TransferFit) -> list[complex]:
+    """The poles with a zero of its own within a tenth of their size."""
+    zeros, beside = list(fit.zeros), []
+    for pole in fit.poles:
+        distances = [abs(pole - zero) for zero in zeros]
+        if distances and min(distances) < _NEAR_ZERO * abs(pole):
+            zeros.pop(int(np.argmin(distances)))
+            beside.append(complex(pole))
+    return beside
 
 
 FIT_HEAD = ("numerator", "denominator", "poles [rad/s]", "delay [ms]", "chi² per degree", "J")
@@ -297,8 +316,12 @@ def _roots(fit: TransferFit) -> str:
     in handling qualities."""
     if not all(c.determined for c in fit.denominator):
         return "not determined"
+    return _root_words(fit.poles)
+
+
+def _root_words(poles: Iterable[complex]) -> str:
     words = []
-    for pole in sorted(fit.poles, key=abs):
+    for pole in sorted(poles, key=abs):
         if pole.imag > 0.0:
             damping = number(-pole.real / abs(pole), 3)
             words.append(f"ω {number(abs(pole), 4)}, ζ {damping}")

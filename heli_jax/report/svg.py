@@ -211,7 +211,8 @@ def _grid(panel: Panel, x: _Scale, y: _Scale, *, numbered: bool, whole: bool) ->
     across = (decades if x.logarithmic else ticks)(x.low, x.high, 9)
     if whole:
         across = [v for v in across if v == round(v)]
-    up = ticks(y.low, y.high, max(3, round(panel.height / 30)))
+    degrees = panel.label.endswith("[deg]")
+    up = ticks(y.low, y.high, max(3, round(panel.height / 30)), degrees=degrees)
     lines = [f"M{float(x(v)):.1f} {y.begin:.1f}V{y.end:.1f}" for v in across]
     lines += [f"M{x.begin:.1f} {float(y(v)):.1f}H{x.end:.1f}" for v in up]
     parts = [f'<path d="{"".join(lines)}" stroke="{_GRID}" stroke-width="0.8"/>']

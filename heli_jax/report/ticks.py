@@ -1,30 +1,47 @@
 """Where an axis has its numbers, and how they are written."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from heli_jax.numbers import aligned
 
+_ANGLES = (1.0, 2.0, 5.0, 15.0, 30.0, 45.0, 90.0, 180.0)
+"""degrees: angles are read in parts of a right angle and in turns"""
 
-def ticks(low: float, high: float, most: int) -> list[float]:
-    """Round numbers from low to high, 1, 2 or 5 times a power of ten apart.
+
+def ticks(low: float, high: float, most: int, *, degrees: bool = False) -> list[float]:
+    """Round numbers from low to high, 1, 2 or 5 times a power of ten apart; two at least.
 
     Args:
         low, high: ends of the axis, in either order.
-        most: numbers at most, 2 at least.
+        most: numbers at most, 3 at least.
+        degrees: whether they are an angle's: then 15, 30, 45, 90 or 180 apart, or turns.
     """
     low, high = min(low, high), max(low, high)
     if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
         return [low] if math.isfinite(low) else []
-    power = 10.0 ** math.floor(math.log10((high - low) / most))
-    for factor in (1.0, 2.0, 5.0, 10.0, 20.0):
-        step = factor * power
+    before: list[float] = []
+    for step in _steps((high - low) / most, degrees=degrees):
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+        # Not by their number before it is known to be small.
         if last - first < most:
+            found = [k * step for k in range(first, last + 1)]
             break
-    return [k * step for k in range(first, last + 1)]
+        before = [first * step, last * step]
+    # One number tells no size. Those of the finer step that would be too many have their ends.
+    return found if len(found) > 1 or not before else sorted({*found, *before})
+
+
+def _steps(least: float, *, degrees: bool) -> Iterator[float]:
+    """From one that is too fine on."""
+    if degrees and least > 0.2:
+        yield from _ANGLES
+        yield from (360.0 * n for n in _steps(least / 360.0, degrees=False) if n >= 1.0)
+        return
+    power = 10.0 ** math.floor(math.log10(least))
+    yield from (factor * power for factor in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0))
 
 
 def decades(low: float, high: float, most: int) -> list[float]:

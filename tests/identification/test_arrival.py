@@ -1,5 +1,6 @@
 """Whether a search has arrived is asked of its own slopes, not of its last step alone."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from heli_jax import Free, Problem, fit
 from heli_jax.identification.estimation import multistart
 from heli_jax.identification.estimation.arrival import gain_left
+from heli_jax.identification.fit_notes import open_directions
 from tests.identification.test_equation_error import ROLL, Params, record
 
 RNG = np.random.default_rng(0)
@@ -35,19 +37,20 @@ def test_what_a_modest_step_would_take_away():
     assert gain_left(NOISE[:12], J[:12], 3) is None
 
 
+def _stays(layout, data, noise, z0, max_steps=200, **_):
+    at = multistart.residual_and_jacobian(layout, data, noise, z0)
+    cost = np.mean(np.square(np.asarray(at.r)))
+    return multistart.Optimum(z0, cost, np.asarray(9), np.asarray(True))
+
+
 def test_a_search_that_has_not_moved_did_not_converge(monkeypatch):
     flight = record(n=200, noise=2e-3)
     problem = Problem(ROLL, Params(-4.0, 25.0, 0.0), [flight], {"Lp": Free(-2.0), "Lda": Free(9.0)})
     found = fit(problem)
     assert found.status == "converged"
 
-    def stays(layout, data, noise, z0, max_steps=200, **_):
-        # The optimiser's word is that it arrived, at its start.
-        at = multistart.residual_and_jacobian(layout, data, noise, z0)
-        cost = np.mean(np.square(np.asarray(at.r)))
-        return multistart.Optimum(z0, cost, np.asarray(9), np.asarray(True))
-
-    monkeypatch.setattr(multistart, "optimise", stays)
+    # The optimiser's word is that it arrived, at its start.
+    monkeypatch.setattr(multistart, "optimise", _stays)
     stuck = fit(problem)
     assert stuck.status == "not-converged"
     [note] = [n for n in stuck.notes if "stuck" in n]
@@ -55,3 +58,16 @@ def test_a_search_that_has_not_moved_did_not_converge(monkeypatch):
     assert SimpleNamespace(**{n: e.value for n, e in stuck.estimates.items()}) == SimpleNamespace(
         Lp=pytest.approx(-2.0), Lda=pytest.approx(9.0)
     )
+
+
+def test_a_search_along_what_the_data_leave_open_is_told_what_to_fix():
+    """Next to a start of nearly no effect nothing is told; at the optimum all is."""
+    flight = record(n=200, noise=0.3)
+    flight = dataclasses.replace(flight, inputs={"da": 1e-7 * flight.inputs["da"]})
+    problem = Problem(ROLL, Params(-4.0, 25.0, 0.0), [flight], {"Lp": Free(-2.0), "Lda": Free(9.0)})
+    found = fit(problem)
+    open_before, told = found.verdict_before, found.verdict
+    [note] = open_directions(open_before, open_before)
+    assert "Lp and Lda" in note
+    assert open_directions(open_before, told) == []
+    assert open_directions(told, open_before) == []

@@ -118,6 +118,14 @@ def test_the_headline_is_not_said_twice(sound, sound_page, tmp_path):
     assert "The data determine Ixx." in text
 
 
+def test_the_caption_of_the_responses_names_least_squares_where_they_are_drawn(sound, tmp_path):
+    fit, problem, baseline = sound
+    for drawn in (baseline, None):
+        text, _ = page((fit, problem, drawn), tmp_path / str(drawn is None))
+        [caption] = re.findall(r"<figcaption>([^<]*Magnitude and phase.*?)</figcaption>", text)
+        assert ("recursive least squares" in caption) == (drawn is not None)
+
+
 def test_captions_are_words(sound_page):
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", sound_page[0])
     assert len(captions) == len(sound_page[1])

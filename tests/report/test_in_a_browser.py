@@ -70,6 +70,21 @@ def test_a_figure_has_its_own_limits_while_all_of_it_is_seen_and_others_when_zoo
     assert np.ptp(window.value(y)[0]) < 0.9 * np.ptp(limits[0])
 
 
+def test_every_panel_has_two_numbers_and_phases_are_parts_of_a_right_angle(window, report):
+    window.size(1200)
+    window.open(report)
+    plots = "[...heliCharts.groups.values()].flat()"
+    window.value("new Promise(requestAnimationFrame)")
+    splits = window.value(f"{plots}.map(u => u.axes[1]._splits)")
+    assert min(map(len, splits)) >= 2
+    assert any(s[1] - s[0] in (45.0, 90.0, 180.0) for s in splits)
+    # A chirp that fills four fifths of a low panel's room to either side.
+    low = f"{plots}.find(u => u.bbox.height / uPlot.pxRatio < 60)"
+    window.value(f"{low}.setScale('y', {{min: -0.18, max: 0.18}})")
+    window.value("new Promise(requestAnimationFrame)")
+    assert len(window.value(f"{low}.axes[1]._splits")) >= 2
+
+
 def scales(window, group, k=0):
     return window.value(
         f"(({{min, max}}) => [min, max])(heliCharts.groups.get({json.dumps(group)})[{k}].scales.x)"

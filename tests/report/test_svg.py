@@ -109,14 +109,26 @@ def test_a_peak_of_one_sample_in_a_long_record_is_seen():
     low=st.floats(-1e12, 1e12),
     span=st.floats(1e-9, 1e12),
     most=st.integers(3, 12),
+    degrees=st.booleans(),
 )
-def test_ticks_lie_within_the_axis_and_are_told_apart(low, span, most):
+def test_ticks_lie_within_the_axis_and_are_told_apart(low, span, most, degrees):
     high = low + max(span, 1e-6 * abs(low))
-    values = ticks(low, high, most)
-    assert 1 <= len(values) <= most
+    values = ticks(low, high, most, degrees=degrees)
+    assert 2 <= len(values) <= most
     hair = 1e-6 * (high - low)
     assert all(low - hair <= v <= high + hair for v in values)
     assert len(set(tick_texts(values))) == len(values)
+
+
+def test_a_low_panel_has_a_number_besides_zero():
+    assert ticks(-0.45, 0.45, 3) == pytest.approx([-0.4, 0.0, 0.4])
+
+
+def test_phases_are_numbered_in_parts_of_a_right_angle():
+    assert ticks(-210.0, 20.0, 6, degrees=True) == [-180.0, -135.0, -90.0, -45.0, 0.0]
+    assert ticks(-100.0, 60.0, 3, degrees=True) == [-90.0, 0.0]
+    assert ticks(-12.0, 11.0, 6, degrees=True) == [-10.0, -5.0, 0.0, 5.0, 10.0]
+    assert ticks(-2000.0, 100.0, 6, degrees=True) == [-1800.0, -1440.0, -1080.0, -720.0, -360.0, 0]
 
 
 def test_numbers_of_an_axis_are_written_as_elsewhere_on_the_page():

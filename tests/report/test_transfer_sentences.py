@@ -1,5 +1,6 @@
 """What is said beside a transfer function, in terminal, page and JSON alike."""
 
+import numpy as np
 import pytest
 
 from heli_jax.analysis.handling_qualities import Number
@@ -33,6 +34,19 @@ def test_what_is_to_be_heeded_of_a_transfer_function(fit: TransferFit, words: li
     assert bool(said) == bool(words)
     assert all(w in said for w in words)
     assert ("integrator" in said) == ("integrator" in words)
+
+
+def test_poles_that_zeros_all_but_cancel_are_named() -> None:
+    """25 (s + 7.7) / ((s + 3) (s + 8)) is next to 25 / (s + 3)."""
+    numerator = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 7.7))
+    (said,) = fit_sentences(_fit(11.0, 24.0)._replace(numerator=numerator), WINDOW)
+    assert said.startswith("beside −8 lie zeros")
+    away = tuple(Coefficient(v, 0.1, v - 0.2, v + 0.2) for v in (25.0, 25.0 * 5.0))
+    assert not fit_sentences(_fit(11.0, 24.0)._replace(numerator=away), WINDOW)
+    undetermined = numerator[1]._replace(sd=np.inf)
+    assert not fit_sentences(
+        _fit(11.0, 24.0)._replace(numerator=(numerator[0], undetermined)), WINDOW
+    )
 
 
 def test_numbers_have_the_digits_that_their_deviation_leaves() -> None:

@@ -52,6 +52,7 @@ def match(
     axes[0].set_xscale("log")
     axes[0].set_xlim(_hz(pair)[0], _hz(pair)[last_of(pair.omega, pair.coherence, known)])
     style.plain_log_ticks(axes[0])
+    style.phase_ticks(axes[1])
     labels = (f"gain [{unit}]", "phase [deg]", "coherence", "error [dB]", "error [deg]")
     for ax, words in zip(axes, labels, strict=True):
         ax.set_ylabel(words)

@@ -70,6 +70,7 @@ def draw_response(
     axes[0].set_xscale("log")
     axes[0].set_xlim(hz[0], hz[last_of(omega, pair.coherence, known)])
     style.plain_log_ticks(axes[0])
+    style.phase_ticks(axes[1])
     axes[0].set_ylabel(f"gain [dB re {unit}]" if unit != "1" else "gain [dB]")
     axes[1].set_ylabel("phase [deg]")
     axes[2].set_ylabel("coherence")
