@@ -289,7 +289,11 @@ def fit(
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
-        return _with_doubtful_inputs(problem, guess, assemble(problem, search, optimum, run))
+        estimate = assemble(problem, search, optimum, run)
+        # A fit follows numbers in any unit: that it does says nothing of the unit.
+        adequacy = estimate.adequacy.only_if(doubts.unsure)
+        estimate = dataclasses.replace(estimate, adequacy=adequacy)
+        return _with_doubtful_inputs(problem, guess, estimate)
 
 
 def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
@@ -302,9 +306,11 @@ def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, estimate: Fit) ->
     at_start = (flights, guess.e.simulated, sticks_of(problem.model))
     # A fit follows numbers in any unit, and does not tell.
     doubts = wrong_units(*at_start)
+    adequacy = estimate.adequacy.only_if(["the unit of an input is in doubt"] if doubts else [])
     if not estimate.adequacy.adequate:
         doubts += against_start(*at_start)
-    return dataclasses.replace(estimate, notes=(*(f.sentence for f in doubts), *estimate.notes))
+    notes = (*(f.sentence for f in doubts), *estimate.notes)
+    return dataclasses.replace(estimate, adequacy=adequacy, notes=notes)
 
 
 def _search(

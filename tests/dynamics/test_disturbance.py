@@ -195,7 +195,7 @@ D: {az: {col: Zc}, up: {col: -Zc}}
 """
 
 
-@pytest.mark.parametrize("poles", [1, 2])
+@pytest.mark.parametrize("poles", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_output_that_is_the_pushed_derivative_has_the_push(tmp_path, poles):
     """az is w' and up is -w'; lift lacks the control and w is a state: they have the motion alone.
 

@@ -218,6 +218,7 @@ def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate(method
     assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
 
 
+@pytest.mark.slow
 def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
     phi = np.full(N, np.deg2rad(3.0))
     record = Flight(dt=DT, inputs={"u": U}, outputs={"p": FIRST.outputs["p"], "s": phi})

@@ -90,7 +90,15 @@ def test_a_unit_against_that_of_the_file_is_doubted(load, size):
     small = of(flights(load(0.1 * P, unit="deg/s", unit_of_p="rad/s")))
     assert len(misread(small)) == 1
     assert record_doubts(small).words == []
+    assert record_doubts(small).unsure == ["the file says 'deg/s' of p"]
     assert misread(of(flights(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s")))) == []
+
+
+def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_leaves_no_plain_yes(load):
+    fast = P * 12.0 / np.percentile(np.abs(P), 99)
+    doubts = record_doubts(of(flights(load(fast))))
+    assert doubts.words == []
+    assert doubts.unsure == ["p looks like deg/s read as rad/s"]
 
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):

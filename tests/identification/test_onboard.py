@@ -47,6 +47,7 @@ def params(model, **more):
     return model.Params(**{**naming.asdict(ROLL.vehicle().params), **more})
 
 
+@pytest.mark.slow
 def test_a_servo_and_two_delays_are_recovered():
     model = models.with_servos(ROLL.model, ["lat"])
     model = models.with_delays(model, ["lat"], ["phi"], order=3)

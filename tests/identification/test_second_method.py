@@ -72,6 +72,7 @@ def _problem(folder: Path, gust: float, method: str, seed: int = 4) -> Problem:
     return Problem(yaw.model, yaw.vehicle({}).params, [_record(gust, seed)], free, method=method)
 
 
+@pytest.mark.slow
 def test_estimates_that_gusts_have_made_are_not_to_be_trusted(tmp_path):
     # As much gust as answer: slow drift is taken for a slow pole of the yaw gyro's feedback.
     problem = _problem(tmp_path, 1.5, "output-error")

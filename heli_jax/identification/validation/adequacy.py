@@ -81,6 +81,10 @@ class Adequacy(NamedTuple):
         doubts = (*self.doubts, *doubts)
         return self._replace(adequate=False, doubts=doubts) if doubts else self
 
+    def only_if(self, words: Sequence[str]) -> "Adequacy":
+        """The same, no plain yes where there are such reasons, each in a few words."""
+        return self._replace(limited="; ".join([*filter(None, [self.limited]), *words]))
+
     @property
     def unjudged(self) -> bool:
         """Whether the optimiser stopped before an optimum: how a model looks there says nothing."""

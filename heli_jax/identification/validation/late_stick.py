@@ -131,10 +131,9 @@ def with_late_stick(adequacy: Adequacy, late: LateStick | None) -> Adequacy:
     """The adequacy, no plain yes where inputs look late."""
     if late is None:
         return adequacy
-    words = [adequacy.limited] if adequacy.limited else []
-    words.append(f"steps of {', '.join(late.inputs)} fall between stamps" if late.freed else "")
-    words[-1] = words[-1] or late.words
-    return adequacy._replace(limited="; ".join(words), remarks=(late.sentence, *adequacy.remarks))
+    between = f"steps of {', '.join(late.inputs)} fall between stamps" if late.freed else ""
+    adequacy = adequacy.only_if([between or late.words])
+    return adequacy._replace(remarks=(late.sentence, *adequacy.remarks))
 
 
 def slow_sticks(

@@ -49,6 +49,8 @@ class Misread(NamedTuple):
 
     finding: Finding
     words: str = ""
+    unsure: str = ""
+    """where it is not sure: why an adequate model is so under a condition alone"""
 
 
 def misread(problem: Problem) -> list[Misread]:
@@ -75,6 +77,8 @@ class RecordDoubts(NamedTuple):
     findings: list[Finding]
     words: list[str]
     """why no model of these numbers is adequate, each reason in a few words"""
+    unsure: list[str]
+    """what keeps a fit of them from a plain yes, likewise"""
 
 
 def record_doubts(problem: Problem) -> RecordDoubts:
@@ -96,6 +100,7 @@ def record_doubts(problem: Problem) -> RecordDoubts:
             *(one.finding for one in odd),
         ],
         [*words, *contradictions(problem), *(one.words for one in odd)],
+        list(dict.fromkeys(one.unsure for one in doubts if one.unsure)),
     )
 
 
@@ -146,7 +151,8 @@ def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
             f"{shown(signal.contradicted)} of {shown(signal.name)}: if the file is right, {off}, "
             "and the estimates are wrong with it; without unit the file's is taken."
         )
-        yield Misread(Finding("signs and units", "doubt", words))
+        unsure = f"the file says {shown(signal.contradicted)} of {name}"
+        yield Misread(Finding("signs and units", "doubt", words), unsure=unsure)
 
 
 def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Misread]:
@@ -197,8 +203,10 @@ def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Mi
                 "rad, with every estimate off by 57; state unit: deg if so."
             )
         certain = (size > impossible and not flown) or signal.contradicted == unit
-        sure = f"{name} looks like {unit} read as {signal.unit}" if certain else ""
-        yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
+        short = f"{name} looks like {unit} read as {signal.unit}"
+        finding = Finding("signs and units", "doubt", words, size, criterion)
+        # What was flown upside down is in its own unit as likely as not.
+        yield Misread(finding, short if certain else "", "" if certain or flown else short)
 
 
 def _of_fuselage(model: Model, name: str) -> bool:

@@ -92,9 +92,8 @@ def noisy_inputs(
 def with_noisy_inputs(adequacy: Adequacy, noisy: tuple[NoisyInput, ...]) -> Adequacy:
     """The adequacy, no plain yes where the noise of an input moves an estimate."""
     for one in noisy:
-        words = [*([adequacy.limited] if adequacy.limited else []), one.words]
         remarks = (one.sentence, *adequacy.remarks)
-        adequacy = adequacy._replace(limited="; ".join(words), remarks=remarks)
+        adequacy = adequacy.only_if([one.words])._replace(remarks=remarks)
     return adequacy
 
 

@@ -240,14 +240,11 @@ def with_unmodelled(
     """
     if gappy:
         words = f"what {', '.join(gappy)} may lack was not asked, since samples are missing"
-        limited = [adequacy.limited] if adequacy.limited else []
-        adequacy = adequacy._replace(limited="; ".join([*limited, words]))
+        adequacy = adequacy.only_if([words])
     if not lacking:
         return adequacy
     adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in lacking)))
-    words = [adequacy.limited] if adequacy.limited else []
-    words += [f.words for f in lacking if f.matters]
-    return adequacy._replace(limited="; ".join(words))
+    return adequacy.only_if([f.words for f in lacking if f.matters])
 
 
 def _of_output(
