@@ -128,10 +128,11 @@ def test_a_model_without_disturbance_is_refused(bench30):
     "fixed",
     [
         ("sigma_y", "tau_w"),
-        pytest.param(("sigma_w", "tau_w", "sigma_y"), marks=pytest.mark.slow),
+        ("sigma_w", "tau_w", "sigma_y"),
     ],
     ids=" ".join,
 )
+@pytest.mark.slow
 def test_noise_may_be_fixed(disturbed, fixed):
     params, problem, free = disturbed
     start = replace(problem.vehicle, sigma_w=params.sigma_w, tau_w=params.tau_w)

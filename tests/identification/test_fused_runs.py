@@ -186,6 +186,7 @@ def test_records_fitted_together_are_as_each_by_itself(fitted):
             np.testing.assert_allclose(found.values[name][k::3], found.values[name][k], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_many_records_are_fitted_as_scipy_fits_them():
     free = {"Ixx": Free(0.03), "If": Free(2e-4)}
     flights = [record(BENCH, seed=k, n=150) for k in range(24)]
@@ -203,6 +204,7 @@ def test_many_records_are_fitted_as_scipy_fits_them():
             assert abs(found.values[name][k] - value) < 1e-2 * spread
 
 
+@pytest.mark.slow
 def test_a_records_cost_is_its_own(fitted):
     whole = record(BENCH, seed=5, n=150)
     # Of the last one too few, of the one before as many as `fit` takes.

@@ -156,6 +156,7 @@ def test_the_scale_of_the_offset_is_that_of_the_stick():
     assert scale == pytest.approx(10 * np.std(flight.inputs["x_roll"]))
 
 
+@pytest.mark.slow
 def test_a_slow_mode_leaves_the_offset_to_be_found():
     # The spiral of an aeroplane: what an aileron that is off by its own deflection does in the end
     # is a bank of radians, which the record never sees; a constant cannot stand for all of that.

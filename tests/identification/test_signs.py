@@ -103,7 +103,8 @@ def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
         assert one.upper95 - one.value == pytest.approx(one.value - one.lower95, rel=1e-6)
 
 
-@pytest.mark.parametrize("wrong", [pytest.param(0.5, marks=pytest.mark.slow), 3.0])
+@pytest.mark.parametrize("wrong", [0.5, 3.0])
+@pytest.mark.slow
 def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
     # Over 20 s the simulation grows by e^10 and e^60.
     found = fit(problem({"Lp": Free(wrong), "Ld": Free(-1.0)}))
