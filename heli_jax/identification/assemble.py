@@ -42,9 +42,7 @@ from heli_jax.identification.validation.aliases import (
     fast_modes,
     measurement_noise,
 )
-from heli_jax.identification.validation.closed_loop_trust import (
-    known_no_gusts,
-)
+from heli_jax.identification.validation.closed_loop_trust import Loop, known_no_gusts
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
@@ -96,7 +94,7 @@ class _HeldOut(NamedTuple):
     in_frequency: HeldOutFrequency | None = None
 
 
-def _held_out(end: End) -> _HeldOut:
+def _held_out(end: End, loop: Loop) -> _HeldOut:
     problem, at = end.problem, end.at
     flights = tuple(f for f in problem.flights if f.hold_out)
     if not flights:
@@ -104,7 +102,11 @@ def _held_out(end: End) -> _HeldOut:
     # With their own initial states and biases: those of the fitted flights belong to these.
     checked = validate(problem, at.layout, at.z, at.noise, flights)
     free_run = free_runs(flights, checked.free_run)
-    in_frequency = validate_in_frequency(problem, at, end.e, flights) if end.arrived else None
+    in_frequency = None
+    if end.arrived:
+        closed = loop.held or any(f.present for f in loop.found)
+        feedback = closed and not loop.instruments
+        in_frequency = validate_in_frequency(problem, at, end.e, flights, feedback=feedback)
     said = in_frequency.sentences if in_frequency else ()
     return _HeldOut(signals_of(checked.e, flights), free_run, (*checked.notes, *said), in_frequency)
 
@@ -167,7 +169,7 @@ def assemble(
     judged = judge(end, errors, numbers_of)
     errors, numbers = judged.errors, judged.numbers
     layout, status = search.layout, _status(end, errors.verdict)
-    held = _held_out(end)
+    held = _held_out(end, judged.loop)
     # Of rounding, and of numbers that are none, notes of their own speak.
     astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
     notes = [

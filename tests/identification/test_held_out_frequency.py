@@ -181,7 +181,14 @@ def test_an_unstable_machine_is_judged_where_no_simulation_stays(tmp_path):
         y += rng.standard_normal(y.shape) * [5e-3, 2e-3]
         outputs = {"p": y[:, 0], "phi": y[:, 1]}
         made.append(
-            Flight(dt=dt, inputs={"lat": u}, outputs=outputs, name=name, hold_out=name == "second")
+            Flight(
+                dt=dt,
+                inputs={"lat": u},
+                outputs=outputs,
+                instruments={"lat": steps},
+                name=name,
+                hold_out=name == "second",
+            )
         )
     free = {"Lp": Free(-0.5), "Llat": Free(7.0), "Lphi": Free(1.0)}
     found = fit(Problem(model.model, model.vehicle().params, made, free, method="frequency-error"))

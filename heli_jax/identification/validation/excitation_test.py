@@ -57,6 +57,8 @@ class Followed(NamedTuple):
     p_value: float
     explained: float
     """part of the output's power that follows the excitation which the model explains"""
+    by_chance: float = 0.0
+    """standard deviation of that part"""
 
 
 def _in_words(followed: Followed) -> str:
@@ -164,7 +166,7 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
         both = [_lines(v, count) for v in (measured, list(map(_between_ends, measured)))]
         found = [_in_bands(y, y, np.ones((len(y), 1)), X) for y in both]
         for name, *statistics in zip(names, *found, strict=True):
-            sums[name] = sums.get(name, np.zeros((2, 4))) + np.stack(statistics)
+            sums[name] = sums.get(name, np.zeros((2, 5))) + np.stack(statistics)
     return {
         # Of two questions about one record.
         name: min(1.0, 2.0 * float(np.min(scipy.special.chdtrc(s[:, 1], s[:, 0]))))
@@ -234,13 +236,14 @@ def errors_against_excitation(
             sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
         size = sizes[id(W)]
         for name, statistics in zip(names, _in_bands(e, y, size, X), strict=True):
-            sums[name] = sums.get(name, np.zeros(4)) + statistics
+            sums[name] = sums.get(name, np.zeros(5)) + statistics
     return {
         name: Followed(
             float(scipy.special.chdtrc(freedom, statistic)),
             float(1.0 - left / answer) if answer > 0 else 1.0,
+            float(np.sqrt(variance) / answer) if answer > 0 else np.inf,
         )
-        for name, (statistic, freedom, left, answer) in sums.items()
+        for name, (statistic, freedom, left, answer, variance) in sums.items()
         if freedom > 0
     }
 
@@ -255,12 +258,12 @@ def _in_bands(
     y: Complex[np.ndarray, "K p"],
     size: Float[np.ndarray, "K s"],
     X: Complex[np.ndarray, "K m"],
-) -> Float[np.ndarray, "p 4"]:
-    """By output the test's statistic and degrees of freedom, and the powers that follow the
-    excitation of the residual and of what was measured, less what chance makes; of one size each,
-    or (s = 1) all of the same."""
+) -> Float[np.ndarray, "p 5"]:
+    """By output the test's statistic and degrees of freedom, the powers that follow the excitation
+    of the residual and of what was measured, less what chance makes, and the variance of the first
+    by chance; of one size each, or (s = 1) all of the same."""
     first, lines = 0, float(max(_FIRST, 4 * X.shape[1]))
-    total = np.zeros((e.shape[1], 4))
+    total = np.zeros((e.shape[1], 5))
     while first + int(lines) <= len(e):
         band = slice(first, first + int(lines))
         n, first, lines = int(lines), band.stop, lines * _GROWTH
@@ -280,7 +283,9 @@ def _in_bands(
         statistic = -(2.0 * n - m - 1.0) * np.log1p(-share)
         # Not the model's response: a wrong model's may be larger than anything that was measured.
         scale = np.mean(size[band] ** 2, axis=0)[:, None]
-        chance = m[:, None] * np.maximum(whole - parts, 0.0) / (n - m)[:, None]
-        statistics = np.column_stack([statistic, 2.0 * m, scale * (parts - chance)])
+        per_line = np.maximum(whole - parts, 0.0) / (n - m)[:, None]
+        chance = m[:, None] * per_line
+        variance = m * (scale[:, 0] * per_line[:, 0]) ** 2
+        statistics = np.column_stack([statistic, 2.0 * m, scale * (parts - chance), variance])
         total += np.where(asked[:, None], statistics, 0.0)
     return total

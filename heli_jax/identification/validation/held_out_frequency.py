@@ -63,6 +63,8 @@ _SAME_RATE = 1e-6
 """relative difference of sample times that are one"""
 _FEWEST = 12
 """lines of a band at least"""
+_SURE = 0.05
+"""standard deviation of what is explained by chance, above which it is not said"""
 _MISFIT = 2.0
 """squared errors of a response over their variance, from which on chance alone makes none"""
 _NO_EFFECT = 1e-10
@@ -81,7 +83,7 @@ class _Fitted(NamedTuple):
 
 
 def validate_in_frequency(
-    problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight]
+    problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight], *, feedback: bool
 ) -> HeldOutFrequency | None:
     """The flights held out against a fit in frequency; None of a fit in time.
 
@@ -92,6 +94,7 @@ def validate_in_frequency(
         at: where the fit ended.
         e: the evaluation there.
         held: the flights held out.
+        feedback: whether inputs are used that follow the outputs.
     """
     estimator = at.layout.estimator
     if not held or not estimator.noise_spectrum:
@@ -103,12 +106,23 @@ def validate_in_frequency(
     fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
     with np.errstate(all="ignore"):
         try:
-            if estimator.fits_responses:
-                return _by_responses(problem, at, fitted, held)
-            return _by_lines(problem, at, fitted, held)
+            judged = _by_responses if estimator.fits_responses else _by_lines
+            found = judged(problem, at, fitted, held)
         except (ValueError, np.linalg.LinAlgError) as error:
             words = f"Held out: not judged in frequency: {error}"
             return HeldOutFrequency((), (), (words,))
+    # What feedback makes of estimates is another thing in every flight, and no news of the machine.
+    return _without_estimates(found) if feedback and found.flights else found
+
+
+def _without_estimates(found: HeldOutFrequency) -> HeldOutFrequency:
+    left = {"estimates_p_value": None, "furthest": None, "explained": {}, "worse": ()}
+    words = (
+        "Held out: inputs follow the outputs, and no instrument is used: what the flights say of "
+        "the parameters, and what follows their inputs, is not asked, since feedback biases both."
+    )
+    flights = tuple(f._replace(**left) for f in found.flights)
+    return found._replace(flights=flights, notes=(*found.notes, words))
 
 
 def _by_lines(
@@ -183,7 +197,6 @@ def _flight_by_lines(
     of_noise = float(sum(2 * r.lines * len(names) for r in records_of(at.layout)))
     by_instrument = data.flights[0].by_instrument is not None
     own = None, None
-    # What feedback makes of estimates without an instrument is no news of the machine.
     if by_instrument or at.data.flights[0].by_instrument is None:
         # In its own noise: stronger gusts would pass for another machine.
         itself = whitening_by(machine, errors)
@@ -308,11 +321,14 @@ def _own_estimates(
 
 
 def _explained(followed: dict[str, Followed]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """By output what is explained, and the outputs where the model is worse than none."""
+    """By output what is explained, where that is known, and the outputs where the model is worse
+    than none."""
     level = LEVEL / max(len(followed), 1)
-    worse = (n for n, f in followed.items() if f.p_value < level and not f.explained >= 0.0)
-    # What chance takes off may be more than is left.
-    return {n: min(f.explained, 1.0) for n, f in followed.items()}, tuple(worse)
+    worse = [n for n, f in followed.items() if f.p_value < level and not f.explained >= 0.0]
+    # Of an output that hardly follows the excitation any share would be one of noise. What chance
+    # takes off may be more than is left.
+    known = [n for n, f in followed.items() if f.by_chance < _SURE or n in worse]
+    return {n: min(followed[n].explained, 1.0) for n in known}, tuple(worse)
 
 
 def _hz(record: Record, dt: float) -> Float[np.ndarray, " K"]:
