@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, Signal, fit
+from heli_jax.flights.flight import Source
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.sentences import _tied_together
 from heli_jax.identification.identifiability.verdict import Pair, Unknown
@@ -208,3 +209,12 @@ def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
         assert verdict.roughly == said
         where = "only roughly time_shift (its 95 % interval reaches the end of its search)"
         assert (where in verdict.text) == bool(said)
+
+
+def test_an_input_whose_unit_is_in_doubt_is_named_in_the_first_line():
+    flight = record(1, 0.0, 0.02)
+    percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
+    source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
+    read = Flight(dt=DT, inputs=percent, outputs=dict(flight.outputs), source=source)
+    found = fit(problem(read, L=Free(-1.0), B=Free(2.0)))
+    assert "the unit of d is in doubt" in found.adequacy.summary
