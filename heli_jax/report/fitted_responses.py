@@ -78,6 +78,8 @@ class FittedResponses(NamedTuple):
     notes: tuple[str, ...]
     incoherent: tuple[str, ...] = ()
     """those without a coherence worth showing, as `lat to p`; they have no figure"""
+    held_out: tuple[FittedPair, ...] = ()
+    """of the flights held out, as many as are shown"""
 
 
 def fitted_responses(
@@ -106,12 +108,7 @@ def fitted_responses(
         words = f"the model cannot be linearised about {at.words or 'zero'}"
         return FittedResponses((), 0, (), at.words, (*responses.notes, words))
     curves = _Curves(fit, of, tuple(free), (responses.omega[0], _BEYOND * responses.omega[-1]))
-    means = {
-        (input, name): octave_mean(responses.omega, pair.coherence)
-        for name, output in responses.outputs.items()
-        for input, pair in output.pairs.items()
-    }
-    coherent = {of: float(np.sum(c[c >= COHERENT])) for of, c in means.items()}
+    coherent = _coherent(responses)
     pairs = _pairs(responses, curves, coherent)
     handling = tuple(
         Handling(p, _of_model(curves, p), measured_handling(responses, p))
@@ -122,7 +119,9 @@ def fitted_responses(
     left_out = max(len(pairs) - MOST_PAIRS, 0)
     drawn = tuple(pairs[:MOST_PAIRS])
     incoherent = tuple(f"{input} to {name}" for (input, name), c in coherent.items() if not c)
-    return FittedResponses(drawn, left_out, handling, at.words, responses.notes, incoherent)
+    held_out, notes = _of_held_out(problem, settings, curves)
+    notes = (*responses.notes, *notes)
+    return FittedResponses(drawn, left_out, handling, at.words, notes, incoherent, held_out)
 
 
 class _Curves(NamedTuple):
@@ -182,6 +181,17 @@ def _sd(estimate: Estimate, fit: Fit) -> float:
     return max(half / _Z95, e.sd)
 
 
+def _coherent(responses: FlightResponses) -> dict[tuple[str, str], float]:
+    """By input and output the sum of the coherence, a mean over an octave, where it is worth
+    showing."""
+    means = {
+        (input, name): octave_mean(responses.omega, pair.coherence)
+        for name, output in responses.outputs.items()
+        for input, pair in output.pairs.items()
+    }
+    return {names: float(np.sum(c[c >= COHERENT])) for names, c in means.items()}
+
+
 def _pairs(
     responses: FlightResponses, curves: _Curves, coherent: Mapping[tuple[str, str], float]
 ) -> list[FittedPair]:
@@ -198,6 +208,24 @@ def _pairs(
         measured = responses.omega, H, sd, pair.coherence
         ranked.append((total, FittedPair(input, name, *measured, model, pair.half95)))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
+
+
+def _of_held_out(
+    problem: Problem, settings: Settings, curves: _Curves
+) -> tuple[tuple[FittedPair, ...], tuple[str, ...]]:
+    """The responses of the flights held out, as many as are shown, and why there is none."""
+    held = tuple(f for f in problem.flights if f.hold_out)
+    if not held:
+        return (), ()
+    try:
+        responses = flight_responses(held, settings)
+    except ValueError as e:
+        return (), (f"no responses of the flights held out: {e}",)
+    pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
+    if pairs:
+        return pairs, ()
+    words = "no figure of the flights held out: together none of their responses is coherent"
+    return (), (words,)
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:

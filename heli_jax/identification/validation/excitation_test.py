@@ -11,7 +11,7 @@ Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System 
 (1999), 16.6, for residuals against inputs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
@@ -195,14 +196,31 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
         problem: with the flights, their inputs and instruments.
         at: where a fit by frequency error ended.
     """
-    layout, data, noise, z = at
-    errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
+    errors = jax.device_get(errors_of_lines(*at).errors)
+    by = instruments_of(problem) if at.data.flights[0].by_instrument is not None else ()
+    return errors_against_excitation(problem.training, at, errors, by)
+
+
+def errors_against_excitation(
+    flights: Sequence[Flight],
+    at: Solution,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    by: Sequence[str],
+) -> dict[str, Followed]:
+    """By output what of errors follows the excitation; outputs of too few lines are left out.
+
+    Args:
+        flights: those of the layout, fitted or held out.
+        at: where they are evaluated.
+        errors: by record.
+        by: the inputs that are taken by their instrument.
+    """
+    layout, _, noise, _ = at
     sums: dict[str, np.ndarray] = {}
     sizes: dict[int, np.ndarray] = {}
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
-        flight, part = problem.training[record.flight], slice(record.first, record.last)
+        flight, part = flights[record.flight], slice(record.first, record.last)
         names = layout.outputs[record.flight]
-        by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
         drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
         drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
         if not drives:
