@@ -82,6 +82,17 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
 
     Where an output has one noise in all flights, what is not stated is guessed from all of them.
     """
+    noise = first_noise_sizes(problem, flights)
+    return estimator_of(problem.method).prepared_for(problem, noise, flights)
+
+
+def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
+    """The same without what the method adds, such as a spectrum.
+
+    Args:
+        problem: says which method shares noise between flights.
+        flights: with any outputs.
+    """
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
     # The median: one flight in which an output hardly moves, or jumps, has no say.
@@ -94,8 +105,7 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
         {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in sorted(flight.outputs)}
         for flight, guess in zip(flights, guesses, strict=True)
     )
-    noise = Noise(sd, np.zeros((), dtype))
-    return estimator_of(problem.method).prepared_for(problem, noise, flights)
+    return Noise(sd, np.zeros((), dtype))
 
 
 def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> RelaxedOptimum:

@@ -12,7 +12,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
-from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -80,7 +80,10 @@ def validate(
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
     """The noise of the flights held out: what was estimated where all flights share it, else a
     guess from their own records."""
-    guess = first_noise(problem, held)
+    # A spectrum is that of flights with the same outputs, which those held out need not be; in time
+    # it is not asked for.
+    in_rows = layout.estimator.nuisances_in_rows
+    guess = first_noise(problem, held) if in_rows else first_noise_sizes(problem, held)
     if not layout.estimator.shared_noise:
         return guess
     known = {n: s for flight in noise.sd for n, s in flight.items()}
