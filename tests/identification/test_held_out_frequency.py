@@ -118,6 +118,26 @@ def test_it_stands_in_fit_json_and_in_tables(found):
     assert len(tables.held_out_bands(held_out).rows) == len(held_out.bands)
 
 
+@pytest.mark.slow
+def test_flights_held_out_may_have_other_outputs_each_and_some_that_never_move(flights):
+    fitted, both, same = flights[0], flights[-1], flights[1]
+    still = np.zeros(HELD)
+    dead = dataclasses.replace(both, outputs={**both.outputs, "roll": still + 0.1}, name="dead")
+    resting = dataclasses.replace(
+        same, inputs=dict.fromkeys(same.inputs, still), outputs={"roll": still}, name="resting"
+    )
+    held_out = [both, same, dead, resting]
+    problem = Problem(
+        models.roll_on_stand, vehicle(BENCH), [fitted, *held_out], FREE, method="frequency-error"
+    )
+    said = fit(problem).held_out_frequency
+    assert [f.flight for f in said.flights] == ["both", "same"]
+    assert [n for n in said.notes if "none of its outputs (roll) ever moves" in n] == list(
+        said.notes
+    )
+    assert len(said.notes) == 2
+
+
 def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
     other = dataclasses.replace(flights[-1], hold_out=False)
     with pytest.raises(ValueError, match="both: output roll_rate is not in every flight"):

@@ -28,8 +28,8 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     # Output error has simulated on its way; a filter predicts one step ahead, which is no run.
     outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
     # Fetched all at once: every fetch by itself would wait for the device.
-    outputs, innovations, r, J, named, slopes = jax.device_get(
-        (outputs, at.innovations, at.r, at.J, *_named(layout, data, z))
+    outputs, innovations, r, J, values, slopes = jax.device_get(
+        (outputs, at.innovations, at.r, at.J, *named(layout, data, z))
     )
     simulated = with_biases(layout, outputs)
     raw = tuple(
@@ -37,7 +37,7 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
         for flight, run in zip(data.flights, simulated, strict=True)
     )
     rms = outputs.state_rms
-    return Evaluation(simulated, raw, rms, innovations, r, J, named, slopes, np.asarray(z))
+    return Evaluation(simulated, raw, rms, innovations, r, J, values, slopes, np.asarray(z))
 
 
 def simulated_outputs(
@@ -54,14 +54,22 @@ def simulated_outputs(
 
 
 @eqx.filter_jit
-def _named(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
-    def named(z: Array) -> Array:
+def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Array]:
+    """Values of parameters, gains and time shift [SI], and their slopes by the coordinates.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
+
+    def values(z: Array) -> Array:
         u = unpack(layout, data, z)
         shift = () if u.shift is None else (u.shift,)
         return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
 
     # Each depends on its own coordinate alone: the rest of the Jacobian is zero.
-    return named(z), jnp.diagonal(jax.jacfwd(named)(z))
+    return values(z), jnp.diagonal(jax.jacfwd(values)(z))
 
 
 def deviations(J: np.ndarray) -> np.ndarray:

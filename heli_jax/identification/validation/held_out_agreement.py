@@ -8,6 +8,8 @@ from heli_jax.numbers import number, p_value, percent, plain_words
 LEVEL = 0.01
 """of the test whether a flight's own estimates are those of the fit"""
 
+_DIGITS = 9
+
 
 class HeldOutBand(NamedTuple):
     """Errors of one output in a band of frequencies, over all flights held out."""
@@ -29,10 +31,20 @@ class Furthest(NamedTuple):
 
     parameter: str
     own: float
-    """what the flight says by itself: one step of Gauss and Newton from the fit [SI]"""
+    """what the flight says by itself: where it differs where steps of Gauss and Newton stay, else
+    after the first from the fit [SI]"""
     fitted: float
     sds: float
     """joint standard deviations between the two"""
+
+    @property
+    def values(self) -> tuple[str, str]:
+        """Both, with as many digits as tell them apart."""
+        for digits in range(3, _DIGITS):
+            both = (number(self.own, digits), number(self.fitted, digits))
+            if both[0] != both[1]:
+                break
+        return plain_words(both[0]), plain_words(both[1])
 
 
 class HeldOutFlight(NamedTuple):
@@ -93,8 +105,8 @@ class HeldOutFlight(NamedTuple):
                 ""
                 if f is None
                 else (
-                    f", most of all {f.parameter}, about {plain_words(number(f.own, 3))} there for "
-                    f"{plain_words(number(f.fitted, 3))} ({f.sds:.1f} joint standard deviations)"
+                    f", most of all {f.parameter}, about {f.values[0]} there for "
+                    f"{f.values[1]} ({f.sds:.1f} joint standard deviations)"
                 )
             )
             said.append(

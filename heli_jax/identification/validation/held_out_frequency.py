@@ -27,13 +27,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.analysis.response_agreement import expected_interval
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import deviations, named
 from heli_jax.identification.estimation.frequency_gusts import LEAST, PART, whitening_by
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
@@ -53,12 +53,18 @@ from heli_jax.identification.validation.excitation_test import (
     errors_against_excitation,
 )
 from heli_jax.identification.validation.held_out_agreement import (
-    Furthest,
     HeldOutBand,
     HeldOutFlight,
     HeldOutFrequency,
 )
+from heli_jax.identification.validation.own_estimates import (
+    Fitted,
+    Rows,
+    explained_by_estimates,
+    own_estimates,
+)
 
+_NO_SPECTRUM = "its errors have no spectrum: two of its outputs are one, or there is no noise"
 _SAME_RATE = 1e-6
 """relative difference of sample times that are one"""
 _FEWEST = 12
@@ -67,19 +73,6 @@ _SURE = 0.05
 """standard deviation of what is explained by chance, above which it is not said"""
 _MISFIT = 2.0
 """squared errors of a response over their variance, from which on chance alone makes none"""
-_NO_EFFECT = 1e-10
-"""part of the largest size below which a direction has no effect"""
-
-
-class _Fitted(NamedTuple):
-    """What a fit knows of its parameters."""
-
-    information: Float[np.ndarray, "q q"]
-    """of the coordinates that the optimiser has"""
-    names: tuple[str, ...]
-    values: Float[np.ndarray, " q"]
-    slopes: Float[np.ndarray, " q"]
-    """of the values by the coordinates"""
 
 
 def validate_in_frequency(
@@ -103,7 +96,7 @@ def validate_in_frequency(
     J = np.asarray(e.J, float)[:, :q]
     if not np.isfinite(J).all():
         return None
-    fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
+    fitted = Fitted(J.T @ J, deviations(J), at.layout.of_interest, np.asarray(e.named))
     with np.errstate(all="ignore"):
         try:
             judged = _by_responses if estimator.fits_responses else _by_lines
@@ -126,7 +119,7 @@ def _without_estimates(found: HeldOutFrequency) -> HeldOutFrequency:
 
 
 def _by_lines(
-    problem: Problem, at: Solution, fitted: _Fitted, held: Sequence[Flight]
+    problem: Problem, at: Solution, fitted: Fitted, held: Sequence[Flight]
 ) -> HeldOutFrequency:
     """At the lines of each flight, against the spectrum of the fitted ones."""
     found, lines, notes = [], [], []
@@ -136,7 +129,12 @@ def _by_lines(
             notes.append(f"{label}, held out: not judged in frequency: {why}.")
             continue
         notes += [f"{label}, held out: {why}."] if why else []
-        made = _flight_by_lines(problem, at, fitted, (label, sound))
+        try:
+            made = _flight_by_lines(problem, at, fitted, (label, sound))
+        except np.linalg.LinAlgError:
+            # What one flight lacks takes nothing off the others.
+            notes.append(f"{label}, held out: not judged in frequency: {_NO_SPECTRUM}.")
+            continue
         found.append(made[0])
         lines += made[1]
     return HeldOutFrequency(tuple(found), _bands(at, lines), tuple(notes))
@@ -150,12 +148,18 @@ def _comparable(at: Solution, flight: Flight) -> tuple[Flight | None, str]:
         return None, "no fitted flight has its sample time, and so none its noise"
     if not common:
         return None, f"it has none of the outputs that were fitted ({', '.join(names)})"
+    still = [n for n, y in common.items() if np.nanmin(y) == np.nanmax(y)]
+    common = {n: y for n, y in common.items() if n not in still}
+    if not common:
+        return None, f"none of its outputs ({', '.join(still)}) ever moves"
     sound = replace(flight, outputs=common)
     if not parts_of(sound):
         return None, "no part of it has all of its outputs, which a Fourier transform needs"
     by = at.data.flights[0].by_instrument is not None
     missing = by and not flight.instruments
-    return sound, "it holds no instrument, and is judged by its inputs" if missing else ""
+    said = [f"{n} never moves, and is left out in frequency" for n in still]
+    said += ["it holds no instrument, and is judged by its inputs"] if missing else []
+    return sound, "; ".join(said)
 
 
 class _Line(NamedTuple):
@@ -172,7 +176,7 @@ class _Line(NamedTuple):
 def _flight_by_lines(
     problem: Problem,
     at: Solution,
-    fit: _Fitted,
+    fit: Fitted,
     of: tuple[str, Flight],
 ) -> tuple[HeldOutFlight, list[_Line]]:
     """One flight, with its label."""
@@ -185,23 +189,31 @@ def _flight_by_lines(
     # By the inputs themselves: by instrument there is no sum of squares.
     direct = Noise((sd,), np.zeros(()), whitening, np.zeros(()), np.ones(()))
     z = _with_nuisances(problem, at, layout, data, direct)
-    errors, machine, taken = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
+    errors, _, taken = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
     squares = sum(
         float(np.sum(np.abs(np.einsum("kij,kj->ki", np.asarray(W), e)) ** 2))
         for W, e in zip(whitening, errors, strict=True)
     )
     freedom = float(sum(2 * e.size - t.numbers for e, t in zip(errors, taken, strict=True)))
     r, J = _rows(at, layout, data, direct, z)
-    allowed = 2.0 * squares - _explained_by_estimates(r, J, fit.information)
+    allowed = 2.0 * squares - explained_by_estimates(r, J, fit.information)
     chi = allowed / freedom
     of_noise = float(sum(2 * r.lines * len(names) for r in records_of(at.layout)))
     by_instrument = data.flights[0].by_instrument is not None
     own = None, None
     if by_instrument or at.data.flights[0].by_instrument is None:
         # In its own noise: stronger gusts would pass for another machine.
-        itself = whitening_by(machine, errors)
-        itself = direct._replace(whitening=itself, by_instrument=np.asarray(float(by_instrument)))
-        own = _own_estimates(*_rows(at, layout, data, itself, z), fit)
+        itself = direct._replace(by_instrument=np.asarray(float(by_instrument)))
+
+        def rows(z: Array) -> Rows:
+            made = jax.device_get(errors_of_lines(layout, data, direct, z))
+            noise = itself._replace(whitening=whitening_by(made.machine, made.errors))
+            return _rows(at, layout, data, noise, z)
+
+        def before(z: Array) -> Rows:
+            return _rows(at, layout, data, itself, z)
+
+        own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fit)
     names_by = instruments_of(problem) if by_instrument else ()
     there = Solution(layout, data, direct, z)
     followed = errors_against_excitation((flight,), there, errors, names_by)
@@ -217,14 +229,12 @@ def _flight_by_lines(
     )
 
 
-def _rows(
-    at: Solution, layout: Layout, data: Data, noise: Noise, z: Array
-) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r q"]]:
+def _rows(at: Solution, layout: Layout, data: Data, noise: Noise, z: Array) -> Rows:
     """Rows, in units in which noise has variance 1, and their derivative by what is of interest."""
     q = len(at.layout.of_interest)
     made = residual_and_jacobian(layout, data, noise, z)
     # Behind them stand the priors, which are none of this flight's news.
-    return np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q]
+    return Rows(np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q])
 
 
 def _with_nuisances(
@@ -267,57 +277,6 @@ def _whitening(
     made = np.stack(flat, axis=1).reshape(len(f), *W.shape[1:])
     # Below what the fitted flights show noise may grow as that of a random walk.
     return made * np.minimum(f / at_f[0], 1.0)[:, None, None]
-
-
-def _explained_by_estimates(
-    r: Float[np.ndarray, " r"],
-    J: Float[np.ndarray, "r q"],
-    information: Float[np.ndarray, "q q"],
-) -> float:
-    """Of the sum of squares what errors of the estimates may have added."""
-    A, b = information + J.T @ J, J.T @ r
-    sizes = np.sqrt(np.diag(A))
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    # Directions of which neither tells anything add nothing.
-    values, vectors = np.linalg.eigh(A / np.outer(sizes, sizes))
-    kept = values > _NO_EFFECT * values[-1]
-    return float(np.sum((vectors[:, kept].T @ (b / sizes)) ** 2 / values[kept]))
-
-
-def _own_estimates(
-    r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], fit: _Fitted
-) -> tuple[float | None, Furthest | None]:
-    """How likely the flight's own estimates lie as far from the fit's, and which are the furthest.
-
-    Args:
-        r: the flight's rows.
-        J: their derivative.
-        fit: what they are compared with.
-    """
-    own, known = J.T @ J, fit.information
-    sizes = np.sqrt(np.diag(own + known))
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    b, (own, known) = J.T @ r / sizes, (v / np.outer(sizes, sizes) for v in (own, known))
-    values, vectors = np.linalg.eigh(own + known)
-    kept = values > _NO_EFFECT * values[-1]
-    root = vectors[:, kept] / np.sqrt(values[kept])
-    shares, turned = np.linalg.eigh(root.T @ own @ root)
-    # Both have to tell of a direction for anything to be compared along it.
-    both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
-    if not both.any():
-        return None, None
-    directions, shares = root @ turned[:, both], shares[both]
-    along = directions.T @ b
-    statistic = float(np.sum(along**2 * (1.0 / shares - 1.0)))
-    p = float(scipy.special.chdtrc(int(both.sum()), statistic))
-    # What lies along other directions is the same in both, as far as anybody knows.
-    step = -(directions @ (along / shares)) / sizes
-    variance = np.sum(directions**2 * (1.0 / shares + 1.0 / (1.0 - shares)), axis=1) / sizes**2
-    sds = np.abs(step) / np.sqrt(np.where(variance > 0, variance, np.inf))
-    k = int(np.argmax(sds))
-    value = float(fit.values[k])
-    there = value + float(fit.slopes[k]) * float(step[k])
-    return p, Furthest(fit.names[k], there, value, float(sds[k]))
 
 
 def _explained(followed: dict[str, Followed]) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -372,7 +331,7 @@ def _edges(hz: Float[np.ndarray, " K"]) -> list[tuple[float, float]]:
 
 
 def _by_responses(
-    problem: Problem, at: Solution, fitted: _Fitted, held: Sequence[Flight]
+    problem: Problem, at: Solution, fitted: Fitted, held: Sequence[Flight]
 ) -> HeldOutFrequency:
     """By the responses of each flight; of those that are too short by themselves, together."""
     found, short, notes = [], {}, []
@@ -393,7 +352,7 @@ def _by_responses(
 
 
 def _responses_of(
-    problem: Problem, at: Solution, fitted: _Fitted, of: tuple[str, tuple[Flight, ...]]
+    problem: Problem, at: Solution, fitted: Fitted, of: tuple[str, tuple[Flight, ...]]
 ) -> HeldOutFlight:
     """Of some flights together, with their label, in windows as long as those of the fitted ones.
 
@@ -410,15 +369,23 @@ def _responses_of(
     q, first = len(at.layout.of_interest), layout.first_nuisance
     z = jnp.zeros(layout.size, at.z.dtype).at[:first].set(at.z[:first])
     z, noise = layout.estimator.relax(layout, data, None, noise, z)
-    made = residual_and_jacobian(layout, data, noise, z)
-    rows = 2 * noise.whitening.used.size
-    r, J = np.asarray(made.r)[:rows], np.asarray(made.J)[:rows, :q]
+    count = 2 * noise.whitening.used.size
+
+    def before(z: Array) -> Rows:
+        made = residual_and_jacobian(layout, data, noise, z)
+        return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
+
+    def rows(z: Array) -> Rows:
+        there = layout.estimator.relax(layout, data, None, noise, z)
+        made = residual_and_jacobian(layout, data, there[1], there[0])
+        return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
+
     agreement = layout.estimator.response_agreement(layout, data, noise, z, fitted=False)
     assert agreement is not None
-    added = _explained_by_estimates(r, J, fitted.information)
+    added = explained_by_estimates(*before(z), fitted.information)
     chi = agreement.chi_squared - added / agreement.freedom
     agreement = agreement._replace(chi_squared=chi)
-    own = _own_estimates(r, J, fitted)
+    own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fitted)
     ends = agreement.lower95, agreement.upper95, agreement.freedom
     worse = {
         p.output: None
