@@ -41,7 +41,10 @@ def flights() -> list[Flight]:
         dataclasses.replace(same, dt=0.01, name="other rate"),
         dataclasses.replace(same, outputs={"roll_rate": same.outputs["roll"]}, name="rates"),
         dataclasses.replace(
-            same, outputs={**same.outputs, "roll_rate": same.outputs["roll"]}, name="both"
+            same,
+            outputs={**same.outputs, "roll_rate": same.outputs["roll"]},
+            sd={"roll_rate": 0.01},
+            name="both",
         ),
     ]
 
@@ -153,6 +156,8 @@ def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
 def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     names = ("same", "noisy", "turned")
     chosen = [flights[0], *(f for f in flights if f.name in names)]
+    still = {"roll": np.full(HELD, 0.1)}
+    chosen.append(dataclasses.replace(flights[1], name="dead", outputs=still))
     short = [
         dataclasses.replace(
             flights[1],
@@ -178,6 +183,9 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert wrong.worse == ("roll",)
     assert wrong.responses.pairs[0].J > 1000.0
     assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
+    assert "dead, held out: not judged in frequency: none of its outputs (roll) ever moves." in (
+        found[0].notes
+    )
     content = fit_json(*found, None)["held_out_frequency"]
     assert content["flights"][0]["responses"]["pairs"][0]["output"] == "roll"
 

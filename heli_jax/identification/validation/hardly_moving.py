@@ -1,6 +1,8 @@
-"""Inputs that move so little that they tell nothing: a count of the log, a few samples."""
+"""Inputs that move so little that they tell nothing: a count of the log, a few samples. Outputs
+that never move."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -53,3 +55,30 @@ def _one_step(levels: Float[np.ndarray, " k"]) -> str:
     if multiple < _ON_LATTICE or abs(multiple - round(multiple)) > 1e-6 * multiple:
         return ""
     return f"{low:.6g} and {high:.6g}"
+
+
+def moving_outputs(flight: Flight) -> tuple[Flight | None, str]:
+    """The flight with the outputs that move, or None; what to say of the others.
+
+    Args:
+        flight: with at least one measured sample of each output.
+    """
+    outputs = {n: y for n, y in flight.outputs.items() if np.nanmin(y) < np.nanmax(y)}
+    still = ", ".join(n for n in flight.outputs if n not in outputs)
+    if not outputs:
+        return None, f"none of its outputs ({still}) ever moves"
+    said = f"{still} never moves, and is left out in frequency" if still else ""
+    return with_outputs(flight, outputs), said
+
+
+def with_outputs(flight: Flight, names: Collection[str]) -> Flight:
+    """The flight with some of its outputs.
+
+    Args:
+        flight: any.
+        names: of the outputs to keep.
+    """
+    outputs, sd = (
+        {n: v for n, v in of.items() if n in names} for of in (flight.outputs, flight.sd)
+    )
+    return replace(flight, outputs=outputs, sd=sd)

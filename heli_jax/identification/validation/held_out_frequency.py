@@ -21,7 +21,6 @@ Sources: Chow (1960); Pintelon and Schoukens (2012), chapters 9 and 11; Brilling
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -52,6 +51,7 @@ from heli_jax.identification.validation.excitation_test import (
     Followed,
     errors_against_excitation,
 )
+from heli_jax.identification.validation.hardly_moving import moving_outputs, with_outputs
 from heli_jax.identification.validation.held_out_agreement import (
     HeldOutBand,
     HeldOutFlight,
@@ -143,21 +143,19 @@ def _by_lines(
 def _comparable(at: Solution, flight: Flight) -> tuple[Flight | None, str]:
     """The flight with the outputs whose spectrum is known, or None and why; what else to say."""
     names = at.layout.outputs[0]
-    common = {n: y for n, y in flight.outputs.items() if n in names}
+    common = [n for n in flight.outputs if n in names]
     if not any(abs(float(f.dt) / flight.dt - 1.0) < _SAME_RATE for f in at.data.flights):
         return None, "no fitted flight has its sample time, and so none its noise"
     if not common:
         return None, f"it has none of the outputs that were fitted ({', '.join(names)})"
-    still = [n for n, y in common.items() if np.nanmin(y) == np.nanmax(y)]
-    common = {n: y for n, y in common.items() if n not in still}
-    if not common:
-        return None, f"none of its outputs ({', '.join(still)}) ever moves"
-    sound = replace(flight, outputs=common)
+    sound, still = moving_outputs(with_outputs(flight, common))
+    if sound is None:
+        return None, still
     if not parts_of(sound):
         return None, "no part of it has all of its outputs, which a Fourier transform needs"
     by = at.data.flights[0].by_instrument is not None
     missing = by and not flight.instruments
-    said = [f"{n} never moves, and is left out in frequency" for n in still]
+    said = [still] if still else []
     said += ["it holds no instrument, and is judged by its inputs"] if missing else []
     return sound, "; ".join(said)
 
@@ -336,10 +334,16 @@ def _by_responses(
     """By the responses of each flight; of those that are too short by themselves, together."""
     found, short, notes = [], {}, []
     for label, flight in zip(labels(tuple(held)), held, strict=True):
+        sound, said = moving_outputs(flight)
+        if sound is None:
+            said = f"not judged in frequency: {said}"
+        notes += [f"{label}, held out: {said}."] if said else []
+        if sound is None:
+            continue
         try:
-            found.append(_responses_of(problem, at, fitted, (label, (flight,))))
+            found.append(_responses_of(problem, at, fitted, (label, (sound,))))
         except ValueError as error:
-            short[label] = (flight, str(error))
+            short[label] = (sound, str(error))
     if len(short) > 1:
         flights = tuple(flight for flight, _ in short.values())
         try:
@@ -347,7 +351,7 @@ def _by_responses(
             short = {}
         except ValueError:
             pass
-    notes = [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
+    notes += [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
     return HeldOutFrequency(tuple(found), (), tuple(notes))
 
 
