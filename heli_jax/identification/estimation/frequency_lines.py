@@ -215,17 +215,18 @@ def errors_of_some(
         by: the inputs by instrument.
     """
     blocks, f = at.blocks, y.shape[0]
-    B, D = (M.T.astype(at.z.dtype) for M in (m.B, m.D))
     lines = Signals(*(at_lines(record, v) for v in signals))
-    beyond = at_lines(record, y) - lines.acting @ D
+    # In time, where these numbers are real ones and half as many.
+    beyond = at_lines(record, y - signals.acting @ m.D.T)
     # By instrument the states are those of the inputs alone: such a record has no ends.
-    inputs = [lines.U] if by is None else [lines.U, at_lines(record, by.U)]
-    driving = blocks.cut(jnp.concatenate(inputs) @ B, axis=1)
+    inputs = blocks.cut(
+        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by.U)]), axis=1
+    )
     left = blocks.cut(beyond, axis=1)
 
     def unprojected(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         white, along = made
-        e = _times(at.W[b], left[b]) - _times(at.H[b], driving[b][:f])
+        e = _times(at.W[b], left[b]) - _times(at.H[b], by_real(inputs[b, :f], m.B.T))
         e = jnp.stack([jnp.real(e), jnp.imag(e)], axis=2).reshape(f, -1)
         return white.at[b].set(e), along + e @ at.basis(b)
 
@@ -241,10 +242,11 @@ def errors_of_some(
 
     def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, X = made
-        driven = driving[b].at[:f].add(at.ends[b][None] @ of_ends)
+        driven = by_real(inputs[b], m.B.T).at[:f].add(at.ends[b][None] @ of_ends)
         return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
 
-    rows, X = blocks.over(without_ends, (white, jnp.zeros_like(driving)))
+    X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
+    rows, X = blocks.over(without_ends, (white, X))
     return Errors(rows, X[:, :f], None if by is None else X[:, f:], lines, beyond)
 
 
@@ -290,6 +292,16 @@ def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array
     return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
 
+def by_real(v: Complex[Array, "... a"], M: Float[Array, "a b"]) -> Complex[Array, "... b"]:
+    """v M, without the products of what M has no imaginary part of.
+
+    Args:
+        v: complex numbers.
+        M: a real matrix.
+    """
+    return jax.lax.complex(jnp.real(v) @ M, jnp.imag(v) @ M)
+
+
 def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Array, "f k a"]:
     # A sum: products of a small matrix and a vector each would call a routine for every line.
     return jnp.sum(M[None] * v[:, :, None, :], axis=3)
@@ -320,7 +332,7 @@ def errors_of_lines(
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 e = errors_of_some(at, m, record, *some)
-                made.append(e.beyond - at.blocks.joined(e.X, axis=1) @ m.C.T.astype(at.z.dtype))
+                made.append(e.beyond - by_real(at.blocks.joined(e.X, axis=1), m.C.T))
             return made
 
         first = first_machine(machines.matrices) if first is None else first
