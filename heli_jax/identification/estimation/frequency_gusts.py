@@ -39,6 +39,7 @@ from heli_jax.identification.estimation.frequency_spectrum import (
     inverses,
     knots_of,
     smoothed,
+    summed_powers,
     whitening_of,
 )
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
@@ -85,7 +86,7 @@ def whitening_by(
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
     before = _before(machine, scaled, size, part)
-    left = smoothed([(before[len(e)] @ e[:, :, None])[:, :, 0] for e in scaled], PART, least=LEAST)
+    left = smoothed([np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], PART, least=LEAST)
     counts = tuple(Counter(len(e) for e in errors).items())
     p, made = errors[0].shape[1], {}
     for e, W in zip(errors, whitening_of(left), strict=True):
@@ -149,7 +150,7 @@ def _cells(
     K = len(errors[0])
     at, _ = knots_of(K, *_CELLS)
     edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
-    power = sum(e[:, :, None] * np.conj(e[:, None, :]) for e in errors) / len(errors)
+    power = summed_powers(np.stack(errors)) / len(errors)
     count = np.diff(np.append(edges, K)).astype(float)
     power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
     f = part * (at + 1) / (2 * K + 1)
@@ -242,7 +243,7 @@ def powers_of(
         # By way what of it the errors show, and what they should.
         matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
         of_ways = matrices.view(float).reshape(c, 2, -1) @ by_way
-        shown, due = np.moveaxis((by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p), 1, 0)
-        part = np.maximum(shown, 0.0) / np.where(due > 0, due, 1.0)
-        powers = np.maximum(powers * part, least)
+        of_ways = (by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p)
+        shown, due = of_ways[:, 0], of_ways[:, 1]
+        powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
     return powers[:, :n].T, powers[0, n:]
