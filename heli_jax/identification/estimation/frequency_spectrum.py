@@ -178,12 +178,6 @@ def whitening_of(
     return tuple(made[id(S)] for S in spectra)
 
 
-def inverses(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
-    """S^-1."""
-    # Of one output thousands of numbers, not of matrices.
-    return 1.0 / S if S.shape[1] == 1 else np.linalg.inv(S)
-
-
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
     """L^-1, where S = L L^H.
 
