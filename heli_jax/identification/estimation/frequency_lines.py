@@ -98,7 +98,7 @@ def resolved(
         whitening: of the record's lines.
         part: of the lines that are used.
     """
-    blocks = blocks_of(record, part)
+    blocks = blocks_of(record, part, m.C.size)
     # Beyond the last line those that would follow it, so that nothing is singular there.
     k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
     z = np.exp(2j * np.pi * k / (record.samples + 2 * blocks.size))
