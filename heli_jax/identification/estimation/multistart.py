@@ -44,6 +44,8 @@ _NEAR = 0.1
 """standard deviations from the optimum at which it counts as reached"""
 _AGAIN = 3
 """times that an optimiser which stopped short of the optimum is sent on"""
+_GOOD = 10.0
+"""cost up to which a run explains something whatever there is to explain"""
 _FAINT = 0.3
 """one over the sd of the logarithm of a disturbance's parameter below which it is none"""
 
@@ -252,9 +254,11 @@ class Search:
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        if run.cost <= _GOOD:
+            return run
         # The cost is a mean over the measured numbers, so this is one too.
         nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
-        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
 
     def misfit_of_nothing(self, noise: Noise) -> float:
         """Sum of squares that a model without any response leaves."""
