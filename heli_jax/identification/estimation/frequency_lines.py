@@ -9,7 +9,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +28,7 @@ from heli_jax.identification.estimation.frequency_machines import (
 )
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.numerics.jitted import jitted
 
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
@@ -307,7 +307,7 @@ def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Ar
     return jnp.sum(M[None] * v[:, :, None, :], axis=3)
 
 
-@eqx.filter_jit
+@jitted
 def errors_of_lines(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> tuple[list[Complex[Array, "K p"]], Machine]:
