@@ -33,7 +33,7 @@ def smoothed(
     """
     p = lines[0].shape[1]
     # The half that lies below the diagonal: a spectrum is Hermitian.
-    below = np.tril_indices(p)
+    below = _below(p)
 
     def half(v: np.ndarray) -> np.ndarray:
         # Of a session in single precision too: the view is of double numbers.
@@ -48,6 +48,11 @@ def smoothed(
         own += _ROUNDING * np.mean(np.real(own), axis=0)
         spectra[K] = S
     return [spectra[len(v)] for v in lines]
+
+
+@functools.cache
+def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.tril_indices(p)
 
 
 def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
