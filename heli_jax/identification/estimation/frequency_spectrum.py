@@ -50,6 +50,30 @@ def smoothed(
     return [spectra[len(v)] for v in lines]
 
 
+def smoothed_with(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+    others: Sequence[Complex[np.ndarray, "K r"]],
+    part: float = PART,
+) -> list[Complex[np.ndarray, "K p r"]]:
+    """By record the cross-spectrum E e r^H with other signals, smoothed likewise.
+
+    Args:
+        lines: by record at its own frequencies.
+        others: the other signals, likewise.
+        part: sd of the Gaussian as a part of the frequency.
+    """
+    p, r = lines[0].shape[1], others[0].shape[1]
+
+    def products(v: np.ndarray) -> np.ndarray:
+        made = v[:, :, :p].transpose(1, 2, 0) @ np.conj(v[:, :, p:].transpose(1, 0, 2))
+        return np.ascontiguousarray(made.reshape(len(made), -1), dtype=complex).view(float)
+
+    both = [np.concatenate(v, axis=1) for v in zip(lines, others, strict=True)]
+    made = _over_lines(both, products, part, LEAST)
+    spectra = {K: v.view(complex).reshape(K, p, r) for K, v in made.items()}
+    return [spectra[len(v)] for v in lines]
+
+
 @functools.cache
 def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
     return np.tril_indices(p)
