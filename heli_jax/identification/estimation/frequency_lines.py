@@ -202,7 +202,7 @@ def errors_of_some(
     record: Record,
     signals: Signals,
     y: Float[Array, "f N p"],
-    by: Signals | None = None,
+    by: tuple[Signals, Array] | None = None,
 ) -> Errors:
     """Of one record of each of a few flights of one machine, with a leading axis.
 
@@ -212,7 +212,7 @@ def errors_of_some(
         record: which samples it is.
         signals: over the whole flights.
         y: what was measured.
-        by: the inputs by instrument.
+        by: the inputs by instrument, and whether their states are asked for: zero if not.
     """
     blocks, f = at.blocks, y.shape[0]
     lines = Signals(*(at_lines(record, v) for v in signals))
@@ -220,7 +220,7 @@ def errors_of_some(
     beyond = at_lines(record, y - signals.acting @ m.D.T)
     # By instrument the states are those of the inputs alone: such a record has no ends.
     inputs = blocks.cut(
-        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by.U)]), axis=1
+        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by[0].U)]), axis=1
     )
     left = blocks.cut(beyond, axis=1)
 
@@ -240,10 +240,19 @@ def errors_of_some(
     d = (along @ at.S) @ at.S.T
     of_ends = d.reshape(f, at.ends.shape[2], -1).astype(at.z.dtype)
 
+    def asked_for(b: Any, driven: Array) -> Array:
+        if by is None:
+            return states(at, b, driven)
+
+        def direct(v: Array) -> Array:
+            return jnp.concatenate([states(at, b, v[:f]), jnp.zeros_like(v[f:])])
+
+        return jax.lax.cond(by[1], lambda v: states(at, b, v), direct, driven)
+
     def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, X = made
         driven = by_real(inputs[b], m.B.T).at[:f].add(at.ends[b][None] @ of_ends)
-        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
+        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(asked_for(b, driven))
 
     X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
     rows, X = blocks.over(without_ends, (white, X))
