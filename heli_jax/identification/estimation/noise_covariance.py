@@ -208,7 +208,7 @@ def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarra
     alone would be a misfit."""
     # A model that is not linear is linearised where they put it.
     without = np.array(z)
-    if layout.model.linear and not layout.estimator.nuisances_in_rows:
+    if not layout.estimator.nuisances_in_rows and layout.model.linear:
         without[layout.first_nuisance :] = 0.0
     return without
 
