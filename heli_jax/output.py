@@ -68,9 +68,16 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
+    held = fit.held_out_frequency
+    for flight in held.flights if held is not None else ():
+        tell(f"{flight.flight}, held out, in frequency: {flight.in_words}")
     _print_handling(run)
-    if (responses := report_tables.responses(fit)) is not None:
+    if (responses := report_tables.responses(fit.responses)) is not None:
         _tell_table(responses)
+    for flight in held.flights if held is not None else ():
+        if (responses := report_tables.responses(flight.responses)) is not None:
+            tell(f"Responses of {flight.flight}, held out:")
+            _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     tell(f"acceptance card: {summary(card(problem, fit), _GATES)}")
@@ -91,8 +98,7 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({vaf_text(m.vaf)})" for n, m in fit.validation.items() if not m.vaf >= 0]
-    held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
+    held = f". Held out: {doubt}" if (doubt := report_tables.held_out_doubt(fit)) else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
     why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts

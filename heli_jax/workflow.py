@@ -74,7 +74,7 @@ class FitRun:
         from heli_jax.report.drawings import Analysis, drawings
         from heli_jax.report.style import styled
 
-        shown = _with_responses(self) if name.startswith("match") else self.supplementary
+        shown = _with_responses(self) if name.startswith(("match", "held")) else self.supplementary
         draw = drawings(Analysis(self.fit, self.problem, self.baseline, shown))
         figure = styled(draw[name]) if name in draw else None
         if figure is None:

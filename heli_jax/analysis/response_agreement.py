@@ -37,6 +37,8 @@ class PairAgreement(NamedTuple):
     NaN where there are none"""
     chi_squared: float
     """squared errors over their variance, in the mean; 1 is expected"""
+    of_none: float
+    """the same of a model without any response: how far the measured one stands above its errors"""
     simulated: bool
     """whether the model was simulated from its initial state and sent through the windows of the
     measurement; else its bounded solution was, and what the ends of the record add taken off"""
@@ -153,7 +155,7 @@ def pair_agreements(
             at = used[:, j, i]
             some = bool(at.any())
             hz = w.hz[at]
-            errors = np.abs(E[at, j, i]) ** 2 / variance[at, j, i]
+            errors, sizes = (np.abs(v[at, j, i]) ** 2 / variance[at, j, i] for v in (E, H))
             out.append(
                 PairAgreement(
                     input,
@@ -165,6 +167,7 @@ def pair_agreements(
                     float(np.mean(coherence[at, j, i])) if some else np.nan,
                     _J(w, at, (H[:, j, i], E[:, j, i], coherence[:, j, i])),
                     float(np.mean(errors)) if some else np.nan,
+                    float(np.mean(sizes)) if some else np.nan,
                     simulated[j],
                 )
             )

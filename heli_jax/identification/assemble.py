@@ -42,10 +42,10 @@ from heli_jax.identification.validation.aliases import (
     fast_modes,
     measurement_noise,
 )
-from heli_jax.identification.validation.closed_loop_trust import (
-    known_no_gusts,
-)
+from heli_jax.identification.validation.closed_loop_trust import Loop, known_no_gusts
 from heli_jax.identification.validation.held_out import validate
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
+from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
@@ -91,16 +91,24 @@ class _HeldOut(NamedTuple):
     free_run: tuple[Signals, ...] = ()
     """with windows: simulated in one piece"""
     notes: tuple[str, ...] = ()
+    in_frequency: HeldOutFrequency | None = None
 
 
-def _held_out(problem: Problem, search: Search, optimum: RelaxedOptimum) -> _HeldOut:
+def _held_out(end: End, loop: Loop) -> _HeldOut:
+    problem, at = end.problem, end.at
     flights = tuple(f for f in problem.flights if f.hold_out)
     if not flights:
         return _HeldOut()
     # With their own initial states and biases: those of the fitted flights belong to these.
-    checked = validate(problem, search.layout, optimum.best.z, optimum.noise, flights)
+    checked = validate(problem, at.layout, at.z, at.noise, flights)
     free_run = free_runs(flights, checked.free_run)
-    return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
+    in_frequency = None
+    if end.arrived:
+        closed = loop.held or any(f.present for f in loop.found)
+        feedback = closed and not loop.instruments
+        in_frequency = validate_in_frequency(problem, at, end.e, flights, feedback=feedback)
+    said = in_frequency.sentences if in_frequency else ()
+    return _HeldOut(signals_of(checked.e, flights), free_run, (*checked.notes, *said), in_frequency)
 
 
 def _numbers(
@@ -161,7 +169,7 @@ def assemble(
     judged = judge(end, errors, numbers_of)
     errors, numbers = judged.errors, judged.numbers
     layout, status = search.layout, _status(end, errors.verdict)
-    held = _held_out(problem, search, optimum)
+    held = _held_out(end, judged.loop)
     # Of rounding, and of numbers that are none, notes of their own speak.
     astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
     notes = [
@@ -198,6 +206,7 @@ def assemble(
         metrics=pooled_metrics(end.signals),
         validation=pooled_metrics(held.signals),
         validation_free_run=pooled_metrics(held.free_run),
+        held_out_frequency=held.in_frequency,
         one_step=pooled_metrics(end.signals, one_step=True),
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=end.white,

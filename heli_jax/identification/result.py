@@ -18,6 +18,7 @@ from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, un
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.late_stick import LateStick
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
@@ -159,6 +160,8 @@ class Fit:
     """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
     """with windows: the same simulated in one piece, from the initial state of the first window"""
+    held_out_frequency: HeldOutFrequency | None = None
+    """of a fit in frequency: what the flights held out say in frequency"""
     adequacy: Adequacy = UNJUDGED
     """whether the model explains what was measured, judged against what"""
     coloured: bool = False
@@ -247,9 +250,11 @@ class Fit:
 
     @property
     def held_out_worse(self) -> tuple[str, ...]:
-        """Output error: the outputs that flights held out show worse than their mean, by more than
-        chance makes of one that does not respond."""
-        # With gusts in the model, or no simulation in the fit, such a simulation says little.
+        """The outputs that flights held out show worse than their mean, by more than chance makes
+        of one that does not respond; of a fit in frequency, of what follows the inputs there."""
+        if self.held_out_frequency is not None:
+            return self.held_out_frequency.worse
+        # With gusts in the model, or no simulation in the fit, a simulation says little.
         estimator = estimator_of(self.method)
         if estimator.process_noise or estimator.noise_spectrum:
             return ()

@@ -62,8 +62,13 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 )
     if fit.signals[0].inputs:
         drawings["bode"] = _bode(fit, problem, baseline)
-    for pair in supplementary.responses.pairs if supplementary.responses else ():
-        drawings[f"match_{pair.output}-{pair.input}"] = _match(pair, analysis)
+    if (responses := supplementary.responses) is not None:
+        for group, pairs, whose in (
+            ("match", responses.pairs, "flights together"),
+            ("held", responses.held_out, "flights held out"),
+        ):
+            for pair in pairs:
+                drawings[f"{group}_{pair.output}-{pair.input}"] = _match(pair, analysis, whose)
     if len(fit.verdict.names) > 1:
         drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)._replace(
             svg=partial(correlation_svg, fit.verdict)
@@ -197,10 +202,10 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     return _panels(figures.bode, flight, baseline)
 
 
-def _match(pair: FittedPair, analysis: Analysis) -> Draw:
+def _match(pair: FittedPair, analysis: Analysis, whose: str) -> Draw:
     responses = analysis.supplementary.responses
     assert responses is not None
     about = f"model linearised about {responses.about}" if responses.about else "continuous model"
-    note = f"{about}; data without the hold of the input, flights together"
+    note = f"{about}; data without the hold of the input, {whose}"
     unit = figures.bode_unit(analysis.problem.model, pair.output, pair.input)
     return _panels(figures.match, pair, unit, note)

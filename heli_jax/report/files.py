@@ -101,6 +101,7 @@ def fit_json(
             "covariance": "coloured residuals" if fit.coloured else "white",
             **content.residuals(fit),
             "responses": content.responses(fit.responses),
+            "held_out_frequency": content.held_out_frequency(fit.held_out_frequency),
             "baseline_rls": content.baseline(baseline),
             "handling_qualities": handling_json(
                 supplementary.responses.handling if supplementary.responses else ()

@@ -18,6 +18,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.identification.validation.follows_response import LEVEL
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.numbers import percent
 
 
@@ -83,6 +84,24 @@ def responses(agreement: ResponseAgreement | None) -> dict[str, Any] | None:
         "averages": dict(agreement.averages),
         "pairs": [p._asdict() for p in agreement.pairs],
         "usual_J": USUAL_J,
+    }
+
+
+def held_out_frequency(held: HeldOutFrequency | None) -> dict[str, Any] | None:
+    """What flights held out say in frequency."""
+    if held is None:
+        return None
+    return {
+        "flights": [
+            {
+                **f._asdict(),
+                "furthest": f.furthest._asdict() if f.furthest else None,
+                "responses": responses(f.responses),
+            }
+            for f in held.flights
+        ],
+        "bands": [b._asdict() for b in held.bands],
+        "notes": list(held.notes),
     }
 
 

@@ -20,6 +20,7 @@ from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Moved
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate
 
@@ -395,6 +396,8 @@ class FitFile(TypedDict):
     """the same in a sentence; empty where all is trusted"""
     responses: ResponseAgreement | None
     """of a fit of frequency responses"""
+    held_out_frequency: HeldOutFrequency | None
+    """of a fit in frequency what flights held out say there"""
     baseline_rls: BaselineContent | None
     handling_qualities: list[HandlingPair]
     equation_error_start: EquationErrorContent | None

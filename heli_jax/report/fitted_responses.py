@@ -78,6 +78,8 @@ class FittedResponses(NamedTuple):
     notes: tuple[str, ...]
     incoherent: tuple[str, ...] = ()
     """those without a coherence worth showing, as `lat to p`; they have no figure"""
+    held_out: tuple[FittedPair, ...] = ()
+    """of the flights held out, as many as are shown"""
 
 
 def fitted_responses(
@@ -115,8 +117,15 @@ def fitted_responses(
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
     drawn = tuple(pairs[:MOST_PAIRS])
+    held_out, notes = _of_held_out(problem, settings, curves)
     return FittedResponses(
-        drawn, left_out, handling, at.words, responses.notes, _incoherent(responses)
+        drawn,
+        left_out,
+        handling,
+        at.words,
+        (*responses.notes, *notes),
+        _incoherent(responses),
+        held_out,
     )
 
 
@@ -193,6 +202,24 @@ def _pairs(responses: FlightResponses, curves: _Curves) -> list[FittedPair]:
             fitted = FittedPair(input, name, *measured, model, pair.half95)
             ranked.append((float(np.sum(mean[used])), fitted))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
+
+
+def _of_held_out(
+    problem: Problem, settings: Settings, curves: _Curves
+) -> tuple[tuple[FittedPair, ...], tuple[str, ...]]:
+    """The responses of the flights held out, as many as are shown, and why there is none."""
+    held = tuple(f for f in problem.flights if f.hold_out)
+    if not held:
+        return (), ()
+    try:
+        responses = flight_responses(held, settings)
+    except ValueError as e:
+        return (), (f"no responses of the flights held out: {e}",)
+    pairs = tuple(_pairs(responses, curves)[:MOST_PAIRS])
+    if pairs:
+        return pairs, ()
+    words = "no figure of the flights held out: together none of their responses is coherent"
+    return (), (words,)
 
 
 def _incoherent(responses: FlightResponses) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from heli_jax.identification.result import Fit
 from heli_jax.report import card, tables
 from heli_jax.report.captions import GROUPS, alt_text, caption
 from heli_jax.report.drawings import MOST_FLIGHTS, Analysis, drawings, logged_outputs, logged_units
@@ -14,7 +15,7 @@ from heli_jax.report.pictures import Kind, Picture, picture
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
 
-_LIVE = ("response", "bode", "match", "rls")
+_LIVE = ("response", "bode", "match", "held", "rls")
 """figures that the page draws itself, to be zoomed: those over time and over frequency"""
 
 
@@ -127,12 +128,27 @@ def _results(analysis: Analysis) -> dict[str, Any]:
         "nuisances": tables.nuisances(fit),
         "combinations": tables.combinations(fit),
         "agreement": tables.agreement(fit, baseline, logged_outputs(analysis)),
-        "fitted_to": tables.responses(fit),
+        "fitted_to": tables.responses(fit.responses),
+        **_held_out(fit),
         "acceptance": tables.acceptance(lines),
         "summary": card.summary(lines),
         "residuals": tables.residuals(fit, problem),
         "verdict": tables.verdict(fit),
         "starts": tables.starts(fit),
+    }
+
+
+def _held_out(fit: Fit) -> dict[str, Any]:
+    """Tables of the flights held out, in frequency; None where nothing was asked."""
+    held = fit.held_out_frequency
+    return {
+        "held_out_flights": tables.held_out_flights(held),
+        "held_out_bands": tables.held_out_bands(held),
+        "held_out_responses": [
+            (flight.flight, tables.responses(flight.responses))
+            for flight in (held.flights if held else ())
+            if flight.responses is not None
+        ],
     }
 
 

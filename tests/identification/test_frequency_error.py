@@ -237,7 +237,7 @@ def test_a_flight_is_cut_at_its_missing_samples():
     assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
     data, noise = data_of(problem, problem.training, layout), first_noise(problem, [exact])
     at_truth = start_vector(layout, data, problem)
-    lines, _ = errors_of_lines(layout, data, noise, at_truth)
+    lines = errors_of_lines(layout, data, noise, at_truth).errors
     assert [len(one) for one in lines] == [349, 249]
     np.testing.assert_allclose(np.concatenate(lines), 0.0, atol=1e-10)
     [note] = cut_notes(layout, data)

@@ -57,7 +57,7 @@ def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
     assert found.metrics["roll"].vaf > 0.999
     content = fit_json(found, problem, None)["responses"]
     assert content["pairs"][0]["output"] == "roll"
-    assert "in windows" in str(tables.responses(found).rows)
+    assert "in windows" in str(tables.responses(found.responses).rows)
 
 
 def test_the_simulation_of_a_machine_is_that_of_scipy():

@@ -34,7 +34,7 @@ def test_lines_go_back_to_the_samples_they_came_of(N):
 
 def test_a_record_that_is_drawn_differs_in_its_noise_alone(found):
     at = found.reached
-    [errors], _ = jax.device_get(errors_of_lines(at.layout, at.data, at.noise, at.z))
+    [errors] = jax.device_get(errors_of_lines(at.layout, at.data, at.noise, at.z).errors)
     drawn, powers = _records(at, np.random.default_rng(1)), []
     for _ in range(40):
         other = next(drawn)

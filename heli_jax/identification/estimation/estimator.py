@@ -416,7 +416,7 @@ class Estimator(abc.ABC):
         return False
 
     def response_agreement(
-        self, layout: Layout, data: Data, noise: Noise, z: Array
+        self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
     ) -> ResponseAgreement | None:
         """How model and measured frequency responses agree, where these are what is fitted.
 
@@ -425,6 +425,7 @@ class Estimator(abc.ABC):
             data: the numbers of the problem.
             noise: at the optimum.
             z: the unknowns.
+            fitted: whether the unknowns were fitted to these flights.
         """
         return None
 

@@ -40,6 +40,7 @@ from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
     cut_notes,
     lines_of,
+    other_outputs,
     parts_of,
     records_of,
     without_parts,
@@ -100,12 +101,14 @@ class FrequencyError(Estimator):
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Flights without a part in which every output is there, and without a trim.
+        """Flights of other outputs, without a part in which every output is there, or without a
+        trim.
 
         Args:
             problem: what is to be fitted.
         """
-        refused = without_parts(problem.training) or absent_instrument(problem)
+        flights = problem.training
+        refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
@@ -228,7 +231,7 @@ class FrequencyError(Estimator):
             noise: so far.
             z: the unknowns.
         """
-        errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
+        errors, machine, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
         part = float(noise.part)
         errors = [v[: int(part * len(v))] for v in errors]
         rows = sum(2 * v.size for v in errors)

@@ -113,6 +113,25 @@ def without_parts(flights: Sequence[Flight]) -> str | None:
     return None
 
 
+def other_outputs(flights: Sequence[Flight]) -> str | None:
+    """Which flights have not the outputs of the others, and what to do; None where all have.
+
+    Args:
+        flights: those to be fitted.
+    """
+    # The noise's spectrum is one matrix over the outputs.
+    common = set.intersection(*(set(f.outputs) for f in flights))
+    for flight in flights:
+        more = sorted(set(flight.outputs) - common)
+        if more:
+            return (
+                f"{flight.name or 'a flight'}: output {', '.join(more)} is not in every flight, "
+                "and frequency-error has one spectrum of noise for all; leave it out "
+                "(signals.outputs), or use frequency-response, output-error or filter-error"
+            )
+    return None
+
+
 def cut_notes(layout: Layout, data: Data) -> list[str]:
     """By flight that was cut, how much of it is used.
 

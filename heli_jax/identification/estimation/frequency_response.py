@@ -130,14 +130,14 @@ class FrequencyResponse(Estimator):
         return noise._replace(whitening=on_device(weights))
 
     def relax(
-        self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum of what no response explains of the errors.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
-            e: at z with `noise`.
+            e: not asked for.
             noise: so far.
             z: the unknowns.
         """
@@ -217,7 +217,7 @@ class FrequencyResponse(Estimator):
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
-        self, layout: Layout, data: Data, noise: Noise, z: Array
+        self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
     ) -> ResponseAgreement | None:
         """Chi-squared and Tischler's J of every response.
 
@@ -226,6 +226,7 @@ class FrequencyResponse(Estimator):
             data: the numbers of the problem.
             noise: at the optimum.
             z: the unknowns.
+            fitted: whether the unknowns were fitted to these flights.
         """
         weights = back(noise.whitening)
         w, used = weights.windows, weights.used
@@ -236,7 +237,8 @@ class FrequencyResponse(Estimator):
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
         # What the ends of the records add takes its part.
         ends = 0 if all(weights.simulated) else len(data.flights) * len(layout.states)
-        freedom = max(2.0 * weights.numbers - len(layout.of_interest) - ends, 1.0)
+        taken = len(layout.of_interest) if fitted else 0
+        freedom = max(2.0 * weights.numbers - taken - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(
             w, used, H, E, weights.variance(), weights.coherence, weights.simulated

@@ -85,7 +85,7 @@ class _FromOptimum(Search):
 def _records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
     """The numbers of the problem, again and again with other noise."""
     layout, noise = _in_lines(at)
-    errors, _ = jax.device_get(errors_of_lines(layout, at.data, noise, at.z))
+    errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
     # What the unknowns fit of the noise is missing in the residual.
     rows = sum(2 * e.size for e in errors)

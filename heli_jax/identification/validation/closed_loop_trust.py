@@ -289,7 +289,7 @@ def _lines(at: Solution) -> _Lines:
             v = np.stack([np.asarray(x)[part] for x in signals], axis=1)
             made.append(lines_of(v))
     moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
-    errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
+    errors = jax.device_get(errors_of_lines(layout, data, noise, z).errors)
     W = [np.asarray(w) for w in noise.whitening]
     by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
     names = list(naming.asdict(data.flights[0].inputs))

@@ -11,7 +11,7 @@ Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System 
 (1999), 16.6, for residuals against inputs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
@@ -56,6 +57,8 @@ class Followed(NamedTuple):
     p_value: float
     explained: float
     """part of the output's power that follows the excitation which the model explains"""
+    by_chance: float = 0.0
+    """standard deviation of that part"""
 
 
 def _in_words(followed: Followed) -> str:
@@ -163,7 +166,7 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
         both = [_lines(v, count) for v in (measured, list(map(_between_ends, measured)))]
         found = [_in_bands(y, y, np.ones((len(y), 1)), X) for y in both]
         for name, *statistics in zip(names, *found, strict=True):
-            sums[name] = sums.get(name, np.zeros((2, 4))) + np.stack(statistics)
+            sums[name] = sums.get(name, np.zeros((2, 5))) + np.stack(statistics)
     return {
         # Of two questions about one record.
         name: min(1.0, 2.0 * float(np.min(scipy.special.chdtrc(s[:, 1], s[:, 0]))))
@@ -195,14 +198,31 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
         problem: with the flights, their inputs and instruments.
         at: where a fit by frequency error ended.
     """
-    layout, data, noise, z = at
-    errors, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
+    errors = jax.device_get(errors_of_lines(*at).errors)
+    by = instruments_of(problem) if at.data.flights[0].by_instrument is not None else ()
+    return errors_against_excitation(problem.training, at, errors, by)
+
+
+def errors_against_excitation(
+    flights: Sequence[Flight],
+    at: Solution,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    by: Sequence[str],
+) -> dict[str, Followed]:
+    """By output what of errors follows the excitation; outputs of too few lines are left out.
+
+    Args:
+        flights: those of the layout, fitted or held out.
+        at: where they are evaluated.
+        errors: by record.
+        by: the inputs that are taken by their instrument.
+    """
+    layout, _, noise, _ = at
     sums: dict[str, np.ndarray] = {}
     sizes: dict[int, np.ndarray] = {}
     for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
-        flight, part = problem.training[record.flight], slice(record.first, record.last)
+        flight, part = flights[record.flight], slice(record.first, record.last)
         names = layout.outputs[record.flight]
-        by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
         drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
         drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
         if not drives:
@@ -216,13 +236,14 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
             sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
         size = sizes[id(W)]
         for name, statistics in zip(names, _in_bands(e, y, size, X), strict=True):
-            sums[name] = sums.get(name, np.zeros(4)) + statistics
+            sums[name] = sums.get(name, np.zeros(5)) + statistics
     return {
         name: Followed(
             float(scipy.special.chdtrc(freedom, statistic)),
             float(1.0 - left / answer) if answer > 0 else 1.0,
+            float(np.sqrt(variance) / answer) if answer > 0 else np.inf,
         )
-        for name, (statistic, freedom, left, answer) in sums.items()
+        for name, (statistic, freedom, left, answer, variance) in sums.items()
         if freedom > 0
     }
 
@@ -237,12 +258,12 @@ def _in_bands(
     y: Complex[np.ndarray, "K p"],
     size: Float[np.ndarray, "K s"],
     X: Complex[np.ndarray, "K m"],
-) -> Float[np.ndarray, "p 4"]:
-    """By output the test's statistic and degrees of freedom, and the powers that follow the
-    excitation of the residual and of what was measured, less what chance makes; of one size each,
-    or (s = 1) all of the same."""
+) -> Float[np.ndarray, "p 5"]:
+    """By output the test's statistic and degrees of freedom, the powers that follow the excitation
+    of the residual and of what was measured, less what chance makes, and the variance of the first
+    by chance; of one size each, or (s = 1) all of the same."""
     first, lines = 0, float(max(_FIRST, 4 * X.shape[1]))
-    total = np.zeros((e.shape[1], 4))
+    total = np.zeros((e.shape[1], 5))
     while first + int(lines) <= len(e):
         band = slice(first, first + int(lines))
         n, first, lines = int(lines), band.stop, lines * _GROWTH
@@ -262,7 +283,9 @@ def _in_bands(
         statistic = -(2.0 * n - m - 1.0) * np.log1p(-share)
         # Not the model's response: a wrong model's may be larger than anything that was measured.
         scale = np.mean(size[band] ** 2, axis=0)[:, None]
-        chance = m[:, None] * np.maximum(whole - parts, 0.0) / (n - m)[:, None]
-        statistics = np.column_stack([statistic, 2.0 * m, scale * (parts - chance)])
+        per_line = np.maximum(whole - parts, 0.0) / (n - m)[:, None]
+        chance = m[:, None] * per_line
+        variance = m * (scale[:, 0] * per_line[:, 0]) ** 2
+        statistics = np.column_stack([statistic, 2.0 * m, scale * (parts - chance), variance])
         total += np.where(asked[:, None], statistics, 0.0)
     return total

@@ -1,6 +1,14 @@
 """What the report's page says, as words and as rows of text; the page itself is the template."""
 
-from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals, responses
+from heli_jax.report.tables.agreement import (
+    acceptance,
+    agreement,
+    choice,
+    held_out_bands,
+    held_out_flights,
+    residuals,
+    responses,
+)
 from heli_jax.report.tables.baseline import baseline_facts, baseline_ratios
 from heli_jax.report.tables.estimates import (
     Nuisances,
@@ -21,6 +29,7 @@ from heli_jax.report.tables.headline import (
     adequate,
     further_sentences,
     headline,
+    held_out_doubt,
     model_remark,
     warnings,
 )
@@ -48,6 +57,9 @@ __all__ = [
     "handling",
     "handling_sentences",
     "headline",
+    "held_out_bands",
+    "held_out_doubt",
+    "held_out_flights",
     "intervals",
     "meanings",
     "methods",

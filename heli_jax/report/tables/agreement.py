@@ -4,13 +4,14 @@ import math
 from collections.abc import Iterator, Mapping
 
 from heli_jax import naming
-from heli_jax.analysis.response_agreement import USUAL_J
+from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness, diverges
-from heli_jax.numbers import NOTHING, number, percent, vaf_percent
+from heli_jax.numbers import NOTHING, explained_text, number, p_value, percent, vaf_percent
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
@@ -65,9 +66,8 @@ def _cells(m: Metrics) -> tuple[str, ...]:
     return (vaf_percent(m.vaf), fit_percent, number(m.rmse), number(m.tic, 3))
 
 
-def responses(fit: Fit) -> Table | None:
+def responses(agreement: ResponseAgreement | None) -> Table | None:
     """The model's frequency responses against the measured ones, where these were fitted."""
-    agreement = fit.responses
     if agreement is None:
         return None
     usual = f"J (usual: < {USUAL_J:g})"
@@ -89,6 +89,39 @@ def responses(fit: Fit) -> Table | None:
     rows.append(("all together", "", "", "", number(agreement.chi_squared, 3), "", ""))
     rows.append(("expected", "", "", "", between, "", ""))
     return Table(head, rows)
+
+
+def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
+    """By flight held out what it says in frequency; None where nothing was asked."""
+    if held is None or not held.flights:
+        return None
+    rows = []
+    for f in held.flights:
+        p = NOTHING
+        if f.estimates_p_value is not None:
+            p = f"{'differ' if f.differs else 'agree'} (p {p_value(f.estimates_p_value)})"
+        parts = (f"{n} {explained_text(v)}" for n, v in f.explained.items())
+        between = f"{number(f.lower95, 3)} to {number(f.upper95, 3)}"
+        explained = ", ".join(parts) or NOTHING
+        rows.append((f.flight, number(f.chi_squared, 3), between, p, explained))
+    head = ("flight, held out", "chi-squared", "expected", "its own estimates", "explained")
+    return Table(head, rows)
+
+
+def held_out_bands(held: HeldOutFrequency | None) -> Table | None:
+    """By output and band the errors of the flights held out; None where there are none."""
+    if held is None or not held.bands:
+        return None
+    rows = [
+        (
+            b.output,
+            f"{number(b.low, 2)} to {number(b.high, 2)}",
+            number(b.chi_squared, 3),
+            f"{number(b.lower95, 3)} to {number(b.upper95, 3)}",
+        )
+        for b in held.bands
+    ]
+    return Table(("output, held out", "Hz", "chi-squared", "expected"), rows)
 
 
 def choice(selection: Choice) -> Table:

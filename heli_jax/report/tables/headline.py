@@ -9,6 +9,7 @@ from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
+from heli_jax.numbers import vaf_text
 from heli_jax.report.fit_content import whiteness_note
 from heli_jax.vehicle import of_helicopter
 
@@ -30,7 +31,20 @@ def headline(fit: Fit) -> Headline:
         level = "bad" if worst else "warning"
     if (fit.adequacy.coloured or fit.adequacy.one_step_only) and level == "good":
         level = "warning"
-    return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
+    doubt = held_out_doubt(fit)
+    if doubt and level == "good":
+        level = "warning"
+    held = f". Held out: {doubt}" if doubt else ""
+    return Headline(level, word, f"{text}; adequate: {adequate(fit)}{held}")
+
+
+def held_out_doubt(fit: Fit) -> str:
+    """What flights held out have against the fit, in a few words; empty where nothing."""
+    # A simulation of an unstable machine leaves any flight: in frequency nothing is simulated.
+    if fit.held_out_frequency is not None and fit.held_out_frequency.flights:
+        return fit.held_out_frequency.doubt
+    worse = [f"{n} ({vaf_text(m.vaf)})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    return f"worse than the mean (VAF): {', '.join(worse)}" if worse else ""
 
 
 def further_sentences(fit: Fit) -> list[str]:

@@ -1,0 +1,157 @@
+"""What flights held out say of a fit in frequency: plain data, and in words."""
+
+from typing import NamedTuple
+
+from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.numbers import number, p_value, percent, plain_words
+
+LEVEL = 0.01
+"""of the test whether a flight's own estimates are those of the fit"""
+
+
+class HeldOutBand(NamedTuple):
+    """Errors of one output in a band of frequencies, over all flights held out."""
+
+    output: str
+    low: float
+    high: float
+    """[Hz]"""
+    chi_squared: float
+    """squared errors over what the noise of the fitted flights lets expect; errors of the estimates
+    are not allowed for"""
+    lower95: float
+    upper95: float
+    """what the noise lets expect of it with 95 % probability"""
+
+
+class Furthest(NamedTuple):
+    """The parameter whose estimate in a flight is the furthest from that of the fit."""
+
+    parameter: str
+    own: float
+    """what the flight says by itself: one step of Gauss and Newton from the fit [SI]"""
+    fitted: float
+    sds: float
+    """joint standard deviations between the two"""
+
+
+class HeldOutFlight(NamedTuple):
+    """A flight held out; of responses, those together that are too short by themselves."""
+
+    flight: str
+    chi_squared: float
+    """squared errors over what the noise and the errors of the estimates let expect"""
+    lower95: float
+    upper95: float
+    """what both let expect of it with 95 % probability"""
+    freedom: float
+    """independent real numbers that it is the mean of"""
+    estimates_p_value: float | None
+    """that the flight's own estimates would be as far from the fit's by chance; None where it says
+    nothing of them"""
+    furthest: Furthest | None
+    explained: dict[str, float]
+    """by output, of the power that follows the excitation the part that the model explains"""
+    worse: tuple[str, ...]
+    """the outputs that a model without any response would explain better"""
+    responses: ResponseAgreement | None
+    """of a fit of frequency responses those of the flight, whose errors are compared with its own
+    noise and not with that of the fitted flights"""
+
+    @property
+    def differs(self) -> bool:
+        """Whether the flight speaks of other parameters."""
+        return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """In a line: chi-squared, what was expected, the estimates, what is explained."""
+        between = f"95 %: {self.lower95:.3g} to {self.upper95:.3g}"
+        known = [f"chi-squared {self.chi_squared:.3g} ({between})"]
+        if self.estimates_p_value is not None:
+            verb = "differ" if self.differs else "agree"
+            known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
+        if self.explained:
+            parts = (
+                f"{plain_words(percent(v, 1))} of {n}" if v >= 0 else f"none of {n}"
+                for n, v in self.explained.items()
+            )
+            known.append(f"explained of what follows the inputs {', '.join(parts)}")
+        return "; ".join(known)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What speaks against the fit, or keeps the flight from speaking for it."""
+        where, said = f"{self.flight}, held out", []
+        if self.worse:
+            names = " and ".join(self.worse)
+            said.append(f"{where}: of {names} the model explains less than none at all would.")
+        if self.differs:
+            assert self.estimates_p_value is not None
+            f = self.furthest
+            most = (
+                ""
+                if f is None
+                else (
+                    f", most of all {f.parameter}, about {plain_words(number(f.own, 3))} there for "
+                    f"{plain_words(number(f.fitted, 3))} ({f.sds:.1f} joint standard deviations)"
+                )
+            )
+            said.append(
+                f"{where}: what it says of the parameters is further from the estimates than the "
+                f"errors of both allow (p {p_value(self.estimates_p_value)}){most}: the model "
+                "lacks something, or the machine was another one there (mass, speed, battery). The "
+                "intervals speak for the fitted flights alone."
+            )
+        elif not self.worse and not self.lower95 <= self.chi_squared <= self.upper95:
+            said.append(f"{where}: {self._size}.")
+        return tuple(said)
+
+    @property
+    def _size(self) -> str:
+        between = f"95 %: {self.lower95:.3g} to {self.upper95:.3g}"
+        size = f"squared errors are {self.chi_squared:.3g} times what"
+        more = self.chi_squared > self.upper95
+        if self.responses is not None:
+            why = "the model lacks something there" if more else "its noise is taken too large"
+            return f"{size} its own noise lets expect ({between}): {why}"
+        size = f"{size} the noise of the fitted flights lets expect ({between})"
+        if self.estimates_p_value is None:
+            return size
+        what = "more gusts or noise than these, or more" if more else "fewer gusts and less noise"
+        rest = " than the model explains" if more else " than these"
+        return f"{size}, though its own estimates agree: it has {what}{rest}"
+
+
+class HeldOutFrequency(NamedTuple):
+    """What the flights held out say in frequency."""
+
+    flights: tuple[HeldOutFlight, ...]
+    bands: tuple[HeldOutBand, ...]
+    notes: tuple[str, ...]
+    """why a flight is not judged"""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What a reader has to know."""
+        return (*self.notes, *(s for f in self.flights for s in f.sentences))
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """The outputs that the model explains worse than none at all in some flight."""
+        return tuple(dict.fromkeys(n for f in self.flights for n in f.worse))
+
+    @property
+    def doubt(self) -> str:
+        """What belongs beside the verdict of the fit, in a few words; empty where nothing."""
+        words = []
+        if self.worse:
+            words.append(f"the model is worse than none for {', '.join(self.worse)}")
+        if differing := [f for f in self.flights if f.differs]:
+            p = min(f.estimates_p_value or 0.0 for f in differing)
+            names, ask = (
+                ", ".join(f.flight for f in differing),
+                "asks" if len(differing) == 1 else "ask",
+            )
+            words.append(f"{names} {ask} for other estimates (p {p_value(p)})")
+        return "; ".join(words)
