@@ -41,6 +41,7 @@ def problem(tmp_path) -> Problem:
     return Problem(oscillator.model, oscillator.vehicle().params, [flight], free)
 
 
+@pytest.mark.slow
 def test_where_little_is_explained_the_search_begins_again_elsewhere(problem: Problem) -> None:
     found = fit(problem)
     assert found.status == "converged"

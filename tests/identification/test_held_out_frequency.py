@@ -129,6 +129,7 @@ def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     names = ("same", "noisy", "turned")
     chosen = [flights[0], *(f for f in flights if f.name in names)]

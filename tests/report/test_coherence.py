@@ -80,6 +80,7 @@ def test_a_coherence_has_no_size():
     np.testing.assert_allclose(partial_coherence(others, 1e-200 * u, y), plain, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_noise_free_flight_of_the_exact_model_fails_no_gate(flown):
     found = gates(flown)
     assert len(found) == 25

@@ -38,8 +38,15 @@ def agree(rtol, model, vehicle, flight, design, reduce, **options):
     return fused
 
 
-@pytest.mark.parametrize("solver", ["exact", "rk4"])
-@pytest.mark.parametrize("hold", ["zero-order", "linear"])
+@pytest.mark.parametrize(
+    ("solver", "hold"),
+    [
+        ("exact", "linear"),
+        ("rk4", "zero-order"),
+        pytest.param("exact", "zero-order", marks=pytest.mark.slow),
+        pytest.param("rk4", "linear", marks=pytest.mark.slow),
+    ],
+)
 def test_the_stand(bench30, record, solver, hold):
     flight = dataclasses.replace(record, hold={"x_roll": hold})
     design = sobol({"Ixx": Range(0.02, 0.05, "log"), "gain.x_roll": Range(0.5, 2.0)}, 20)

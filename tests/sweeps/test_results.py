@@ -175,6 +175,7 @@ def test_the_inputs_may_come_later(bench30, record):
         np.testing.assert_allclose(found["p"][k], np.sqrt(np.mean(run.outputs.roll**2)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_seed_draws_the_disturbance(bench30, record):
     model = with_disturbance(ROLL, "roll")
     params = model.Params(
