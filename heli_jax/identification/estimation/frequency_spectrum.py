@@ -135,10 +135,13 @@ def whitening_alone(
         return np.sum(np.real(v) ** 2 + np.imag(v) ** 2, axis=0)
 
     made = {}
-    for K, power in _over_lines(lines, own, PART, LEAST).items():
-        root = _positive(power + _ROUNDING * np.mean(power, axis=0)) ** -0.5
-        made[K] = root[:, :, None] * np.eye(power.shape[1], dtype=complex)
-    return tuple(made[len(v)] for v in lines)
+    # Flights held out may have other outputs.
+    for p in {v.shape[1] for v in lines}:
+        alike = [v for v in lines if v.shape[1] == p]
+        for K, power in _over_lines(alike, own, PART, LEAST).items():
+            root = _positive(power + _ROUNDING * np.mean(power, axis=0)) ** -0.5
+            made[K, p] = root[:, :, None] * np.eye(p, dtype=complex)
+    return tuple(made[v.shape] for v in lines)
 
 
 @functools.lru_cache(maxsize=32)
