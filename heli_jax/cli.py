@@ -95,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="heli-jax",
         description="Physical parameters of small helicopters from logged runs, with honest "
         "uncertainties.",
+        epilog=cli_options.EXIT_CODES,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     # Each command's function becomes `options.run`, so that `main` needs no table of them.
@@ -103,7 +104,9 @@ def _parser() -> argparse.ArgumentParser:
     def command(
         name: str, run: Callable[[argparse.Namespace], int], words: str
     ) -> argparse.ArgumentParser:
-        added = commands.add_parser(name, help=words, description=words)
+        added = commands.add_parser(
+            name, help=words, description=words, epilog=cli_options.EXIT_CODES
+        )
         added.add_argument("--quiet", action="store_true", help="results, doubts and errors alone")
         added.set_defaults(run=run)
         return added

@@ -11,6 +11,13 @@ from heli_jax.errors import InputError
 if TYPE_CHECKING:
     from heli_jax.flights.convert import Selection
 
+EXIT_CODES = (
+    "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
+    "asked; 4 an optimiser did not converge, the model is not adequate and explains less than the "
+    "mean of what was measured, or sensors are not compatible; 130 interrupted."
+)
+"""what `--help` ends with: of every command"""
+
 
 def add_fit_options(command: argparse.ArgumentParser) -> None:
     """Of `heli-jax fit`."""

@@ -691,3 +691,11 @@ def test_quiet_hides_progress_and_no_doubt(tmp_path, bench_log, capsys):
     said = capsys.readouterr().err
     assert "column 't' is taken for a clock in s" in said
     assert "wrote" not in said
+
+
+@pytest.mark.parametrize("arguments", [[], ["fit"], ["frf"]])
+def test_help_says_what_exit_codes_mean(arguments, capsys):
+    with pytest.raises(SystemExit):
+        main([*arguments, "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "3 the data cannot determine what was asked; 4 an optimiser did not converge" in said

@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
-from heli_jax.analysis.response_parts import Names, groups, records_of
+from heli_jax.analysis.response_parts import Names, coherence_where_moving, groups, records_of
 from heli_jax.analysis.response_pictures import pictures_of, several_windows
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import (
@@ -69,7 +69,7 @@ class Pair(NamedTuple):
     sd: np.ndarray
     """of its real and of its imaginary part"""
     coherence: np.ndarray
-    """partial: what the other inputs explain is taken out"""
+    """partial: what the other inputs explain is taken out; of the flights in which it moves"""
     picture: np.ndarray
     """H of the composite of several windows, for looking; NaN where there is none"""
     half95: float = Z95
@@ -288,9 +288,8 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
     seen = (driven & own[y]).T[:, :, None]
-    H, sd, coherence = (
-        np.where(seen, v, np.nan) for v in (estimate.H, estimate.sd, estimate.coherence)
-    )
+    moving = coherence_where_moving(estimate.coherence, records, by or u, round(window / dt))
+    H, sd, coherence = (np.where(seen, v, np.nan) for v in (estimate.H, estimate.sd, moving))
     assert estimate.ends is not None
     added, sd = without_ends(omega, H, sd, estimate.ends, window)
     H = H - added

@@ -13,7 +13,8 @@ USUAL_J = 100.0
 _POINTS = 20
 """frequencies, equally spaced in the logarithm, that J is usually taken over"""
 _TOO_SMALL = 0.7
-"""times the lower limit, below which squared errors are smaller than the noise that they are of"""
+"""times the lower limit, below which squared errors are smaller than the noise that they are of,
+and no chance makes it"""
 _MISFIT = 2.0
 """times what random errors let expect, from which on squared errors speak against the model"""
 
@@ -107,11 +108,13 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def misfit(self) -> str:
-        """What chi-squared says where it lies above its interval, or far below it; else empty."""
-        if self.chi_squared < _TOO_SMALL * self.lower95:
+        """What chi-squared says where it lies outside of its interval; else empty."""
+        if self.chi_squared < self.lower95:
+            chance = "chance makes as little in one of forty; or "
             return (
                 f"Squared errors of the responses are {self.chi_squared:.3g} times what their "
-                f"random errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the "
+                f"random errors let expect (95 %: {self.lower95:.3g} to {self.upper95:.3g}): "
+                f"{'' if self.chi_squared < _TOO_SMALL * self.lower95 else chance}the "
                 "noise in the windows is taken for larger than it is in the responses, and the "
                 "intervals are too wide."
             )

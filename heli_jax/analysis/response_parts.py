@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import spans
+
+_AT_REST = 0.01
+"""of an input's largest standard deviation in a part, below which it rests in another"""
 
 type Parts = tuple[tuple[int, int, int], ...]
 """flight, first sample and the one behind the last of each part"""
@@ -81,3 +85,30 @@ def records_of(
         )
         for i, first, last in parts
     ]
+
+
+def coherence_where_moving(
+    coherence: Float[np.ndarray, "k l m"],
+    records: Sequence[Float[np.ndarray, "signals N"]],
+    moving: Sequence[int],
+    window: int,
+) -> Float[np.ndarray, "k l m"]:
+    """Coherence in the flights in which an input moves, of that in all.
+
+    Of sweeps of one stick at a time the others are at rest, and the noise of those flights is
+    nothing that they could be coherent with.
+
+    Args:
+        coherence: of l outputs with m inputs, partial.
+        records: signals of each part.
+        moving: the inputs, or their instruments, by their place among the signals.
+        window: samples of one.
+    """
+    windows = np.array([max(r.shape[1] - window + 1, 0) for r in records], float)
+    sizes = np.array([np.std(r[list(moving)], axis=1) for r in records])
+    moves = sizes > _AT_REST * np.max(sizes, axis=0)
+    used = np.sum(np.where(moves, windows[:, None], 0.0), axis=0)
+    # One that moves in parts alone that are shorter than a window has none.
+    share = np.where(used > 0, used, np.sum(windows)) / np.sum(windows)
+    with np.errstate(all="ignore"):
+        return coherence / (coherence + share * (1.0 - coherence))

@@ -29,8 +29,9 @@ _FINE = 64
 """samples whose turns are sines, each times those of every so many"""
 OVERLAP = 2.0 / 3.0
 """of a Hann window with the next, for responses. The squares of such windows add up to the same at
-all times, so that what they cut off of answers that end outside of them, in proportion to the
-square's slope, cancels; of windows that overlap by half it does not"""
+all times: no sample counts for more than another but at the ends of a record, and what they cut off
+of answers that end outside of them, in proportion to the square's slope, cancels; of windows that
+overlap by half it does not"""
 _ROUNDING = 1e-14
 """of an output's density, what rounding leaves where the inputs explain all of it"""
 
@@ -337,13 +338,11 @@ def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarra
     return np.maximum(power - 2.0 * crossed + explained, _ROUNDING * power)
 
 
-def composite(
+def weights_by_output(
     several: Sequence[CrossSpectra], inputs: Sequence[int], outputs: Sequence[int]
-) -> CrossSpectra:
-    """One picture from several lengths of segments: long ones for low frequencies, short ones for
-    high, each by the fourth power of its random error.
-
-    It is for looking: no intervals are to be taken from it, since the lengths share the record.
+) -> Float[np.ndarray, "w k l"]:
+    """What each length of segments counts for in one picture of several, output by output: long
+    ones for low frequencies, short ones for high, each by the fourth power of its random error.
 
     Args:
         several: of the same signals and frequencies, of segments of different length.
@@ -355,27 +354,24 @@ def composite(
 
     Source: Tischler and Remple (2012), chapter 10, without its last search.
     """
-    return combined(several, _weights(several, inputs, outputs, (2, 3)))
-
-
-def weights_by_output(
-    several: Sequence[CrossSpectra], inputs: Sequence[int], outputs: Sequence[int]
-) -> Float[np.ndarray, "w k l"]:
-    """What `composite` weighs each length by where it is made for one output alone.
-
-    Args:
-        several: of the same signals and frequencies, of segments of different length.
-        inputs: those whose responses decide, by their place among the signals.
-        outputs: likewise.
-
-    Raises:
-        ValueError: the frequencies differ.
-    """
-    return _weights(several, inputs, outputs, (3,))
+    omega = several[0].omega
+    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
+        raise ValueError("several: expected the same frequencies in all")
+    estimates = [responses(s, inputs, outputs) for s in several]
+    with np.errstate(all="ignore"):
+        each = np.abs(np.stack([e.H / e.sd for e in estimates])) ** 2
+    seen = np.isfinite(each)
+    count = np.maximum(np.sum(seen, axis=3), 1)
+    information = np.sum(np.where(seen, each, 0.0), axis=3) / count
+    # Two periods within a segment are the least that a window resolves.
+    seconds = np.array([s.seconds for s in several])[:, None, None]
+    resolved = omega[:, None] >= 4.0 * np.pi / seconds * (1.0 - 1e-9)
+    return np.where(resolved, information, 1e-12 / seconds) ** 2
 
 
 def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"]) -> CrossSpectra:
-    """Their mean.
+    """One picture of several lengths of segments, their mean. It is for looking: no intervals are
+    to be taken from it, since the lengths share the record.
 
     Args:
         several: of the same signals and frequencies.
@@ -387,29 +383,3 @@ def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"])
     S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
     n = np.stack([np.broadcast_to(s.averages, omega.shape) for s in several])
     return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
-
-
-def _weights(
-    several: Sequence[CrossSpectra],
-    inputs: Sequence[int],
-    outputs: Sequence[int],
-    over: tuple[int, ...],
-) -> np.ndarray:
-    """(w, k, ...) one over the random error, to the fourth power, of (w, k, l, m) a mean over some
-    axes."""
-    omega = several[0].omega
-    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
-        raise ValueError("several: expected the same frequencies in all")
-    estimates = [responses(s, inputs, outputs) for s in several]
-    with np.errstate(all="ignore"):
-        each = np.abs(np.stack([e.H / e.sd for e in estimates])) ** 2
-    seen = np.isfinite(each)
-    information = np.sum(np.where(seen, each, 0.0), axis=over) / np.maximum(
-        np.sum(seen, axis=over), 1
-    )
-    # Two periods within a segment are the least that a window resolves.
-    seconds = np.array([s.seconds for s in several])[:, None]
-    resolved, least = omega >= 4.0 * np.pi / seconds * (1.0 - 1e-9), 1e-12 / seconds
-    if information.ndim > 2:
-        resolved, least = resolved[:, :, None], least[:, :, None]
-    return np.where(resolved, information, least) ** 2

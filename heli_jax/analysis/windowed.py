@@ -14,6 +14,7 @@ from jaxtyping import Array, Complex, Float
 from heli_jax.analysis.flight_responses import require_window
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.analysis.spectra import OWN, leakage
+from heli_jax.analysis.spectral import OVERLAP
 from heli_jax.flights.flight import Flight
 
 _LONGEST = 30.0
@@ -29,11 +30,9 @@ _SHARED = (
 """correlation of white noise in a Hann window with that in the next one and in the one after it"""
 _FOR_MATRIX = 4.0
 """averages for each output from which a spectral matrix has an inverse of about the right size"""
-STEPS = 3
-"""from a window to the next, in the length of one. The squares of Hann windows that overlap by two
-thirds add up to the same at all times: no sample counts for more than another but at the ends of a
-record, and what windows cut off of answers that end outside of them cancels. With an overlap of a
-half kappa of the disturbed bench is 4 % less precise"""
+STEPS = round(1.0 / (1.0 - OVERLAP))
+"""from a window to the next, in the length of one. With an overlap of a half kappa of the disturbed
+bench is 4 % less precise"""
 PER_AVERAGE = 1.0 + 2.0 * sum(r**2 for r in _SHARED)
 """windows that make one independent average: the sum of the squared correlations of transforms of
 white noise in one window with those in all others"""

@@ -65,7 +65,7 @@ from heli_jax.identification.validation.expected_accuracy import (
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.input_units import wrong_units
+from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
@@ -290,23 +290,24 @@ def fit(
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
         estimate = assemble(problem, search, optimum, run)
-        # A fit follows numbers in any unit: that it does says nothing of the unit.
-        adequacy = estimate.adequacy.only_if(doubts.unsure)
-        estimate = dataclasses.replace(estimate, adequacy=adequacy)
-        return _with_doubtful_inputs(problem, guess, estimate)
+        return _with_doubtful_signals(problem, guess, estimate, doubts.unsure)
 
 
-def _with_doubtful_inputs(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
-    """With what moved too far or not far enough at the start values, and where the model did not
-    follow from there what moved the wrong way, first of all notes."""
+def _with_doubtful_signals(
+    problem: Problem, guess: FirstGuess, estimate: Fit, unsure: list[str]
+) -> Fit:
+    """No plain yes where a unit is in doubt, since a fit follows numbers in any unit; with what
+    moved too far or not far enough at the start values, and where the model did not follow from
+    there what moved the wrong way, first of all notes."""
     # Of an angle that is in other units than its rate that is said already, and is surer.
     if contradictions(problem):
-        return estimate
+        return dataclasses.replace(estimate, adequacy=estimate.adequacy.only_if(unsure))
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     at_start = (flights, guess.e.simulated, sticks_of(problem.model))
-    # A fit follows numbers in any unit, and does not tell.
-    doubts = wrong_units(*at_start)
-    adequacy = estimate.adequacy.only_if(["the unit of an input is in doubt"] if doubts else [])
+    inputs = doubtful_inputs(*at_start)
+    doubts = [finding for _, finding in inputs]
+    names = dict.fromkeys(f"the unit of {name} is in doubt" for name, _ in inputs)
+    adequacy = estimate.adequacy.only_if([*unsure, *names])
     if not estimate.adequacy.adequate:
         doubts += against_start(*at_start)
     notes = (*(f.sentence for f in doubts), *estimate.notes)

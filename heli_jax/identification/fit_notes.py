@@ -1,6 +1,7 @@
 """What a fit says in sentences: of its optimum, of what its method assumes, of its numbers."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from heli_jax.dynamics.disturbance import disturbances_of
@@ -22,6 +23,7 @@ from heli_jax.identification.uncertainty.estimates import (
     stated_noise_notes,
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
+from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.wandering_angles import wandering_notes
 
@@ -105,7 +107,10 @@ def fit_notes(
         *_absent_notes(layout, optimum.absent),
         *of_disturbances(layout, e, absent),
         *optimum.notes,
-        *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
+        *by_label(
+            layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
+            labels(problem.training),
+        ),
         *stated_noise_notes(problem, numbers.noise),
         *wandering_notes(problem),
         *_correlation_notes(correlated),
@@ -114,6 +119,21 @@ def fit_notes(
         *(sign_notes(problem, numbers.of_interest) if bool(best.converged) else []),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),
     ]
+
+
+def by_label(notes: Sequence[str], flights: Sequence[str]) -> list[str]:
+    """Notes that begin with a flight by its number, with what all else calls it: of a log that was
+    split at gaps the third part is `hover, part 3`.
+
+    Args:
+        notes: of an estimator, which knows no names of flights.
+        flights: their labels.
+    """
+
+    def named(match: re.Match[str]) -> str:
+        return flights[int(match[1]) - 1]
+
+    return [re.sub(r"^Flight (\d+)(?=:| was)", named, note) for note in notes]
 
 
 def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[str]:

@@ -31,9 +31,11 @@ def whiteness_note(fit: Fit) -> str:
     worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
     estimator = estimator_of(fit.method)
     if estimator.noise_spectrum:
+        # Where no optimum was reached there are no intervals.
+        allow = "" if fit.status == "not-converged" else " and the intervals allow for it"
         return (
             f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
-            "the noise's spectrum is estimated and the intervals allow for it."
+            f"the noise's spectrum is estimated{allow}."
         )
     what, better = estimator.errors, fit.disturbable
     if fit.status == "not-converged":

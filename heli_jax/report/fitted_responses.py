@@ -4,7 +4,7 @@ The measured ones are conditioned: sticks that move together are told apart, and
 together (`heli_jax.analysis.flight_responses`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -108,7 +108,8 @@ def fitted_responses(
         words = f"the model cannot be linearised about {at.words or 'zero'}"
         return FittedResponses((), 0, (), at.words, (*responses.notes, words))
     curves = _Curves(fit, of, tuple(free), (responses.omega[0], _BEYOND * responses.omega[-1]))
-    pairs = _pairs(responses, curves)
+    coherent = _coherent(responses)
+    pairs = _pairs(responses, curves, coherent)
     handling = tuple(
         Handling(p, _of_model(curves, p), measured_handling(responses, p))
         for p in asked
@@ -117,16 +118,10 @@ def fitted_responses(
     )
     left_out = max(len(pairs) - MOST_PAIRS, 0)
     drawn = tuple(pairs[:MOST_PAIRS])
+    incoherent = tuple(f"{input} to {name}" for (input, name), c in coherent.items() if not c)
     held_out, notes = _of_held_out(problem, settings, curves)
-    return FittedResponses(
-        drawn,
-        left_out,
-        handling,
-        at.words,
-        (*responses.notes, *notes),
-        _incoherent(responses),
-        held_out,
-    )
+    notes = (*responses.notes, *notes)
+    return FittedResponses(drawn, left_out, handling, at.words, notes, incoherent, held_out)
 
 
 class _Curves(NamedTuple):
@@ -186,21 +181,32 @@ def _sd(estimate: Estimate, fit: Fit) -> float:
     return max(half / _Z95, e.sd)
 
 
-def _pairs(responses: FlightResponses, curves: _Curves) -> list[FittedPair]:
+def _coherent(responses: FlightResponses) -> dict[tuple[str, str], float]:
+    """By input and output the sum of the coherence, a mean over an octave, where it is worth
+    showing."""
+    means = {
+        (input, name): octave_mean(responses.omega, pair.coherence)
+        for name, output in responses.outputs.items()
+        for input, pair in output.pairs.items()
+    }
+    return {names: float(np.sum(c[c >= COHERENT])) for names, c in means.items()}
+
+
+def _pairs(
+    responses: FlightResponses, curves: _Curves, coherent: Mapping[tuple[str, str], float]
+) -> list[FittedPair]:
+    """Those of input and output that are coherent anywhere, by the sum of their coherence there."""
     ranked = []
-    for name, output in responses.outputs.items():
-        for input, pair in output.pairs.items():
-            mean = octave_mean(responses.omega, pair.coherence)
-            used = mean >= COHERENT
-            if not used.any():
-                continue
-            with np.errstate(all="ignore"):
-                H = without_hold(responses.omega, pair.H, responses.holds[input])
-                sd = pair.sd * np.abs(H / pair.H)
-            model = curves.curve(input, name).at(responses.omega)
-            measured = responses.omega, H, sd, pair.coherence
-            fitted = FittedPair(input, name, *measured, model, pair.half95)
-            ranked.append((float(np.sum(mean[used])), fitted))
+    for (input, name), total in coherent.items():
+        if not total:
+            continue
+        pair = responses.outputs[name].pairs[input]
+        with np.errstate(all="ignore"):
+            H = without_hold(responses.omega, pair.H, responses.holds[input])
+            sd = pair.sd * np.abs(H / pair.H)
+        model = curves.curve(input, name).at(responses.omega)
+        measured = responses.omega, H, sd, pair.coherence
+        ranked.append((total, FittedPair(input, name, *measured, model, pair.half95)))
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
 
 
@@ -215,20 +221,11 @@ def _of_held_out(
         responses = flight_responses(held, settings)
     except ValueError as e:
         return (), (f"no responses of the flights held out: {e}",)
-    pairs = tuple(_pairs(responses, curves)[:MOST_PAIRS])
+    pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
     words = "no figure of the flights held out: together none of their responses is coherent"
     return (), (words,)
-
-
-def _incoherent(responses: FlightResponses) -> tuple[str, ...]:
-    return tuple(
-        f"{input} to {name}"
-        for name, output in responses.outputs.items()
-        for input, pair in output.pairs.items()
-        if not (octave_mean(responses.omega, pair.coherence) >= COHERENT).any()
-    )
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:

@@ -34,6 +34,9 @@ _FILES = (
     "handling_qualities.json",
 )
 _DB = 20.0 / np.log(10.0)
+_SURE = 0.3
+"""of a response, random error up to which it is usable: what a coherence of 0.6 makes of five
+averages, the least for an interval to mean something"""
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom from which on a transfer function is called too simple"""
 _NEAR_ZERO = 0.1
@@ -341,12 +344,16 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
-    """Mean coherence, and the widest band in which it stays above 0.6, as text."""
+    """Mean coherence, and the widest band in which it stays above 0.6 and the error below what that
+    makes of few averages, as text."""
     seen = np.isfinite(pair.coherence)
     if not seen.any():
         return "not determined", "–", "–"
     mean = f"{np.mean(pair.coherence[seen]):.2f}"
-    band = longest_band(omega, np.where(seen, pair.coherence, 0.0) > COHERENT)
+    # On the flanks of a sine coherence is high, and the window brings it from another frequency.
+    with np.errstate(invalid="ignore"):
+        sure = pair.sd < _SURE * np.abs(pair.H)
+    band = longest_band(omega, (np.where(seen, pair.coherence, 0.0) > COHERENT) & sure)
     if band is None:
         return mean, "–", "–"
     low, high = (number(float(w) / (2.0 * np.pi), 3) for w in band)

@@ -7,6 +7,7 @@ import scipy.signal
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.analysis.spectral import OVERLAP, cross_spectra
+from heli_jax.report.responses import useful_band
 
 DT, N = 0.02, 6000
 B, A, _ = scipy.signal.cont2discrete(([80.0], [1.0, 5.0, 40.0]), DT)
@@ -37,22 +38,45 @@ def test_between_missing_samples_intervals_hold_the_truth(gaps, noise):
     assert np.mean(with_ends) < 0.9 or not gaps
 
 
-def test_where_the_sweep_begins_in_a_long_window_errors_do_not_grow():
+@pytest.mark.parametrize(
+    ("how", "size"), [("linear", 0.2), ("linear", 0.01), ("logarithmic", 0.01)]
+)
+def test_where_the_sweep_begins_in_a_long_window_errors_do_not_grow(how, size):
     """Four sweeps of 60 s in windows of 24 s: slow frequencies are at the windows' ends, and what
-    is taken off of a response that is hardly known is noise."""
+    is taken off of a response that is hardly known is noise. With little noise what a straight line
+    does not take off is all of the error, there and beyond the sweep's last frequency."""
     t = DT * np.arange(3000)
-    u = scipy.signal.chirp(t, 0.15, t[-1], 5.0, "linear", -90)
+    u = scipy.signal.chirp(t, 0.15, t[-1], 5.0, how, -90)
     answer, inside = scipy.signal.lfilter(B.ravel(), A, u), []
-    for seed in range(8):
-        noise = 0.2 * np.random.default_rng(seed).standard_normal((4, t.size))
+    for seed in range(8 if size > 0.1 else 2):
+        noise = size * np.random.default_rng(seed).standard_normal((4, t.size))
         flights = [Flight(dt=DT, inputs={"lat": u}, outputs={"p": answer + e}) for e in noise]
         found = flight_responses(flights, Settings(window=24.0))
         pair = found.outputs["p"].pairs["lat"]
         off = np.abs(pair.H) - np.abs(scipy.signal.freqz(B.ravel(), A, found.omega * DT)[1])
         seen = np.isfinite(off)
         inside.append(np.mean(np.abs(off[seen]) < pair.half95 * pair.sd[seen]))
-    # 83 % with errors that grow from round to round.
+    # 83 % with errors that grow from round to round, and where a response by frequency is taken for
+    # one at that frequency.
     assert np.mean(inside) > 0.93
+
+
+@pytest.mark.parametrize("seconds", [6.0, 60.0])
+def test_of_one_sine_intervals_hold_the_truth_and_no_band_is_usable_but_around_it(seconds):
+    """The window brings the sine's response to all of its main lobe: half of it at most inside
+    errors that know of noise alone."""
+    t, rng = DT * np.arange(round(seconds / DT)), np.random.default_rng(1)
+    u = np.sin(2.0 * np.pi * 3.4 * t)
+    y = scipy.signal.lfilter(B.ravel(), A, u) + 0.01 * rng.standard_normal(t.size)
+    found = flight_responses([Flight(dt=DT, inputs={"lat": u}, outputs={"p": y})])
+    pair = found.outputs["p"].pairs["lat"]
+    off = pair.H - scipy.signal.freqz(B.ravel(), A, found.omega * DT)[1]
+    seen = np.isfinite(off)
+    held = np.abs(np.stack([off.real, off.imag]))[:, seen] < (pair.half95 * pair.sd)[seen]
+    assert np.mean(held) > 0.9
+    low, high = (float(hz) for hz in useful_band(found.omega, pair)[1:])
+    lines = (np.array([low, high]) - 3.4) * found.window
+    assert np.all(np.abs(lines) < 0.6)
 
 
 @pytest.mark.parametrize("n", [99, 100])

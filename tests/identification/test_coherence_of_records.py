@@ -175,3 +175,22 @@ def test_a_machine_in_gusts_is_seen_to_follow_at_half_the_rate_too(every):
     [found] = band(record)
     assert found.severity == "ok"
     assert found.criterion == "partial coherence with an output, 0.60"
+
+
+def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_together():
+    """Long ones at rest set the length of segments, which the one that moves them did not fill:
+    their coherence was no number, and `nothing in the record tells what each does`."""
+    rng = np.random.default_rng(0)
+    sos = scipy.signal.butter(2, 1.5, fs=1 / DT, output="sos")
+
+    def moved(n, size):
+        u, v = size * scipy.signal.sosfilt(sos, rng.standard_normal((2, n)))
+        y = response(u, v)[0] + 1e-3 * rng.standard_normal(n)
+        return replace(flight(n=n), inputs={"u": u, "v": v}, outputs={"phi": y})
+
+    short = moved(500, 1.0)
+    for resting in (0, 8):
+        found = bands([short, *(moved(1500, 0.0) for _ in range(resting))])
+        [together] = [x for x in found if x.topic == "inputs together"]
+        assert together.severity == "ok"
+        assert together.sentence.startswith("no two inputs move together")

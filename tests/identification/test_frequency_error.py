@@ -34,10 +34,12 @@ from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
+from heli_jax.identification.fit_notes import by_label
 from heli_jax.identification.frequency_start import _value, frequency_error_start, started
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
+from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.report.method_content import methods_content
 from heli_jax.report.tables import first_guess, methods
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
@@ -242,6 +244,20 @@ def test_a_flight_is_cut_at_its_missing_samples():
     np.testing.assert_allclose(np.concatenate(lines), 0.0, atol=1e-10)
     [note] = cut_notes(layout, data)
     assert "23.98 of 30 s are used, in 2 parts" in note
+
+
+def test_a_flight_that_was_cut_is_called_by_its_name():
+    """Of a log that was split at gaps no configuration numbers the parts."""
+    holed = [with_holes(record(BENCH, seed=3, n=900), slice(400, 440)) for _ in range(2)]
+    parts = [dataclasses.replace(f, name="log, part 12") for f in holed]
+    problem = problem_of(*parts)
+    layout = layout_of(problem, problem.training)
+    data = data_of(problem, problem.training, layout)
+    first, second = by_label(cut_notes(layout, data), labels(problem.training))
+    assert first.startswith("log, part 12 was cut where samples of roll are missing")
+    assert second.startswith("log, part 12 (2) was cut where")
+    assert by_label(["Flight 1: linearised about its trim."], ["log"])[0].startswith("log: lin")
+    assert by_label(["Flight 1 and 2 differ."], ["log"]) == ["Flight 1 and 2 differ."]
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight, Signal
 from heli_jax.flights.flight import Source
-from heli_jax.identification.validation.input_units import wrong_units
+from heli_jax.identification.validation.input_units import doubtful_inputs, wrong_units
 
 N, DT, FULL = 500, 0.02, 0.5
 
@@ -27,7 +27,9 @@ def doubts(unit, si, per_full, off=1.5, stick="lat"):
     start = off * lagged(read)
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": read}, outputs={"p": p}, source=source)
-    return [f.sentence for f in wrong_units([("one", flight)], [{"p": start}], {"p": stick})]
+    at_start = [("one", flight)], [{"p": start}], {"p": stick}
+    assert all(name == "lat" for name, _ in doubtful_inputs(*at_start))
+    return [f.sentence for f in wrong_units(*at_start)]
 
 
 @pytest.mark.parametrize("off", [0.5, 1.5])

@@ -76,6 +76,23 @@ def test_of_two_flights_against_one_another_neither_is_blamed():
     assert odd.index == 2
 
 
+@pytest.mark.parametrize("size", [1.0, 0.7])
+def test_of_a_turned_column_its_sign_is_named(size):
+    """Of a smaller sweep too, which the test of signs at the start values leaves to the others."""
+    flights = [flight(good(1)), flight(good(2))]
+    x = {n: size * v for n, v in good(3).items()}
+    [odd] = odd_flights([*flights, flight({**x, "p": -x["p"]})])
+    assert odd.turned == ("p",)
+    said = odd.finding.sentence
+    assert "with the other sign it does: p has the wrong one there (`invert: true`)." in said
+    [odd] = odd_flights([*flights, flight(turned(x, 3))])
+    assert (
+        "with the other sign they do: phi and p (or, of all that it moves" in odd.finding.sentence
+    )
+    [odd] = odd_flights([*flights, flight(shuffled(x, 3))])
+    assert odd.turned == ()
+
+
 def test_flights_of_one_machine_are_not_odd():
     for seed in range(0, 100, 4):
         flights = [flight(good(seed + i)) for i in range(4)]

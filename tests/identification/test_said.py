@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, Signal, fit
+from heli_jax.flights.flight import Source
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.sentences import _tied_together
 from heli_jax.identification.identifiability.verdict import Pair, Unknown
@@ -185,3 +186,35 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
         assert verdict.identifiable
         assert verdict.through_zero == zero
         assert ("B (its 95 % interval holds zero)" in verdict.text) == bool(zero)
+
+
+def test_of_a_time_shift_at_its_end_is_not_said_that_it_has_no_effect():
+    # Searched through a tanh, whose slope vanishes there: a record that wants it beyond.
+    [parameter] = unknowns("L")
+    shift = Unknown("time_shift", 0.5, False, 1.0, 0.0, is_parameter=False, at_bound=True, room=0.0)
+    verdict = analyse(np.array([[100.0, 0.0]]), (parameter, shift))
+    assert "no effect" not in verdict.text
+    assert "time_shift is at its bound, 0.5: the data want it beyond" in verdict.text
+    assert "The data determine L." in verdict.text
+    assert verdict.without_effect == ("time_shift",)
+
+
+def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
+    [parameter] = unknowns("L")
+    for sd, said in ((10.0, ("time_shift",)), (5.0, ())):
+        # 0.2 s in samples of 20 ms, searched up to 0.5 s: 15 samples further.
+        shift = Unknown("time_shift", 0.2, False, 1.0, 0.0, is_parameter=False, room=15.0)
+        verdict = analyse(np.diag([100.0, 1.0 / sd]), (parameter, shift))
+        assert verdict.identifiable
+        assert verdict.roughly == said
+        where = "only roughly time_shift (its 95 % interval reaches the end of its search)"
+        assert (where in verdict.text) == bool(said)
+
+
+def test_an_input_whose_unit_is_in_doubt_is_named_in_the_first_line():
+    flight = record(1, 0.0, 0.02)
+    percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
+    source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
+    read = Flight(dt=DT, inputs=percent, outputs=dict(flight.outputs), source=source)
+    found = fit(problem(read, L=Free(-1.0), B=Free(2.0)))
+    assert "the unit of d is in doubt" in found.adequacy.summary

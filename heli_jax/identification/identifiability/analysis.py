@@ -290,7 +290,8 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
 
 
 def _roughly(a: _Analysis) -> dict[str, float]:
-    """By parameter that is determined in a wide interval, the factor to its ends."""
+    """By unknown that is determined in a wide interval, the factor to its ends; infinite of one
+    whose interval reaches the end of its search."""
     lacking = (*a.undetermined, *a.without_effect)
     factors = {
         u.name: factor(u, float(sd), a.limits)
@@ -298,7 +299,12 @@ def _roughly(a: _Analysis) -> dict[str, float]:
         # A coordinate that is no logarithm has no factor; what has no effect has no variance.
         if u.logarithmic and u.name not in lacking
     }
-    return {n: ratio for n, ratio in factors.items() if ratio > math.exp(Z95 * ROUGHLY)}
+    ended = {
+        u.name: math.inf
+        for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
+        if Z95 * float(sd) >= u.room and not u.at_bound and u.name not in lacking
+    }
+    return {n: ratio for n, ratio in factors.items() if ratio > math.exp(Z95 * ROUGHLY)} | ended
 
 
 def _through_zero(a: _Analysis) -> tuple[str, ...]:

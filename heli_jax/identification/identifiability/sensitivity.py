@@ -18,13 +18,15 @@ from heli_jax.identification.identifiability.verdict import (
     Unknown,
     Verdict,
 )
-from heli_jax.identification.problem import Problem
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.nuisances import WeakUnknown, can_be_off, weak_unknowns
 
 _NEAR_ZERO = 1e-2
 """part of a parameter's size below which it takes no part in products of powers"""
+_AT_END = 1e-3
+"""part of the largest time shift within which one is at the end of its search"""
 
 
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
@@ -44,8 +46,19 @@ def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknow
 def _unknown(problem: Problem, name: str, value: float) -> Unknown:
     free = problem.free.get(name)
     if name == "time_shift":
-        # Zero is as good a value as any: one unit is a sample, see `references_of`.
-        return Unknown(name, value, False, 1.0, 0.0, is_parameter=False)
+        # Zero is as good a value as any: one unit is a sample, see `references_of`. The search is
+        # through a tanh, which comes near to its end and never to it.
+        room = MAX_TIME_SHIFT - abs(value)
+        return Unknown(
+            name,
+            value,
+            False,
+            1.0,
+            0.0,
+            is_parameter=False,
+            at_bound=room < _AT_END * MAX_TIME_SHIFT,
+            room=room / problem.training[0].dt,
+        )
     if free is None:
         return Unknown(name, value, True, 1.0, 0.0, is_parameter=False)
     reference, log = _reference(problem, name, value)

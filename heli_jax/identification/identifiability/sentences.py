@@ -1,5 +1,6 @@
 """The identifiability analysis in sentences; each names a way out that exists."""
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
@@ -63,7 +64,8 @@ class Facts(NamedTuple):
     remedies: Mapping[str, str]
     """by name, a further way out, as 'add a run with a known inertia'"""
     roughly: Mapping[str, float] = MappingProxyType({})
-    """by name, the factor to the ends of a 95 % interval that is wide"""
+    """by name, the factor to the ends of a 95 % interval that is wide; infinite of a time shift
+    whose interval reaches the end of its search"""
     through_zero: tuple[str, ...] = ()
     """parameters of either sign whose 95 % interval holds zero"""
     twins: tuple[tuple[str, str], ...] = ()
@@ -74,7 +76,12 @@ class Facts(NamedTuple):
 
 def sentences(facts: Facts) -> tuple[str, ...]:
     """What the data determine, what they do not, and what can be done, most important first."""
-    lines = [_without_effect(name) for name in facts.without_effect]
+    # At its bound the slope of what is searched through a tanh vanishes: that is no lack of effect.
+    bound = {u.name: u for u in facts.unknowns if u.at_bound}
+    lines = [
+        _at_bound(bound[name]) if name in bound else _without_effect(name)
+        for name in facts.without_effect
+    ]
     lines += [_exchanged(pair, facts) for pair in facts.twins]
     lines += _also_fits(facts)
     lines += [_not_determined(group, facts) for group in facts.groups]
@@ -124,16 +131,19 @@ def _by_data(names: list[str], facts: Facts) -> str:
     roughly, zero = facts.roughly, facts.through_zero
     # An interval that holds zero is no factor, and says of the sign that it is open.
     well = [n + _open_sign(n, zero) for n in names if n not in roughly]
-    wide = [
-        n + (_open_sign(n, zero) or f" (95 % within a factor of {roughly[n]:.2g})")
-        for n in names
-        if n in roughly
-    ]
+    wide = [n + (_open_sign(n, zero) or _how_roughly(roughly[n])) for n in names if n in roughly]
     if not wide:
         return f"The data determine {listed(well)}."
     if not well:
         return f"The data determine only roughly {listed(wide)}."
     return f"The data determine {listed(well)}, and only roughly {listed(wide)}."
+
+
+def _how_roughly(factor: float) -> str:
+    # What is no logarithm has no factor: a time shift up to the end of its search.
+    if not math.isfinite(factor):
+        return " (its 95 % interval reaches the end of its search)"
+    return f" (95 % within a factor of {factor:.2g})"
 
 
 def _open_sign(name: str, through_zero: tuple[str, ...]) -> str:

@@ -41,6 +41,9 @@ class Unknown(NamedTuple):
     """whether it moves a mode that the samples do not tell from its aliases"""
     at_bound: bool = False
     """whether it ended at its bound, so that the data want it beyond"""
+    room: float = math.inf
+    """from the value to the nearer end of a search that no configuration widens, that of a time
+    shift, in its relative coordinate"""
 
 
 class Combination(NamedTuple):

@@ -74,7 +74,7 @@ def estimates_of(
             unit=_unit(problem, u.name),
             start=start,
             prior_share=verdict.prior_share[u.name],
-            at_bound=_at_bound(problem, u.name, u.value),
+            at_bound=u.at_bound,
             sd_white=None if not_identifiable else float(white * references[i]),
             sd_alone=None if not_identifiable else float(white * references[i] * insensitivity[i]),
         )
@@ -151,14 +151,6 @@ def _unit(problem: Problem, name: str) -> str:
     if name.startswith("gain "):
         return problem.gain_units.get(name.removeprefix("gain "), "1")
     return naming.unit(problem.model.Params, name) or ""
-
-
-def _at_bound(problem: Problem, name: str, value: float) -> bool:
-    free = problem.free.get(name)
-    if free is None:
-        # The shift is searched through a tanh, which comes near to its bound and never to it.
-        return name == "time_shift" and abs(value) > 0.999 * MAX_TIME_SHIFT
-    return transforms.at_bound(free, value)
 
 
 def bound_notes(estimates: dict[str, Estimate]) -> list[str]:

@@ -92,7 +92,10 @@ def _why_not(seen: SeenParts) -> str:
 
 def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
     """None where no output is seen, or the parts are too short for an average."""
-    more, sizes = 2 * (len(moving) - 1), [p.n_samples for p in seen.parts]
+    # Where all inputs rest nothing is told of what follows them: such segments would count as
+    # averages, and a long flight at rest would set the length of segments for a short sweep.
+    parts = [p for p in seen.parts if any(np.ptp(p.inputs[n]) > 0 for n in moving)]
+    more, sizes = 2 * (len(moving) - 1), [p.n_samples for p in parts]
     if not seen.outputs or not sizes:
         return None
     # Many segments where they can be long still, since few show little of a disturbed machine; else
@@ -102,7 +105,7 @@ def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
     length = _length(sizes, _MANY + more, least) or _length(sizes, _SEGMENTS + more, _SHORTEST)
     if length == 0:
         return None
-    long = [p for p in seen.parts if p.n_samples >= length]
+    long = [p for p in parts if p.n_samples >= length]
     transforms = [segment_transforms(_channels(p, moving, seen.outputs), dt, length) for p in long]
     omega, both = transforms[0][0], np.concatenate([t for _, t in transforms], axis=1)
     # Without zero frequency, which the straight lines took, and Nyquist's.
@@ -248,8 +251,9 @@ def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
         c = np.where(np.isnan(c), np.nan_to_num(partial_coherence(others[:, :, :0], u, v)), c)
         powers = [np.sum(np.abs(x) ** 2, axis=1) for x in (u, v)]
         # Where both have power: that is where each could be taken for the other.
-        weights = np.min([p / p.sum() for p in powers], axis=0)
-        mean = float(np.average(c, weights=weights))
+        weights = np.min([p / max(p.sum(), 1e-300) for p in powers], axis=0)
+        # None where one of them moves in parts alone that are shorter than a segment.
+        mean = float(np.sum(c * weights) / max(np.sum(weights), 1e-300))
         excited = weights >= _LEAST_POWER * weights.max()
         band = longest_band(pooled.hz, (c >= limit) & excited)
         pairs.append((mean, moving[a], moving[b], band))

@@ -42,6 +42,15 @@ def wrong_units(
         simulated: at the start values, by flight and output (N,), SI.
         sticks: by output the input that moves it, of `signal_signs.sticks_of`; without it any.
     """
+    return [finding for _, finding in doubtful_inputs(flights, simulated, sticks)]
+
+
+def doubtful_inputs(
+    flights: Sequence[tuple[str, Flight]],
+    simulated: Sequence[Mapping[str, np.ndarray]],
+    sticks: Mapping[str, str] | None = None,
+) -> list[tuple[str, Finding]]:
+    """The same, each with the name of its input."""
     findings = []
     for (label, flight), run in zip(flights, simulated, strict=True):
         for name, signal in (flight.source.inputs if flight.source else {}).items():
@@ -53,7 +62,7 @@ def wrong_units(
             if other is None or not sizes:
                 continue
             if all(s and other.factor / _NEAR < s < other.factor * _NEAR for s in sizes):
-                findings.append(_said(label, name, signal, other, moved, sizes))
+                findings.append((name, _said(label, name, signal, other, moved, sizes)))
     return findings
 
 

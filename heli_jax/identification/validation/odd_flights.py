@@ -30,6 +30,9 @@ _BINS = 3
 _LEFT = 0.8
 """part of an output's power that the response of the others leaves, from which on it foretells
 nothing"""
+_TURNED = 0.4
+"""part of an output's power that the response of the others leaves at most where its sign is turned
+and nothing else is wrong"""
 _LOUDER = 4.0
 """times what it leaves of the others: of a flight that is hardly excited it leaves no more"""
 _EXCITED = 0.1
@@ -47,6 +50,8 @@ class OddFlight(NamedTuple):
     """part of the power of the surest of them that the response of the others leaves"""
     still: tuple[str, ...]
     """inputs that move in other flights and not in this one"""
+    turned: tuple[str, ...] = ()
+    """those of the outputs that answer as in the others with the other sign"""
 
     @property
     def words(self) -> str:
@@ -58,11 +63,18 @@ class OddFlight(NamedTuple):
         """What was found and what to do, as a doubt."""
         names = " and ".join(self.outputs)
         does = "do" if len(self.outputs) > 1 else "does"
-        why = (
-            f"{' and '.join(self.still)} never moves there: is the column dead?"
-            if self.still
-            else "is it of another machine, is a column or a sign wrong, or its clock out of order?"
-        )
+        if self.still:
+            why = f"{' and '.join(self.still)} never moves there: is the column dead?"
+        elif self.turned == self.outputs:
+            stick = " (or, of all that it moves, an input)" if len(self.turned) > 1 else ""
+            why = (
+                f"with the other sign {'they do' if stick else 'it does'}: {names}{stick} "
+                f"{'have' if stick else 'has'} the wrong one there (`invert: true`)."
+            )
+        else:
+            why = (
+                "is it of another machine, is a column or a sign wrong, or its clock out of order?"
+            )
         words = (
             f"{self.label}: {names} {does} not answer the inputs as in the other flights, whose "
             f"response leaves {percent(self.left, 0)} of the power: {why} Mend this flight or "
@@ -126,7 +138,10 @@ def _of_group(flights: list[Flight], names: list[str], indices: list[int]) -> li
         if bad:
             still = tuple(n for n in moving if not np.ptp(flight.inputs[n]) > 0)
             most = max(left[n] for n in bad)
-            odd.append(OddFlight(indices[i], names[i], bad, most, still))
+            over = own._replace(outputs={n: -own.outputs[n] for n in bad})
+            after = {n: _left(over, others, n, joined) for n in bad}
+            turned = tuple(n for n, x in after.items() if x is not None and x < _TURNED)
+            odd.append(OddFlight(indices[i], names[i], bad, most, still, turned))
     return odd
 
 
