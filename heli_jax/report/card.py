@@ -17,6 +17,7 @@ from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
+from heli_jax.identification.validation.held_out_agreement import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import number, percent, vaf_percent
 from heli_jax.report import frequency
@@ -31,6 +32,8 @@ THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
 # Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
+_LEAST_P = 1e-6
+"""below which the digits of a chance mean nothing"""
 _VAF = "VAF"
 _CORRELATED = "largest correlation"
 _BIAS_PART = "Theil bias part"
@@ -80,6 +83,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
         for name, m in metrics.items():
             at = _of_agreement(name, m, source, judged=judged)
             lines += _without_bias_part(at, _mean_is_fitted(fit))
+    lines += _of_held_out(fit)
     lines += _of_disturbance(fit)
     lines += _of_whiteness(fit, f"whiteness of {estimator.errors}, p-value")
     lines += _of_excitation(problem, fit)
@@ -243,6 +247,23 @@ def _without_bias_part(lines: list[Gate], fitted: str) -> list[Gate]:
         else line
         for line in lines
     ]
+
+
+def _of_held_out(fit: Fit) -> list[Gate]:
+    """What flights held out say in frequency, where their simulation is asked nothing."""
+    lines, held = [], fit.held_out_frequency
+    for f in held.flights if held is not None else ():
+        of = f"{f.flight}, held out"
+        if f.estimates_p_value is not None:
+            p, remark = f.estimates_p_value, "chance of as large a difference from the fit's"
+            words = "" if p >= _LEAST_P else f"below {number(_LEAST_P)}"
+            gate = _least("its own estimates, p-value", of, p, "", LEVEL, remark)
+            lines.append(gate._replace(words=words))
+        for n in dict.fromkeys([*f.explained, *f.worse]):
+            share, passed = f.explained.get(n, math.nan), n not in f.worse
+            line = Gate("explained", f"{n}, {of}", 100 * share, "%", "not below none", passed)
+            lines.append(line if passed else line._replace(words="less than none"))
+    return lines
 
 
 def _of_disturbance(fit: Fit) -> list[Gate]:

@@ -10,6 +10,7 @@ from heli_jax import Flight, Free, Problem, fit, linear_model, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
 from heli_jax.report import tables
+from heli_jax.report.card import card, failed
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, response, vehicle
 from tests.identification.test_frequency_error import FALLING
@@ -85,7 +86,7 @@ def test_another_machine_is_told_with_the_estimate_that_it_asks_for(found):
     assert one.furthest.own == pytest.approx(HEAVY["Ixx"], rel=0.03)
     assert one.furthest.fitted == pytest.approx(BENCH["Ixx"], rel=0.01)
     [sentence] = [n for n in found[0].notes if n.startswith("heavy, held out")]
-    assert "most of all Ixx, about 0.02" in sentence
+    assert "by itself Ixx is the furthest, from 0.02" in sentence
 
 
 def test_a_model_that_is_worse_than_none_is_no_result(found):
@@ -114,8 +115,24 @@ def test_it_stands_in_fit_json_and_in_tables(found):
     assert content["flights"][2]["furthest"]["parameter"] == "Ixx"
     assert content["flights"][0]["responses"] is None
     held_out = found[0].held_out_frequency
-    assert len(tables.held_out_flights(held_out).rows) == 5
+    table = tables.held_out_flights(held_out)
+    assert len(table.rows) == 5
+    assert table.head[-1] == "explained"
+    assert any("differ (p below 1·10⁻⁶)" in row for row in table.rows)
+    assert of(found, "turned").in_words.endswith("of what follows the excitation: roll none")
     assert len(tables.held_out_bands(held_out).rows) == len(held_out.bands)
+
+
+def test_the_card_asks_of_them_what_no_simulation_tells(found):
+    """Beside exit code 4 stood a card of which all gates were passed."""
+    lines = card(found[1], found[0])
+    own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
+    assert own["same, held out"].passed
+    assert own["heavy, held out"].passed is False
+    assert own["heavy, held out"].words == "below 1·10⁻⁶"
+    explained = {g.of: g.passed for g in lines if g.what == "explained"}
+    assert explained["roll, same, held out"]
+    assert explained["roll, turned, held out"] is False
 
 
 def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
@@ -159,6 +176,10 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
     content = fit_json(*found, None)["held_out_frequency"]
     assert content["flights"][0]["responses"]["pairs"][0]["output"] == "roll"
+    # No share is asked of responses.
+    assert "explained" not in tables.held_out_flights(found[0].held_out_frequency).head
+    [gate] = [g for g in failed(card(problem, found[0])) if g.what == "explained"]
+    assert (gate.of, gate.words) == ("roll, turned, held out", "less than none")
 
 
 @pytest.mark.slow

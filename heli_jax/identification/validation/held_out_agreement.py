@@ -73,10 +73,10 @@ class HeldOutFlight(NamedTuple):
             known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
         if self.explained:
             parts = (
-                f"{plain_words(percent(v, 1))} of {n}" if v >= 0 else f"none of {n}"
+                f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
                 for n, v in self.explained.items()
             )
-            known.append(f"explained of what follows the inputs {', '.join(parts)}")
+            known.append(f"explained of what follows the excitation: {', '.join(parts)}")
         return "; ".join(known)
 
     @property
@@ -85,7 +85,7 @@ class HeldOutFlight(NamedTuple):
         where, said = f"{self.flight}, held out", []
         if self.worse:
             names = " and ".join(self.worse)
-            said.append(f"{where}: of {names} the model explains less than none at all would.")
+            said.append(f"{where}: of {names} the model explains less than no model at all would.")
         if self.differs:
             assert self.estimates_p_value is not None
             f = self.furthest
@@ -93,15 +93,17 @@ class HeldOutFlight(NamedTuple):
                 ""
                 if f is None
                 else (
-                    f", most of all {f.parameter}, about {plain_words(number(f.own, 3))} there for "
-                    f"{plain_words(number(f.fitted, 3))} ({f.sds:.1f} joint standard deviations)"
+                    f"; by itself {f.parameter} is the furthest, from "
+                    f"{plain_words(number(f.fitted, 3))} towards {plain_words(number(f.own, 3))} "
+                    f"({f.sds:.1f} joint standard deviations)"
                 )
             )
             said.append(
                 f"{where}: what it says of the parameters is further from the estimates than the "
                 f"errors of both allow (p {p_value(self.estimates_p_value)}){most}: the model "
-                "lacks something, or the machine was another one there (mass, speed, battery). The "
-                "intervals speak for the fitted flights alone."
+                "lacks something, or the flight differs: mass, rotor speed, battery, or the scale, "
+                "sign or clock of a column of its log. The intervals speak for the fitted flights "
+                "alone."
             )
         elif not self.worse and not self.lower95 <= self.chi_squared <= self.upper95:
             said.append(f"{where}: {self._size}.")
