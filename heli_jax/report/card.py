@@ -19,7 +19,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.held_out_agreement import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import number, percent, vaf_percent
+from heli_jax.numbers import number, p_value, percent, vaf_percent
 from heli_jax.report import frequency
 from heli_jax.report.coherence import Coherence, coherences
 from heli_jax.report.frequency import FittedFlight
@@ -32,8 +32,6 @@ THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
 # Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
-_LEAST_P = 1e-6
-"""below which the digits of a chance mean nothing"""
 _VAF = "VAF"
 _CORRELATED = "largest correlation"
 _BIAS_PART = "Theil bias part"
@@ -256,9 +254,8 @@ def _of_held_out(fit: Fit) -> list[Gate]:
         of = f"{f.flight}, held out"
         if f.estimates_p_value is not None:
             p, remark = f.estimates_p_value, "chance of as large a difference from the fit's"
-            words = "" if p >= _LEAST_P else f"below {number(_LEAST_P)}"
             gate = _least("its own estimates, p-value", of, p, "", LEVEL, remark)
-            lines.append(gate._replace(words=words))
+            lines.append(gate._replace(words=p_value(p)))
         for n in dict.fromkeys([*f.explained, *f.worse]):
             share, passed = f.explained.get(n, math.nan), n not in f.worse
             line = Gate("explained", f"{n}, {of}", 100 * share, "%", "not below none", passed)

@@ -129,10 +129,18 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
     own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
     assert own["same, held out"].passed
     assert own["heavy, held out"].passed is False
-    assert own["heavy, held out"].words == "below 1·10⁻⁶"
+    assert own["heavy, held out"].words == "below 1e-6"
+    assert any("below 1·10⁻⁶" in row for row in tables.acceptance(lines).rows)
     explained = {g.of: g.passed for g in lines if g.what == "explained"}
     assert explained["roll, same, held out"]
     assert explained["roll, turned, held out"] is False
+
+
+def test_where_no_estimates_are_asked_for_what_its_size_may_come_of_is_said(found):
+    silent = of(found, "noisy")._replace(estimates_p_value=None, furthest=None, explained={})
+    [sentence] = silent.sentences
+    assert "it has more gusts or noise than these, or more than the model explains" in sentence
+    assert "agree" not in sentence
 
 
 def test_flights_of_other_outputs_cannot_be_fitted_together(flights):

@@ -118,11 +118,11 @@ class HeldOutFlight(NamedTuple):
             why = "the model lacks something there" if more else "its noise is taken too large"
             return f"{size} its own noise lets expect ({between}): {why}"
         size = f"{size} the noise of the fitted flights lets expect ({between})"
-        if self.estimates_p_value is None:
-            return size
+        # Where they are not asked for, nothing tells these from another machine.
+        agree = "" if self.estimates_p_value is None else ", though its own estimates agree"
         what = "more gusts or noise than these, or more" if more else "fewer gusts and less noise"
         rest = " than the model explains" if more else " than these"
-        return f"{size}, though its own estimates agree: it has {what}{rest}"
+        return f"{size}{agree}: it has {what}{rest}"
 
 
 class HeldOutFrequency(NamedTuple):

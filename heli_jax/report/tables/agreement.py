@@ -159,7 +159,10 @@ def choice(selection: Choice) -> Table:
 def acceptance(lines: tuple[Gate, ...]) -> Table:
     """The acceptance card: what, of what, value, gate, passed or failed, remark."""
     words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
-    rows = [(g.what, g.of, shown(g), g.gate or NOTHING, words[g.passed], g.remark) for g in lines]
+    rows = [
+        (g.what, g.of, page_sentence(shown(g)), g.gate or NOTHING, words[g.passed], g.remark)
+        for g in lines
+    ]
     return Table(("", "of", "value", "gate", "", "remark"), rows)
 
 
