@@ -47,11 +47,12 @@ class HeldOutFlight(NamedTuple):
     freedom: float
     """independent real numbers that it is the mean of"""
     estimates_p_value: float | None
-    """that the flight's own estimates would be as far from the fit's by chance; None where it says
-    nothing of them"""
+    """the chance that errors of both make the flight's own estimates as far from the fit's; null
+    where it says nothing of them"""
     furthest: Furthest | None
     explained: dict[str, float]
-    """by output, of the power that follows the excitation the part that the model explains"""
+    """by output, of the power that follows the excitation the part that the model explains; below 0
+    it is worse than no model; of those alone where gusts leave at most 0.05 of it to chance"""
     worse: tuple[str, ...]
     """the outputs that a model without any response would explain better"""
     responses: ResponseAgreement | None
