@@ -5,8 +5,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.linalg
 
-from heli_jax import Flight, Free, Problem, fit, linear_model, models
+from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
 from heli_jax.report import tables
@@ -188,6 +189,46 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert "explained" not in tables.held_out_flights(found[0].held_out_frequency).head
     [gate] = [g for g in failed(card(problem, found[0])) if g.what == "explained"]
     assert (gate.of, gate.words) == ("roll, turned, held out", "less than none")
+
+
+def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
+    """Its responses are those of feedback, and passed for another machine (p below 1e-6)."""
+    roll, dt, n = linear_model("roll-flybarless"), 0.02, 3000
+    params, rng = roll.vehicle().params, np.random.default_rng(3)
+    matrices = linearize(roll.model, params).matrices
+    Ad = scipy.linalg.expm(np.block([[matrices.A, matrices.B], [np.zeros((1, 4))]]) * dt)
+    t = np.arange(n) * dt
+    sweep = 0.05 * np.sin(2 * np.pi * (0.2 * t + 0.04 * t**2))
+    made = []
+    for name in ("fitted", "same", "bare", "off"):
+        x, gust, u, p = np.zeros(3), 0.0, np.zeros(n), np.zeros(n)
+        for k in range(n):
+            asked = 0.0 if name in ("bare", "off") else sweep[k]
+            p[k], u[k] = x[1], asked - 0.8 * x[0]
+            gust = 0.96 * gust + 0.005 * rng.standard_normal()
+            x = (Ad @ np.append(x, u[k]))[:3]
+            x[1] += gust
+        p += 2e-3 * rng.standard_normal(n)
+        own = sweep if name in ("fitted", "same") else np.zeros(n)
+        logged = {} if name == "bare" else {"lat": own}
+        made.append(
+            Flight(
+                dt=dt, inputs={"lat": u}, outputs={"p": p}, instruments=logged, name=name,
+                hold_out=name != "fitted",
+            )
+        )  # fmt: skip
+    found = fit(
+        Problem(
+            roll.model, params, made, {"Lb": Free(100.0), "Blat": Free(0.1)},
+            method="frequency-response", frequency=ResponseOptions(band=(0.3, 4.0), window=10.0),
+        )
+    )  # fmt: skip
+    [one] = found.held_out_frequency.flights
+    assert one.flight == "same"
+    assert not one.differs
+    for name in ("bare", "off"):
+        words = f"{name}, held out: not judged in frequency: no instrument of lat moves in it"
+        assert any(n.startswith(words) for n in found.held_out_frequency.notes)
 
 
 @pytest.mark.slow
