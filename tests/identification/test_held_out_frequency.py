@@ -182,6 +182,8 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert wrong.differs
     assert wrong.worse == ("roll",)
     assert wrong.responses.pairs[0].J > 1000.0
+    unasked = wrong._replace(estimates_p_value=None, furthest=None, worse=())
+    assert unasked.sentences[0].endswith("or feedback makes the responses what they are.")
     assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
     content = fit_json(*found, None)["held_out_frequency"]
     assert content["flights"][0]["responses"]["pairs"][0]["output"] == "roll"

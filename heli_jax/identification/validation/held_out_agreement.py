@@ -117,6 +117,9 @@ class HeldOutFlight(NamedTuple):
         more = self.chi_squared > self.upper95
         if self.responses is not None:
             why = "the model lacks something there" if more else "its noise is taken too large"
+            if more and self.estimates_p_value is None:
+                # They are not asked for where feedback has its part in the responses.
+                why += ", or feedback makes the responses what they are"
             return f"{size} its own noise lets expect ({between}): {why}"
         size = f"{size} the noise of the fitted flights lets expect ({between})"
         # Where they are not asked for, nothing tells these from another machine.
