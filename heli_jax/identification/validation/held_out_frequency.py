@@ -376,7 +376,13 @@ def _by_responses(
 ) -> HeldOutFrequency:
     """By the responses of each flight; of those that are too short by themselves, together."""
     found, short, notes = [], {}, []
+    by = instruments_of(problem)
     for label, flight in zip(labels(tuple(held)), held, strict=True):
+        # Those of the inputs themselves may be what feedback makes of them, whatever the model.
+        if lacks := _without_instrument(flight, by):
+            words = f"no instrument of {', '.join(lacks)} moves in it, and the fit is by instrument"
+            notes.append(f"{label}, held out: not judged in frequency: {words}.")
+            continue
         try:
             found.append(_responses_of(problem, at, fitted, (label, (flight,))))
         except ValueError as error:
@@ -388,8 +394,15 @@ def _by_responses(
             short = {}
         except ValueError:
             pass
-    notes = [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
+    notes += [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
     return HeldOutFrequency(tuple(found), (), tuple(notes))
+
+
+def _without_instrument(flight: Flight, by: Sequence[str]) -> list[str]:
+    """Those of some inputs whose instrument a flight lacks; all where none of its own moves."""
+    if not any(np.ptp(flight.instruments[n]) > 0 for n in by if n in flight.instruments):
+        return list(by)
+    return [n for n in by if n not in flight.instruments]
 
 
 def _responses_of(
