@@ -76,11 +76,13 @@ def print_fit(run: FitRun) -> None:
         _tell_table(responses)
     for flight in held.flights if held is not None else ():
         if (responses := report_tables.responses(flight.responses)) is not None:
-            tell(f"Responses of {flight.flight}, held out:")
+            # A single response has the errors of the estimates in it.
+            allowed = "in all together errors of the estimates are allowed for"
+            tell(f"Responses of {flight.flight}, held out ({allowed}):")
             _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    tell(f"acceptance card: {summary(card(problem, fit), _GATES)}")
+    tell(plain_words(f"acceptance card: {summary(card(problem, fit), _GATES)}"))
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
         _tell_table(compared)

@@ -2,6 +2,7 @@
 stands in fit.json."""
 
 import json
+import shlex
 import shutil
 import textwrap
 from pathlib import Path
@@ -25,7 +26,13 @@ def print_keys(pattern: str | None) -> None:
     """
     matches = keys() if pattern is None else matching(pattern)
     if not matches:
-        raise InputError(f"keys: expected a text that some key or its meaning holds, got {pattern}")
+        from heli_jax.report import fit_keys
+
+        hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(pattern or '')}"
+        raise InputError(
+            f"keys: expected a text that some key or its meaning holds, got {pattern}"
+            f"{hint if fit_keys.matching(pattern or '') else ''}"
+        )
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     for key in matches:
         print(*_lines(key, width), sep="\n")

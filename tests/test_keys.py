@@ -88,7 +88,11 @@ def test_keys_in_the_terminal(
     assert "by how much it is logged late [s]" in shown
     assert all(len(line) <= 50 for line in shown.splitlines())
     assert cli.main(["keys", "no such key"]) == 2
-    assert "no such key" in capsys.readouterr().err
+    assert "no such key" in (said := capsys.readouterr().err)
+    assert "--fit" not in said
+    # What stands in fit.json alone has keys of its own.
+    assert cli.main(["keys", "held_out_frequency"]) == 2
+    assert "heli-jax keys --fit held_out_frequency" in capsys.readouterr().err
     assert cli.main(["keys", "--schema", str(tmp_path / "s.json")]) == 0
     assert yaml.safe_load((tmp_path / "s.json").read_text())["$schema"]
 

@@ -285,8 +285,9 @@ def responses(
     if len(z) != m:
         raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
     if np.min(n) < m + 1:
+        many = "1 input" if m == 1 else f"{m} inputs"
         raise TooFewAveragesError(
-            f"expected at least {m + 1} independent averages for {m} inputs, got "
+            f"expected at least {m + 1} independent averages for {many}, got "
             f"{np.min(n):.2f}: a longer record, or a shorter window"
         )
     # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.

@@ -234,7 +234,8 @@ def _complete(
     seconds, inputs = asked
     averages = np.sum(seen, axis=0) / PER_AVERAGE
     kept = averages >= inputs + 1
-    need = f"expected at least {inputs + 1} independent averages for {inputs} inputs, got"
+    many = "1 input" if inputs == 1 else f"{inputs} inputs"
+    need = f"expected at least {inputs + 1} independent averages for {many}, got"
     windows = f"from windows of {seconds:g} s without a missing sample"
     if not kept.any():
         raise ValueError(

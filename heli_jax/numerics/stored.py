@@ -25,6 +25,7 @@ import numpy as np
 from jax.core import Tracer
 
 from heli_jax import versions
+from heli_jax.numerics.jitted import jitted
 from heli_jax.numerics.stored_content import Unknown, content, named
 
 _MOST = 200
@@ -48,30 +49,30 @@ def keep_in(folder: Path | None) -> None:
 
 
 def stored[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """`equinox.filter_jit` whose programs are kept where `keep_in` was called.
+    """`jitted` whose programs are kept where `keep_in` was called.
 
     Args:
         function: of this package, of arrays and static arguments by position; returns arrays in
             tuples, lists, dictionaries and named tuples.
     """
-    jitted = eqx.filter_jit(function)
+    plain = jitted(function)
     programs: dict[Any, Callable[..., Any] | None] = {}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if not _folder or kwargs:
-            return jitted(*args, **kwargs)
+            return plain(*args, **kwargs)
         traced, static = eqx.partition(args, eqx.is_array)
         leaves, structure = jax.tree.flatten(traced)
         if not all(map(_plain, leaves)):
-            return jitted(*args, **kwargs)
+            return plain(*args, **kwargs)
         fixed, shape = jax.tree.flatten(static)
         types = tuple(map(type, fixed))  # 1, 1.0 and True are equal, and traced otherwise
         key = (structure, shape, tuple(fixed), types, tuple((v.dtype, v.shape) for v in leaves))
         if key not in programs:
             programs[key] = _program(function, args, _folder[0])
         program = programs[key]
-        return jitted(*args, **kwargs) if program is None else program(leaves)
+        return plain(*args, **kwargs) if program is None else program(leaves)
 
     return call
 

@@ -21,7 +21,7 @@ _CAPTIONS = {
     "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
     "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
     "did not notice (Wood and Hodgkinson, 1980).",
-    "held": "The same of the flights held out: gain and phase of model and data with 95 % "
+    "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
     "intervals, partial coherence of the data, and data over model.",
     "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
     "starts": "The misfit that each start of the optimiser reached, best first.",

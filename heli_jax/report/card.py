@@ -17,8 +17,9 @@ from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
+from heli_jax.identification.validation.held_out_agreement import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import number, percent, vaf_percent
+from heli_jax.numbers import number, p_value, percent, vaf_percent
 from heli_jax.report import frequency
 from heli_jax.report.coherence import Coherence, coherences
 from heli_jax.report.frequency import FittedFlight
@@ -80,6 +81,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
         for name, m in metrics.items():
             at = _of_agreement(name, m, source, judged=judged)
             lines += _without_bias_part(at, _mean_is_fitted(fit))
+    lines += _of_held_out(fit)
     lines += _of_disturbance(fit)
     lines += _of_whiteness(fit, f"whiteness of {estimator.errors}, p-value")
     lines += _of_excitation(problem, fit)
@@ -243,6 +245,22 @@ def _without_bias_part(lines: list[Gate], fitted: str) -> list[Gate]:
         else line
         for line in lines
     ]
+
+
+def _of_held_out(fit: Fit) -> list[Gate]:
+    """What flights held out say in frequency, where their simulation is asked nothing."""
+    lines, held = [], fit.held_out_frequency
+    for f in held.flights if held is not None else ():
+        of = f"{f.flight}, held out"
+        if f.estimates_p_value is not None:
+            p, remark = f.estimates_p_value, "chance of as large a difference from the fit's"
+            gate = _least("its own estimates, p-value", of, p, "", LEVEL, remark)
+            lines.append(gate._replace(words=p_value(p)))
+        for n in dict.fromkeys([*f.explained, *f.worse]):
+            share, passed = f.explained.get(n, math.nan), n not in f.worse
+            line = Gate("explained", f"{n}, {of}", 100 * share, "%", "not below none", passed)
+            lines.append(line if passed else line._replace(words="less than none"))
+    return lines
 
 
 def _of_disturbance(fit: Fit) -> list[Gate]:

@@ -65,7 +65,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     if (responses := supplementary.responses) is not None:
         for group, pairs, whose in (
             ("match", responses.pairs, "flights together"),
-            ("held", responses.held_out, "flights held out"),
+            ("held", responses.held_out, "flights held out together"),
         ):
             for pair in pairs:
                 drawings[f"{group}_{pair.output}-{pair.input}"] = _match(pair, analysis, whose)

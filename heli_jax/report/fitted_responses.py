@@ -224,7 +224,10 @@ def _of_held_out(
     pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
-    words = "no figure of the flights held out: together none of their responses is coherent"
+    words = (
+        f"no figure of the flights held out: none of their responses, taken together, has a "
+        f"coherence of {COHERENT:g} in the mean over an octave"
+    )
     return (), (words,)
 
 

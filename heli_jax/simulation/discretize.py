@@ -11,7 +11,7 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
-from heli_jax.numerics.matrix_exponential import expm, product, van_loan
+from heli_jax.numerics.matrix_exponential import expm, van_loan
 from heli_jax.simulation.delays import Delays
 
 
@@ -48,75 +48,71 @@ def discretize(
         dt: [s].
         delays: how late the inputs are; whole samples are left to who reads the arrays. With
             `late` [s] the part of each interval before the delayed sample u[k] acts, under a
-            zero-order hold x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] + G(dt-late) u[k].
+            zero-order hold x[k+1] = Ad x[k] + (G(dt) - G(dt-late)) u[k-1] + G(dt-late) u[k].
         linear: of each input whether it is linear between samples; () holds all.
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
-    if delays is None:
-        return _once(_discretize(A, B, dt, None, linear))
-    if set(delays.groups) == {0}:
-        return _once(_discretize(A, B, dt, delays.rest[0] * dt, linear))
-    return _once(_by_group(A, B, dt, delays, linear))
-
-
-def _by_group(A: Array, B: Array, dt: Array, delays: Delays, linear: tuple[bool, ...]) -> Discrete:
-    """`discretize` where inputs are late by different times: what they add is superposed, so each
-    group's columns are those of a model with these inputs alone."""
-    zeros = jnp.zeros_like(B)
-    # Bp also where a group acts at once: its columns are zero, and one shape serves every delay.
-    Ad, Bd, Bp, Bn = None, zeros, zeros, zeros if linear else None
-    for group in sorted(set(delays.groups), key=lambda g: -1 if g is None else g):
+    Ad, whole = _over(A, B, dt, dt, linear)
+    # u[k] + (u[k+1] - u[k]) t/dt: the ramp takes from this sample what it gives to the next.
+    Bd, Bp, Bn = whole.held - whole.rising, jnp.zeros_like(B), whole.rising
+    # What inputs add is superposed, so that each group's columns are its own.
+    groups = () if delays is None else {g for g in delays.groups if g is not None}
+    for group in sorted(groups):
+        assert delays is not None
         i = np.asarray(delays.members(group))
         # The rest alone: whole samples are in the index by which an input is read.
-        late = None if group is None else delays.rest[group] * dt
+        late = jnp.asarray(delays.rest[group], A.dtype)
         moving = tuple(linear[j] for j in i) if linear else ()
-        part = _discretize(A, B[:, i], dt, late, moving if any(moving) else ())
-        Ad = part.Ad if Ad is None else Ad
-        Bd = Bd.at[:, i].set(part.Bd)
-        if part.Bp is not None:
-            Bp = Bp.at[:, i].set(part.Bp)
-        if part.Bn is not None and Bn is not None:
-            Bn = Bn.at[:, i].set(part.Bn)
-    return Discrete(Ad, Bd, Bp, Bn)
+        _, after = _over(A, B[:, i], dt - late * dt, dt, moving)
+        of_group = _late(_Added(*(v[:, i] for v in whole)), after, late, moving)
+        Bd, Bp, Bn = (M.at[:, i].set(v) for M, v in zip((Bd, Bp, Bn), of_group, strict=True))
+    return _once(Discrete(Ad, Bd, None if delays is None else Bp, Bn if linear else None))
 
 
-def _discretize(A: Array, B: Array, dt: Array, late: Any, linear: tuple[bool, ...]) -> Discrete:
-    """The matrices for inputs that are late by the same part of a sample, `late` [s]."""
-    if linear:
-        return _discretize_ramps(A, B, dt, late, linear)
-    if late is None:
-        return Discrete(*_zero_order_hold(A, B, dt), None)
-    late = jnp.asarray(late, A.dtype)
-    # Two exact steps, u[k-1] over the first and u[k] over the second.
-    first, second = _zero_order_hold(A, B, late), _zero_order_hold(A, B, dt - late)
-    return Discrete(second[0] @ first[0], second[1], second[0] @ first[1])
+class _Added(NamedTuple):
+    """What inputs add to the state over some time."""
+
+    held: Float[Array, "n m"]
+    """those of 1"""
+    rising: Float[Array, "n m"]
+    """those that rise from 0 by 1 every sample; zero for inputs that are held"""
 
 
-def _discretize_ramps(
-    A: Array, B: Array, dt: Array, late: Number | None, linear: tuple[bool, ...]
-) -> Discrete:
-    """`discretize` with some inputs on straight lines between samples (first-order hold)."""
-    if late is None:
-        Ad, G, R = _first_order_hold(A, B, dt, dt, linear)
-        # u[k] + (u[k+1] - u[k]) t/dt: the ramp takes from this sample what it gives to the next.
-        return Discrete(Ad, G - R, None, R)
-    late = jnp.asarray(late, A.dtype)
-    first, second = (
-        _first_order_hold(A, B, late, dt, linear),
-        _first_order_hold(A, B, dt - late, dt, linear),
-    )
+def _over(
+    A: Array, B: Array, h: Array, dt: Array, linear: tuple[bool, ...]
+) -> tuple[Array, _Added]:
+    """Over h [s] e^{A h} and what inputs add, of which some are linear between samples."""
+    if any(linear):
+        Ad, *added = _first_order_hold(A, B, h, dt, linear)
+        return Ad, _Added(*added)
+    Ad, held = _zero_order_hold(A, B, h)
+    return Ad, _Added(held, jnp.zeros_like(held))
+
+
+def _late(
+    whole: _Added, after: _Added, late: Array, linear: tuple[bool, ...]
+) -> tuple[Array, Array, Array]:
+    """The columns Bd, Bp and Bn of inputs that are late by a part of a sample.
+
+    Args:
+        whole: what they would add over the whole sample at once.
+        after: over what is left of it when the sample u[k] arrives.
+        late: the part of the sample before that.
+        linear: of each whether it is linear between samples; () holds all.
+    """
+    # What is added before, at the end of the sample: all of it less what is added after. A ramp
+    # stands at `late` by then, and that is held from there on.
+    held = whole.held - after.held
+    if not any(linear):
+        return after.held, held, whole.rising
+    ramps = jnp.asarray(linear, held.dtype)[None, :]
+    rising = whole.rising - after.rising - ramps * late * after.held
     # The interval begins on the line from u[k-1] to u[k], `late` before its end: what is held is
     # still u[k-1] there.
-    arrived = jnp.asarray(linear, A.dtype)[None, :] * (1.0 - late / dt)
-    before = first[1] * (1.0 - arrived) - first[2]
-    now = first[1] * arrived + first[2]
-    return Discrete(
-        product(second[0], first[0]),
-        product(second[0], now) + second[1] - second[2],
-        product(second[0], before),
-        second[2],
-    )
+    arrived = ramps * (1.0 - late)
+    now = held * arrived + rising + after.held - after.rising
+    return now, held * (1.0 - arrived) - rising, after.rising
 
 
 def _once(discrete: Discrete) -> Discrete:

@@ -266,7 +266,7 @@ def test_a_response_far_larger_than_the_measured_one_explains_nothing():
     # Of a response that is k X the residual's part of the measured power is (1 - k)^2.
     for k in (0.0, 0.9, 6.0):
         lines = (v[:, None] for v in (y - k * X[:, 0], y, np.ones(300)))
-        [(statistic, freedom, left, answer)] = _in_bands(*lines, X)
+        [(statistic, freedom, left, answer, _)] = _in_bands(*lines, X)
         assert left / answer == pytest.approx((1.0 - k) ** 2, rel=0.02, abs=0.02)
         assert statistic > 3.0 * freedom
 

@@ -29,7 +29,7 @@ def bench():
 
 def test_blocks_hold_all_lines_and_a_quarter_of_them_is_whole_blocks():
     for N in (50, 513, 514, 4500, 6001):
-        blocks = blocks_of(Record(0, 7, 7 + N), jnp.asarray(0.25))
+        blocks = blocks_of(Record(0, 7, 7 + N), jnp.asarray(0.25), 60)
         K = (N - 1) // 2
         v = np.arange(2 * K).reshape(2, K) + 1.0
         cut = blocks.cut(jnp.asarray(v), axis=1)

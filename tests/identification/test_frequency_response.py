@@ -151,7 +151,7 @@ def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
             "holds a line of the window",
         ),
         (ResponseOptions(window=10.0, band=(0.4, 0.4001)), "more independent numbers than the 3"),
-        (ResponseOptions(window=50.0), "independent averages for 1 inputs"),
+        (ResponseOptions(window=50.0), "independent averages for 1 input, got"),
     ],
 )
 def test_what_it_cannot_do_is_refused_with_a_reason(options, said):

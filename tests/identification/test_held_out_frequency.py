@@ -5,11 +5,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.linalg
 
-from heli_jax import Flight, Free, Problem, fit, linear_model, models
+from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
 from heli_jax.report import tables
+from heli_jax.report.card import card, failed
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, response, vehicle
 from tests.identification.test_frequency_error import FALLING
@@ -88,7 +90,7 @@ def test_another_machine_is_told_with_the_estimate_that_it_asks_for(found):
     assert one.furthest.own == pytest.approx(HEAVY["Ixx"], rel=0.03)
     assert one.furthest.fitted == pytest.approx(BENCH["Ixx"], rel=0.01)
     [sentence] = [n for n in found[0].notes if n.startswith("heavy, held out")]
-    assert "most of all Ixx, about 0.02" in sentence
+    assert "by itself Ixx is the furthest, from 0.02" in sentence
 
 
 def test_a_model_that_is_worse_than_none_is_no_result(found):
@@ -117,7 +119,11 @@ def test_it_stands_in_fit_json_and_in_tables(found):
     assert content["flights"][2]["furthest"]["parameter"] == "Ixx"
     assert content["flights"][0]["responses"] is None
     held_out = found[0].held_out_frequency
-    assert len(tables.held_out_flights(held_out).rows) == 5
+    table = tables.held_out_flights(held_out)
+    assert len(table.rows) == 5
+    assert table.head[-1] == "explained"
+    assert any("differ (p below 1·10⁻⁶)" in row for row in table.rows)
+    assert of(found, "turned").in_words.endswith("of what follows the excitation: roll none")
     assert len(tables.held_out_bands(held_out).rows) == len(held_out.bands)
 
 
@@ -139,6 +145,26 @@ def test_flights_held_out_may_have_other_outputs_each_and_some_that_never_move(f
         said.notes
     )
     assert len(said.notes) == 2
+
+
+def test_the_card_asks_of_them_what_no_simulation_tells(found):
+    """Beside exit code 4 stood a card of which all gates were passed."""
+    lines = card(found[1], found[0])
+    own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
+    assert own["same, held out"].passed
+    assert own["heavy, held out"].passed is False
+    assert own["heavy, held out"].words == "below 1e-6"
+    assert any("below 1·10⁻⁶" in row for row in tables.acceptance(lines).rows)
+    explained = {g.of: g.passed for g in lines if g.what == "explained"}
+    assert explained["roll, same, held out"]
+    assert explained["roll, turned, held out"] is False
+
+
+def test_where_no_estimates_are_asked_for_what_its_size_may_come_of_is_said(found):
+    silent = of(found, "noisy")._replace(estimates_p_value=None, furthest=None, explained={})
+    [sentence] = silent.sentences
+    assert "it has more gusts or noise than these, or more than the model explains" in sentence
+    assert "agree" not in sentence
 
 
 def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
@@ -182,12 +208,58 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert wrong.differs
     assert wrong.worse == ("roll",)
     assert wrong.responses.pairs[0].J > 1000.0
+    unasked = wrong._replace(estimates_p_value=None, furthest=None, worse=())
+    assert unasked.sentences[0].endswith("or feedback makes the responses what they are.")
     assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
     assert "dead, held out: not judged in frequency: none of its outputs (roll) ever moves." in (
         found[0].notes
     )
     content = fit_json(*found, None)["held_out_frequency"]
     assert content["flights"][0]["responses"]["pairs"][0]["output"] == "roll"
+    # No share is asked of responses.
+    assert "explained" not in tables.held_out_flights(found[0].held_out_frequency).head
+    [gate] = [g for g in failed(card(problem, found[0])) if g.what == "explained"]
+    assert (gate.of, gate.words) == ("roll, turned, held out", "less than none")
+
+
+def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
+    """Its responses are those of feedback, and passed for another machine (p below 1e-6)."""
+    roll, dt, n = linear_model("roll-flybarless"), 0.02, 3000
+    params, rng = roll.vehicle().params, np.random.default_rng(3)
+    matrices = linearize(roll.model, params).matrices
+    Ad = scipy.linalg.expm(np.block([[matrices.A, matrices.B], [np.zeros((1, 4))]]) * dt)
+    t = np.arange(n) * dt
+    sweep = 0.05 * np.sin(2 * np.pi * (0.2 * t + 0.04 * t**2))
+    made = []
+    for name in ("fitted", "same", "bare", "off"):
+        x, gust, u, p = np.zeros(3), 0.0, np.zeros(n), np.zeros(n)
+        for k in range(n):
+            asked = 0.0 if name in ("bare", "off") else sweep[k]
+            p[k], u[k] = x[1], asked - 0.8 * x[0]
+            gust = 0.96 * gust + 0.005 * rng.standard_normal()
+            x = (Ad @ np.append(x, u[k]))[:3]
+            x[1] += gust
+        p += 2e-3 * rng.standard_normal(n)
+        own = sweep if name in ("fitted", "same") else np.zeros(n)
+        logged = {} if name == "bare" else {"lat": own}
+        made.append(
+            Flight(
+                dt=dt, inputs={"lat": u}, outputs={"p": p}, instruments=logged, name=name,
+                hold_out=name != "fitted",
+            )
+        )  # fmt: skip
+    found = fit(
+        Problem(
+            roll.model, params, made, {"Lb": Free(100.0), "Blat": Free(0.1)},
+            method="frequency-response", frequency=ResponseOptions(band=(0.3, 4.0), window=10.0),
+        )
+    )  # fmt: skip
+    [one] = found.held_out_frequency.flights
+    assert one.flight == "same"
+    assert not one.differs
+    for name in ("bare", "off"):
+        words = f"{name}, held out: not judged in frequency: no instrument of lat moves in it"
+        assert any(n.startswith(words) for n in found.held_out_frequency.notes)
 
 
 @pytest.mark.slow

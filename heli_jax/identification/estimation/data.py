@@ -59,11 +59,18 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         ),
         push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},
     )
-    # Once, instead of with every call of a compiled program.
-    numbers = jax.device_put(numbers)
+    numbers = _placed(numbers)
     if not nuisance.initial_state:
         return numbers
     return _with_state_scales(problem, layout or layout_of(problem, flights), numbers)
+
+
+def _placed(numbers: Data) -> Data:
+    """Signals on the device, once instead of with every call of a compiled program; numbers that
+    stand alone, of which there are many more, take longer to put there than to hand over."""
+    leaves, structure = jax.tree.flatten(numbers)
+    signals = iter(jax.device_put([v for v in leaves if v.ndim]))
+    return jax.tree.unflatten(structure, [next(signals) if v.ndim else v for v in leaves])
 
 
 def _flight_data(
@@ -123,7 +130,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
         # On average over the outputs: one gain that is off scales them all.
         ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))
         scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
-        scaled.append(flight._replace(state_scale=jax.device_put(scale)))
+        scaled.append(flight._replace(state_scale=scale))
     return data._replace(flights=tuple(scaled))
 
 

@@ -1,6 +1,5 @@
 """Everything that one point tells, for what is not compiled."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.numerics.jitted import jitted
 
 _TAKES_PART = 1e-3
 """part of a unit direction without effect from which on a coordinate is lost with it"""
@@ -53,7 +53,7 @@ def simulated_outputs(
     return with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
-@eqx.filter_jit
+@jitted
 def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Array]:
     """Values of parameters, gains and time shift [SI], and their slopes by the coordinates.
 

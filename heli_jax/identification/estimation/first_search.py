@@ -1,8 +1,7 @@
 """The search from the start values, by what takes least time to search with."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -47,7 +46,7 @@ def first_optima(
         report: called with a sentence after each of several.
     """
     layout, estimator = at.layout, at.layout.estimator
-    r_J = (jnp.asarray(at.e.r), jnp.asarray(at.e.J))
+    r_J: tuple[Any, Any] = (at.e.r, at.e.J)
     first = Search(search.problem, layout, at.begun, search.max_steps)
     quick, quickly = estimator.to_begin_with(layout, at.data, at.noise, at.z, r_J)
 

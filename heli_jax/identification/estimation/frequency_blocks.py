@@ -1,4 +1,4 @@
-"""The lines of a record some hundred at a time, and how many of these blocks are gone through.
+"""The lines of a record so many at a time, and how many of these blocks are gone through.
 
 What is made for one block stays in the processor's caches. How many are gone through is a number
 like any other and not part of the program: a search may begin with the lowest ones alone.
@@ -13,8 +13,9 @@ from jaxtyping import Array
 
 from heli_jax.identification.estimation.frequency_records import Record
 
-_BLOCK = 256
-"""lines at most"""
+_NUMBERS = 20_000
+"""outputs times states times lines in a block at most: 256 lines of a helicopter, and the whole
+record of a small machine, whose blocks would take longer to begin than to go through"""
 
 
 class Blocks(NamedTuple):
@@ -72,15 +73,16 @@ class Blocks(NamedTuple):
         return jax.lax.fori_loop(0, used, step, first)
 
 
-def blocks_of(record: Record, part: Array) -> Blocks:
+def blocks_of(record: Record, part: Array, numbers: int) -> Blocks:
     """Those of a record.
 
     Args:
         record: which samples it is.
         part: of its lines that are used.
+        numbers: outputs times states.
     """
     K = record.lines
-    count = -(-K // _BLOCK)
+    count = -(-K * numbers // _NUMBERS)
     # So that a half and a quarter of the lines are whole blocks.
     count = count if count == 1 else 4 * -(-count // 4)
     return Blocks(K, count, -(-K // count), jnp.floor(part * K).astype(int))

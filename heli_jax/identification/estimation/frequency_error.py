@@ -48,9 +48,7 @@ from heli_jax.identification.estimation.frequency_records import (
 from heli_jax.identification.estimation.frequency_rows import rows_of_lines
 from heli_jax.identification.estimation.frequency_spectrum import (
     log_determinants,
-    smoothed,
-    whitening_of,
-    without_shared,
+    whitening_alone,
 )
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
@@ -153,7 +151,7 @@ class FrequencyError(Estimator):
                 measured.append(lines_of(whole[first:last]))
         # As if all of it were noise: each frequency by its own size. White noise would give all
         # the say to where the record is largest, gusts included.
-        whitening = whitening_of(without_shared(s) for s in smoothed(measured))
+        whitening = whitening_alone(measured)
         # Least squares at first: near that estimate the equations by instrument have one solution.
         begun, all_lines = np.zeros(()), np.ones(())
         return noise._replace(whitening=whitening, by_instrument=begun, part=all_lines)

@@ -20,7 +20,7 @@ estimated.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,9 +36,9 @@ from heli_jax.identification.estimation.frequency_machines import (
 from heli_jax.identification.estimation.frequency_spectrum import (
     averages,
     inverse_roots,
-    inverses,
     knots_of,
     smoothed,
+    summed_powers,
     whitening_of,
 )
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
@@ -85,7 +85,7 @@ def whitening_by(
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
     before = _before(machine, scaled, size, part)
-    left = smoothed([(before[len(e)] @ e[:, :, None])[:, :, 0] for e in scaled], PART, least=LEAST)
+    left = smoothed([np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], PART, least=LEAST)
     counts = tuple(Counter(len(e) for e in errors).items())
     p, made = errors[0].shape[1], {}
     for e, W in zip(errors, whitening_of(left), strict=True):
@@ -149,7 +149,7 @@ def _cells(
     K = len(errors[0])
     at, _ = knots_of(K, *_CELLS)
     edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
-    power = sum(e[:, :, None] * np.conj(e[:, None, :]) for e in errors) / len(errors)
+    power = summed_powers(np.stack(errors)) / len(errors)
     count = np.diff(np.append(edges, K)).astype(float)
     power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
     f = part * (at + 1) / (2 * K + 1)
@@ -226,23 +226,49 @@ def powers_of(
     powers = np.zeros((len(shapes), n + p))
     powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
     powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
-    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
-    # then products of real matrices.
     alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
     ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
-    ways = np.ascontiguousarray(ways.reshape(c, n + p, -1), complex).view(float)
-    by_way, by_shape = np.swapaxes(ways, 1, 2).copy(), shapes * lines
-    matrices = np.empty((c, 2, p, p), complex)
+    by_shape, told = shapes * lines, (_told_by_one if p == 1 else _told_by_several)(ways, power)
     # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
     # a third more in the interval of If.
     for _ in range(_STEPS):
         # Without the root that would make sure that each step gains: half as many are enough.
-        S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
-        inverse = inverses(S)
-        # By way what of it the errors show, and what they should.
-        matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
-        of_ways = matrices.view(float).reshape(c, 2, -1) @ by_way
-        shown, due = np.moveaxis((by_shape @ of_ways.reshape(c, -1)).reshape(-1, 2, n + p), 1, 0)
-        part = np.maximum(shown, 0.0) / np.where(due > 0, due, 1.0)
-        powers = np.maximum(powers * part, least)
+        of_ways = (by_shape @ told(shapes.T @ powers)).reshape(-1, 2, n + p)
+        shown, due = of_ways[:, 0], of_ways[:, 1]
+        powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
     return powers[:, :n].T, powers[0, n:]
+
+
+_Told = Callable[[Float[np.ndarray, "c m"]], Float[np.ndarray, "c 2m"]]
+"""by cell and way what of it the errors show, and what they should, of the ways' powers"""
+
+
+def _told_by_several(
+    ways: Complex[np.ndarray, "c m p p"], power: Complex[np.ndarray, "c p p"]
+) -> _Told:
+    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
+    # then products of real matrices.
+    c, m, p, _ = ways.shape
+    ways = np.ascontiguousarray(ways.reshape(c, m, -1), complex).view(float)
+    by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
+
+    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
+        inverse = np.linalg.inv((powers[:, None, :] @ ways).view(complex).reshape(c, p, p))
+        matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
+        return (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
+
+    return told
+
+
+def _told_by_one(
+    ways: Complex[np.ndarray, "c m 1 1"], power: Complex[np.ndarray, "c 1 1"]
+) -> _Told:
+    # Of one output they are numbers, and real ones.
+    ways, power = np.real(ways[:, :, 0, 0]), np.real(power[:, :, 0])
+
+    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
+        over = 1.0 / np.sum(powers * ways, axis=1, keepdims=True)
+        of_ways = ways * over
+        return np.concatenate([of_ways * (power * over), of_ways], axis=1)
+
+    return told

@@ -19,7 +19,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
-from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
+from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed, smoothed_with
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
@@ -145,18 +145,19 @@ def _parts(
 ) -> list[Float[np.ndarray, "N u"]]:
     """By flight what of some columns follows signals, about the columns' means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
-    m, out = U[0].shape[1], []
-    spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
-    for whole, S, lines in zip(of, spectra, R, strict=True):
-        size = np.sqrt(np.real(np.einsum("kii->ki", S[:, m:, m:])))
-        size = np.where(size > 0, size, 1.0)
+    responses = {}
+    for S, with_them in zip(smoothed(R, PART), smoothed_with(U, R, PART), strict=True):
+        if len(S) in responses:
+            continue
+        size = np.sqrt(np.real(np.einsum("kii->ki", S)))
+        size = np.where(size > 0, size, 1.0)[:, None, :]
         # In coherences, so that units do not count; two signals that move as one share an effect.
-        shared = S[:, m:, m:] / (size[:, :, None] * size[:, None, :])
-        shared = shared + _ALONE * np.eye(shared.shape[1])
-        part = np.linalg.solve(shared, (lines / size)[:, :, None])[:, :, 0]
-        estimate = np.einsum("kur,kr->ku", S[:, :m, m:] / size[:, None, :], part)
-        out.append(in_time_of(estimate, len(whole)) + whole.mean(axis=0))
-    return out
+        shared = S / (size.swapaxes(1, 2) * size) + _ALONE * np.eye(S.shape[1])
+        # From the right, which the transposes have on their left.
+        turned = np.linalg.solve(shared.swapaxes(1, 2), (with_them / size).swapaxes(1, 2))
+        responses[len(S)] = turned.swapaxes(1, 2) / size
+    made = [np.einsum("kur,kr->ku", responses[len(lines)], lines) for lines in R]
+    return [in_time_of(v, len(w)) + w.mean(axis=0) for v, w in zip(made, of, strict=True)]
 
 
 class Strength(NamedTuple):

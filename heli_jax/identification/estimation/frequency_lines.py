@@ -9,7 +9,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +28,7 @@ from heli_jax.identification.estimation.frequency_machines import (
 )
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.numerics.jitted import jitted
 
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
@@ -98,7 +98,7 @@ def resolved(
         whitening: of the record's lines.
         part: of the lines that are used.
     """
-    blocks = blocks_of(record, part)
+    blocks = blocks_of(record, part, m.C.size)
     # Beyond the last line those that would follow it, so that nothing is singular there.
     k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
     z = np.exp(2j * np.pi * k / (record.samples + 2 * blocks.size))
@@ -202,7 +202,7 @@ def errors_of_some(
     record: Record,
     signals: Signals,
     y: Float[Array, "f N p"],
-    by: Signals | None = None,
+    by: tuple[Signals, Array] | None = None,
 ) -> Errors:
     """Of one record of each of a few flights of one machine, with a leading axis.
 
@@ -212,20 +212,21 @@ def errors_of_some(
         record: which samples it is.
         signals: over the whole flights.
         y: what was measured.
-        by: the inputs by instrument.
+        by: the inputs by instrument, and whether their states are asked for: zero if not.
     """
     blocks, f = at.blocks, y.shape[0]
-    B, D = (M.T.astype(at.z.dtype) for M in (m.B, m.D))
     lines = Signals(*(at_lines(record, v) for v in signals))
-    beyond = at_lines(record, y) - lines.acting @ D
+    # In time, where these numbers are real ones and half as many.
+    beyond = at_lines(record, y - signals.acting @ m.D.T)
     # By instrument the states are those of the inputs alone: such a record has no ends.
-    inputs = [lines.U] if by is None else [lines.U, at_lines(record, by.U)]
-    driving = blocks.cut(jnp.concatenate(inputs) @ B, axis=1)
+    inputs = blocks.cut(
+        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by[0].U)]), axis=1
+    )
     left = blocks.cut(beyond, axis=1)
 
     def unprojected(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         white, along = made
-        e = _times(at.W[b], left[b]) - _times(at.H[b], driving[b][:f])
+        e = _times(at.W[b], left[b]) - _times(at.H[b], by_real(inputs[b, :f], m.B.T))
         e = jnp.stack([jnp.real(e), jnp.imag(e)], axis=2).reshape(f, -1)
         return white.at[b].set(e), along + e @ at.basis(b)
 
@@ -239,12 +240,22 @@ def errors_of_some(
     d = (along @ at.S) @ at.S.T
     of_ends = d.reshape(f, at.ends.shape[2], -1).astype(at.z.dtype)
 
+    def asked_for(b: Any, driven: Array) -> Array:
+        if by is None:
+            return states(at, b, driven)
+
+        def direct(v: Array) -> Array:
+            return jnp.concatenate([states(at, b, v[:f]), jnp.zeros_like(v[f:])])
+
+        return jax.lax.cond(by[1], lambda v: states(at, b, v), direct, driven)
+
     def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, X = made
-        driven = driving[b].at[:f].add(at.ends[b][None] @ of_ends)
-        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
+        driven = by_real(inputs[b], m.B.T).at[:f].add(at.ends[b][None] @ of_ends)
+        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(asked_for(b, driven))
 
-    rows, X = blocks.over(without_ends, (white, jnp.zeros_like(driving)))
+    X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
+    rows, X = blocks.over(without_ends, (white, X))
     return Errors(rows, X[:, :f], None if by is None else X[:, f:], lines, beyond)
 
 
@@ -290,6 +301,16 @@ def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array
     return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
 
+def by_real(v: Complex[Array, "... a"], M: Float[Array, "a b"]) -> Complex[Array, "... b"]:
+    """v M, without the products of what M has no imaginary part of.
+
+    Args:
+        v: complex numbers.
+        M: a real matrix.
+    """
+    return jax.lax.complex(jnp.real(v) @ M, jnp.imag(v) @ M)
+
+
 def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Array, "f k a"]:
     # A sum: products of a small matrix and a vector each would call a routine for every line.
     return jnp.sum(M[None] * v[:, :, None, :], axis=3)
@@ -315,7 +336,7 @@ class LineErrors(NamedTuple):
     """by record; empty unless asked for"""
 
 
-@eqx.filter_jit
+@jitted
 def errors_of_lines(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"], *, ends: bool = False
 ) -> LineErrors:
@@ -341,7 +362,7 @@ def errors_of_lines(
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 e = errors_of_some(at, m, record, *some)
-                left = e.beyond - at.blocks.joined(e.X, axis=1) @ m.C.T.astype(at.z.dtype)
+                left = e.beyond - by_real(at.blocks.joined(e.X, axis=1), m.C.T)
                 same = jax.tree.map(
                     lambda v, f=len(left): jnp.broadcast_to(v, (f, *v.shape)),
                     _taken_by_ends(at) if ends else None,

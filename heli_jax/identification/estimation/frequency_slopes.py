@@ -173,7 +173,8 @@ def _of_record(
         instruments: the inputs by instrument and their derivatives.
     """
     (at, m, dm), (signals, ds, y) = common, measured_signals
-    e = errors_of_some(at, m, record, signals, y, instruments and instruments[0])
+    by_them = None if instruments is None else (instruments[0], by_instrument > 0.5)
+    e = errors_of_some(at, m, record, signals, y, by_them)
     driven: list[tuple[Any, Signals, Signals]] = [(e.X, e.signals, _lines(record, ds))]
     if instruments is not None:
         by, dby = instruments

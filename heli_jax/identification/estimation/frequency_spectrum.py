@@ -4,7 +4,7 @@ Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012)
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -31,32 +31,117 @@ def smoothed(
         part: sd of the Gaussian as a part of the frequency.
         least: the same in lines, at least.
     """
-    # Records of one length have one spectrum and one kernel: their powers are added first.
-    powers: dict[int, np.ndarray] = {}
     p = lines[0].shape[1]
     # The half that lies below the diagonal: a spectrum is Hermitian.
-    below = np.tril_indices(p)
-    for v in lines:
-        product = v[:, below[0]] * np.conj(v[:, below[1]])
-        powers[len(v)] = powers[len(v)] + product if len(v) in powers else product
-    counts = {K: sum(len(v) == K for v in lines) for K in powers}
+    below = _below(p)
+
+    def half(v: np.ndarray) -> np.ndarray:
+        # Of a session in single precision too: the view is of double numbers.
+        power = np.ascontiguousarray(summed_powers(v)[:, below[0], below[1]], dtype=complex)
+        return power.view(float)
+
     spectra = {}
-    for K in powers:
-        _, between = knots_of(K, part, least)
-        total, weight = 0.0, 0.0
-        for other, power in powers.items():
-            kernel = _kernel(K, other, part, least)
-            # Of a session in single precision too: the view below is of double numbers.
-            flat = np.ascontiguousarray(power, dtype=complex)
-            total = total + (kernel @ flat.view(float)).view(complex)
-            weight = weight + counts[other] * kernel.sum(axis=1)
-        at_knots, (low, share) = total / np.asarray(weight)[:, None], between
-        half = at_knots[low] + share[:, None] * (at_knots[low + 1] - at_knots[low])
-        S = np.empty((K, p, p), complex)
-        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(half), half
-        floor = _ROUNDING * np.mean(np.real(np.einsum("kii->ki", S)), axis=0)
-        spectra[K] = S + np.diag(floor)[None]
+    for K, of_half in _over_lines(lines, half, part, least).items():
+        made, S = of_half.view(complex), np.empty((K, p, p), complex)
+        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(made), made
+        own = np.einsum("kii->ki", S)
+        own += _ROUNDING * np.mean(np.real(own), axis=0)
+        spectra[K] = S
     return [spectra[len(v)] for v in lines]
+
+
+def smoothed_with(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+    others: Sequence[Complex[np.ndarray, "K r"]],
+    part: float = PART,
+) -> list[Complex[np.ndarray, "K p r"]]:
+    """By record the cross-spectrum E e r^H with other signals, smoothed likewise.
+
+    Args:
+        lines: by record at its own frequencies.
+        others: the other signals, likewise.
+        part: sd of the Gaussian as a part of the frequency.
+    """
+    p, r = lines[0].shape[1], others[0].shape[1]
+
+    def products(v: np.ndarray) -> np.ndarray:
+        made = v[:, :, :p].transpose(1, 2, 0) @ np.conj(v[:, :, p:].transpose(1, 0, 2))
+        return np.ascontiguousarray(made.reshape(len(made), -1), dtype=complex).view(float)
+
+    both = [np.concatenate(v, axis=1) for v in zip(lines, others, strict=True)]
+    made = _over_lines(both, products, part, LEAST)
+    spectra = {K: v.view(complex).reshape(K, p, r) for K, v in made.items()}
+    return [spectra[len(v)] for v in lines]
+
+
+@functools.cache
+def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.tril_indices(p)
+
+
+def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
+    """The sum of e e^H over records.
+
+    Args:
+        v: at the lines of records of one length.
+    """
+    at_line = v.transpose(1, 2, 0)
+    return at_line @ np.conj(at_line.transpose(0, 2, 1))
+
+
+def _over_lines(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+    numbers: Callable[[Complex[np.ndarray, "f K p"]], Float[np.ndarray, "K m"]],
+    part: float,
+    least: float,
+) -> dict[int, Float[np.ndarray, "K m"]]:
+    """By length of the record the mean of some powers, smoothed over frequency.
+
+    Args:
+        lines: by record.
+        numbers: of records of one length the sum of these powers.
+        part: as that of `smoothed`.
+        least: likewise.
+    """
+    # Records of one length have one spectrum and one kernel: their powers are added first.
+    of_length = {len(v): [w for w in lines if len(w) == len(v)] for v in lines}
+    sums = {K: numbers(np.stack(v)) for K, v in of_length.items()}
+    made = {}
+    for K in sums:
+        _, (low, share) = knots_of(K, part, least)
+        total, weight = 0.0, 0.0
+        for other, power in sums.items():
+            kernel, of_one = _kernel(K, other, part, least)
+            total = total + kernel @ power
+            weight = weight + len(of_length[other]) * of_one
+        at_knots = total / np.asarray(weight)[:, None]
+        made[K] = at_knots[low] + share[:, None] * np.diff(at_knots, axis=0)[low]
+    return made
+
+
+def whitening_alone(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record what makes white each signal by itself, with nothing of what they share.
+
+    Args:
+        lines: by record at its own frequencies.
+
+    Raises:
+        numpy.linalg.LinAlgError: a signal is zero throughout.
+    """
+
+    def own(v: np.ndarray) -> np.ndarray:
+        return np.sum(np.real(v) ** 2 + np.imag(v) ** 2, axis=0)
+
+    made = {}
+    # Flights held out may have other outputs.
+    for p in {v.shape[1] for v in lines}:
+        alike = [v for v in lines if v.shape[1] == p]
+        for K, power in _over_lines(alike, own, PART, LEAST).items():
+            root = _positive(power + _ROUNDING * np.mean(power, axis=0)) ** -0.5
+            made[K, p] = root[:, :, None] * np.eye(p, dtype=complex)
+    return tuple(made[v.shape] for v in lines)
 
 
 @functools.lru_cache(maxsize=32)
@@ -82,13 +167,17 @@ def knots_of(
 
 
 @functools.lru_cache(maxsize=32)
-def _kernel(K: int, other: int, part: float, least: float) -> Float[np.ndarray, "knots other"]:
-    """Weights that the lines of a record of `other` lines have at the knots of one of K."""
+def _kernel(
+    K: int, other: int, part: float, least: float
+) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
+    """Weights that the lines of a record of `other` lines have at the knots of one of K, and their
+    sums."""
     # In parts of the rate, which all records have in common.
     f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
     width = np.maximum(least * first, part * f)
-    return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
+    kernel = np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
+    return kernel, kernel.sum(axis=1)
 
 
 @functools.lru_cache(maxsize=32)
@@ -104,15 +193,10 @@ def averages(
         least: the same in lines, at least.
     """
     at, _ = knots_of(K, part, least)
-    kernels = [(n, _kernel(K, other, part, least)) for other, n in counts]
-    total = sum(n * w.sum(axis=1) for n, w in kernels)
-    squares = sum(n * np.sum(w**2, axis=1) for n, w in kernels)
+    kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
+    total = sum(n * of_one for n, _, of_one in kernels)
+    squares = sum(n * np.sum(w**2, axis=1) for n, w, _ in kernels)
     return np.interp(np.arange(K), at, total**2 / squares)
-
-
-def without_shared(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
-    """Spectra without what signals share."""
-    return S * np.eye(S.shape[1])
 
 
 def whitening_of(
@@ -126,23 +210,32 @@ def whitening_of(
     return tuple(made[id(S)] for S in spectra)
 
 
-def inverses(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
-    """S^-1."""
-    # Of one output thousands of numbers, not of matrices.
-    return 1.0 / S if S.shape[1] == 1 else np.linalg.inv(S)
-
-
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
     """L^-1, where S = L L^H.
 
     Raises:
         numpy.linalg.LinAlgError: one is not positive definite.
     """
-    if S.shape[1] > 1:
-        return np.linalg.inv(np.linalg.cholesky(S))
-    if not (np.real(S) > 0).all():
-        raise np.linalg.LinAlgError("a spectrum is not positive")
-    return S**-0.5
+    # Written out over the lines: for each matrix a routine would be called that takes longer to
+    # call.
+    p, at = S.shape[1], np.ascontiguousarray(S.transpose(1, 2, 0))
+    L, W = np.zeros_like(at), np.zeros_like(at)
+    for i in range(p):
+        left = np.real(at[i, i])
+        for j in range(i):
+            inner = sum((L[i, m] * np.conj(L[j, m]) for m in range(j)), start=0.0)
+            L[i, j] = np.real(W[j, j]) * (at[i, j] - inner)
+            left = left - np.real(L[i, j]) ** 2 - np.imag(L[i, j]) ** 2
+        W[i, i] = root = _positive(left) ** -0.5
+        for j in range(i):
+            W[i, j] = -root * sum((L[i, m] * W[m, j] for m in range(j, i)), start=0.0)
+    return np.ascontiguousarray(W.transpose(2, 0, 1))
+
+
+def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    if not (values > 0).all():
+        raise np.linalg.LinAlgError("a spectrum is not positive definite")
+    return values
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:

@@ -1,12 +1,12 @@
 """The unknowns that a method in frequency does not see, from the simulation in time."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.numerics.jitted import jitted
 
 _STEPS = 20
 """at most, for models that are not linear"""
@@ -35,7 +35,7 @@ def in_time(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> 
     return z
 
 
-@eqx.filter_jit
+@jitted
 def _step(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Array]:
     """The best of a few damped steps of Gauss and Newton, and the part of the cost it gains."""
     first = layout.first_nuisance

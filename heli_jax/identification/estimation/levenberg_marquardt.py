@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -249,7 +249,7 @@ def optimise(
     layout: Layout,
     data: Data,
     noise: Noise,
-    z0: Float[Array, " q"],
+    z0: Float[Array | np.ndarray, " q"],
     max_steps: int = 200,
     *,
     held: np.ndarray | None = None,
@@ -274,7 +274,8 @@ def optimise(
         e = (differentiate if held is not None else residual_and_jacobian)(layout, data, noise, z)
         return e.r, e.J
 
-    trusted, steps, at, stayed = nothing_trusted(layout), 0, z0, layout.size + 1
+    at: Any = z0  # of NumPy or JAX, which what is compiled takes alike
+    trusted, steps, stayed = nothing_trusted(layout), 0, layout.size + 1
     while True:
         limits = _Limits(max_steps - steps, trusted, held, nearing)
         run = _run(layout, data, noise, at, limits, known)

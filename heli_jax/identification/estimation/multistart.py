@@ -44,6 +44,8 @@ _NEAR = 0.1
 """standard deviations from the optimum at which it counts as reached"""
 _AGAIN = 3
 """times that an optimiser which stopped short of the optimum is sent on"""
+_GOOD = 10.0
+"""cost up to which a run explains something whatever there is to explain"""
 _FAINT = 0.3
 """one over the sd of the logarithm of a disturbance's parameter below which it is none"""
 
@@ -140,7 +142,7 @@ class Search:
     def run(
         self,
         noise: Noise,
-        points: Float[Array, "s q"],
+        points: Float[Array | np.ndarray, "s q"],
         progress: Progress | None = None,
         *,
         nearing: Nearing | None = None,
@@ -155,7 +157,8 @@ class Search:
             nearing: how to end where another search follows; as near as it gets unless given.
             known: residuals and Jacobian at the first start, where they are at hand.
         """
-        ends = (nearing, known)
+        # One of them is taken out of NumPy's arrays in no time.
+        ends, points = (nearing, known), np.asarray(points)
         runs = self._run(self.layout, noise, points, progress, ends)
         # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
         # good a place is.
@@ -165,7 +168,7 @@ class Search:
         # What left its bounds begins anew from its start, in coordinates that cannot leave them.
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
-            starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
+            starts = np.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
             again = self._run(self.bounded, noise, starts, progress, (nearing, None))
             for i, run in zip(left, again, strict=True):
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
@@ -175,7 +178,7 @@ class Search:
         self,
         layout: Layout,
         noise: Noise,
-        points: Array,
+        points: np.ndarray,
         progress: Progress | None,
         ends: tuple[Nearing | None, tuple[Array, Array] | None],
     ) -> list[Optimum]:
@@ -252,9 +255,11 @@ class Search:
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        if run.cost <= _GOOD:
+            return run
         # The cost is a mean over the measured numbers, so this is one too.
         nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
-        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
 
     def misfit_of_nothing(self, noise: Noise) -> float:
         """Sum of squares that a model without any response leaves."""
@@ -280,8 +285,9 @@ class Search:
             for f, v in zip(self.problem.free.values(), values.values(), strict=True)
         )
 
-    def _convert(self, z: Array, old: Layout, new: Layout) -> Array:
+    def _convert(self, z: Array | np.ndarray, old: Layout, new: Layout) -> Array:
         """The same point in another layout's coordinates; a value at a bound is moved inside."""
+        z = jnp.asarray(z)
         for i, (free, value) in enumerate(
             zip(self.problem.free.values(), named_values(old, self.data, z).values(), strict=True)
         ):
@@ -308,7 +314,9 @@ def gauss_newton_gain(r: Array | np.ndarray, J: Array | np.ndarray) -> float:
     return float(np.sum((Q.T @ r) ** 2))
 
 
-def named_values(layout: Layout, data: Data, z: Float[Array, " q"]) -> dict[str, float]:
+def named_values(
+    layout: Layout, data: Data, z: Float[Array | np.ndarray, " q"]
+) -> dict[str, float]:
     """The free parameters' values at z, by name, SI.
 
     Args:

@@ -180,7 +180,7 @@ def _alternated(
         earlier = float(best.moved) if np.isfinite(best.moved) else earlier
         # Near its optimum a search needs no damping, which would only take it longer.
         nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
-        [best] = search.run(noise, _without_nuisances(layout, best.z)[None, :], nearing=nearing)
+        [best] = search.run(noise, _without_nuisances(layout, best.z)[None], nearing=nearing)
         trace.append((int(best.steps), float(best.cost)))
         # With less than that the noise stays as well; by more than a prediction where it is that of
         # the intervals.
@@ -213,15 +213,14 @@ def _next_move(moved: float, earlier: float) -> float:
     return moved * min(falls, 1.0)
 
 
-def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " q"]:
+def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarray, " q"]:
     """z where a search goes by rows that nuisances have no part in, in which their weak priors
     alone would be a misfit."""
     # A model that is not linear is linearised where they put it.
-    if layout.estimator.nuisances_in_rows or not layout.model.linear:
-        return z
     without = np.array(z)
-    without[layout.first_nuisance :] = 0.0
-    return jnp.asarray(without)
+    if not layout.estimator.nuisances_in_rows and layout.model.linear:
+        without[layout.first_nuisance :] = 0.0
+    return without
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:

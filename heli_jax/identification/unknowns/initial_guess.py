@@ -40,7 +40,8 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
     whole = np.zeros(layout.size, dtype)
     whole[: len(z)] = jax.device_get(z)
-    if layout.initial_state:
+    # A linear model without a start of its own begins at zero, as z does.
+    if layout.initial_state and not (layout.model.linear and layout.model.start is None):
         _initial_states(layout, data, problem, whole)
     return jnp.asarray(whole)
 

@@ -56,7 +56,8 @@ def _in_free_flight(problem: Problem) -> tuple[str, ...]:
     if of_helicopter(model.Params) and not model.linear:
         return tuple(sticks)
     flight = problem.training[0]
-    params = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
+    if flight.known:
+        params = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # A model declared linear vanishes at zero, so it has no constant term to look for.
     if not model.linear and _has_constant_term(model, params, tuple(problem.free)):
         return ()
@@ -127,7 +128,7 @@ def _responses(model: Model, params: Any, flight: Flight) -> np.ndarray:
     response to each initial state, and that to a unit of each input from rest. NaN where there are
     no finite matrices."""
     dtype = jnp.result_type(float)
-    inputs = {n: jnp.asarray(np.mean(flight.inputs[n]), dtype) for n in flight.inputs}
+    inputs = {n: np.asarray(np.mean(flight.inputs[n]), dtype) for n in flight.inputs}
     u = model.Inputs(**{n: inputs[n] for n in naming.names(model.Inputs)})
     space = jacobians(model, params, None, u)
     A, B, C = (np.asarray(M, np.float64) for M in (space.A, space.B, space.C))

@@ -285,9 +285,8 @@ def within_bounds(layout: Layout, problem: Problem) -> Layout:
         layout: of the problem.
         problem: has the bounds.
     """
-    return dataclasses.replace(
-        layout, kinds=tuple(transforms.kind(f) for f in problem.free.values())
-    )
+    kinds = tuple(transforms.kind(f) for f in problem.free.values())
+    return layout if kinds == layout.kinds else dataclasses.replace(layout, kinds=kinds)
 
 
 def _block(problem: Problem) -> int:

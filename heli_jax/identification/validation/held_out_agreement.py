@@ -59,11 +59,12 @@ class HeldOutFlight(NamedTuple):
     freedom: float
     """independent real numbers that it is the mean of"""
     estimates_p_value: float | None
-    """that the flight's own estimates would be as far from the fit's by chance; None where it says
-    nothing of them"""
+    """the chance that errors of both make the flight's own estimates as far from the fit's; null
+    where it says nothing of them"""
     furthest: Furthest | None
     explained: dict[str, float]
-    """by output, of the power that follows the excitation the part that the model explains"""
+    """by output, of the power that follows the excitation the part that the model explains; below 0
+    it is worse than no model; of those alone where gusts leave at most 0.05 of it to chance"""
     worse: tuple[str, ...]
     """the outputs that a model without any response would explain better"""
     responses: ResponseAgreement | None
@@ -85,10 +86,10 @@ class HeldOutFlight(NamedTuple):
             known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
         if self.explained:
             parts = (
-                f"{plain_words(percent(v, 1))} of {n}" if v >= 0 else f"none of {n}"
+                f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
                 for n, v in self.explained.items()
             )
-            known.append(f"explained of what follows the inputs {', '.join(parts)}")
+            known.append(f"explained of what follows the excitation: {', '.join(parts)}")
         return "; ".join(known)
 
     @property
@@ -97,7 +98,7 @@ class HeldOutFlight(NamedTuple):
         where, said = f"{self.flight}, held out", []
         if self.worse:
             names = " and ".join(self.worse)
-            said.append(f"{where}: of {names} the model explains less than none at all would.")
+            said.append(f"{where}: of {names} the model explains less than no model at all would.")
         if self.differs:
             assert self.estimates_p_value is not None
             f = self.furthest
@@ -105,15 +106,16 @@ class HeldOutFlight(NamedTuple):
                 ""
                 if f is None
                 else (
-                    f", most of all {f.parameter}, about {f.values[0]} there for "
-                    f"{f.values[1]} ({f.sds:.1f} joint standard deviations)"
+                    f"; by itself {f.parameter} is the furthest, from {f.values[1]} to about "
+                    f"{f.values[0]} ({f.sds:.1f} joint standard deviations)"
                 )
             )
             said.append(
                 f"{where}: what it says of the parameters is further from the estimates than the "
                 f"errors of both allow (p {p_value(self.estimates_p_value)}){most}: the model "
-                "lacks something, or the machine was another one there (mass, speed, battery). The "
-                "intervals speak for the fitted flights alone."
+                "lacks something, or the flight differs: mass, rotor speed, battery, or the scale, "
+                "sign or clock of a column of its log. The intervals speak for the fitted flights "
+                "alone."
             )
         elif not self.worse and not self.lower95 <= self.chi_squared <= self.upper95:
             said.append(f"{where}: {self._size}.")
@@ -126,13 +128,16 @@ class HeldOutFlight(NamedTuple):
         more = self.chi_squared > self.upper95
         if self.responses is not None:
             why = "the model lacks something there" if more else "its noise is taken too large"
+            if more and self.estimates_p_value is None:
+                # They are not asked for where feedback has its part in the responses.
+                why += ", or feedback makes the responses what they are"
             return f"{size} its own noise lets expect ({between}): {why}"
         size = f"{size} the noise of the fitted flights lets expect ({between})"
-        if self.estimates_p_value is None:
-            return size
+        # Where they are not asked for, nothing tells these from another machine.
+        agree = "" if self.estimates_p_value is None else ", though its own estimates agree"
         what = "more gusts or noise than these, or more" if more else "fewer gusts and less noise"
         rest = " than the model explains" if more else " than these"
-        return f"{size}, though its own estimates agree: it has {what}{rest}"
+        return f"{size}{agree}: it has {what}{rest}"
 
 
 class HeldOutFrequency(NamedTuple):

@@ -51,6 +51,7 @@ from heli_jax.identification.validation.excitation_test import (
     Followed,
     errors_against_excitation,
 )
+from heli_jax.identification.validation.frequency_bands import band_edges
 from heli_jax.identification.validation.hardly_moving import moving_outputs, with_outputs
 from heli_jax.identification.validation.held_out_agreement import (
     HeldOutBand,
@@ -67,8 +68,6 @@ from heli_jax.identification.validation.own_estimates import (
 _NO_SPECTRUM = "its errors have no spectrum: two of its outputs are one, or there is no noise"
 _SAME_RATE = 1e-6
 """relative difference of sample times that are one"""
-_FEWEST = 12
-"""lines of a band at least"""
 _SURE = 0.05
 """standard deviation of what is explained by chance, above which it is not said"""
 _MISFIT = 2.0
@@ -303,7 +302,7 @@ def _bands(at: Solution, lines: Sequence[_Line]) -> tuple[HeldOutBand, ...]:
         hz = np.concatenate([v.hz for v, _ in own])
         squares = np.concatenate([v.squares[:, j] for v, j in own])
         expected = np.concatenate([v.expected[:, j] for v, j in own])
-        for low, high in _edges(hz):
+        for low, high in band_edges(hz):
             within, of_noise = ((v >= low) & (v <= high) for v in (hz, fitted))
             numbers = float(np.sum(expected[within]))
             if not numbers > 0:
@@ -314,26 +313,18 @@ def _bands(at: Solution, lines: Sequence[_Line]) -> tuple[HeldOutBand, ...]:
     return tuple(found)
 
 
-def _edges(hz: Float[np.ndarray, " K"]) -> list[tuple[float, float]]:
-    """Bands between the lowest and the highest of some frequencies, at 1, 3, 10, 30 ... Hz, each
-    with some lines."""
-    low, high = float(np.min(hz)), float(np.max(hz))
-    decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
-    grid = np.sort(np.concatenate([10.0**decades, 3.0 * 10.0**decades]))
-    edges = [low]
-    for edge in grid[(grid > low) & (grid < high)]:
-        above = np.sum(hz > edge) >= _FEWEST
-        if above and np.sum((hz >= edges[-1]) & (hz <= edge)) >= _FEWEST:
-            edges.append(float(edge))
-    return list(zip(edges, [*edges[1:], high], strict=True))
-
-
 def _by_responses(
     problem: Problem, at: Solution, fitted: Fitted, held: Sequence[Flight]
 ) -> HeldOutFrequency:
     """By the responses of each flight; of those that are too short by themselves, together."""
     found, short, notes = [], {}, []
+    by = instruments_of(problem)
     for label, flight in zip(labels(tuple(held)), held, strict=True):
+        # Those of the inputs themselves may be what feedback makes of them, whatever the model.
+        if lacks := _without_instrument(flight, by):
+            words = f"no instrument of {', '.join(lacks)} moves in it, and the fit is by instrument"
+            notes.append(f"{label}, held out: not judged in frequency: {words}.")
+            continue
         sound, said = moving_outputs(flight)
         if sound is None:
             said = f"not judged in frequency: {said}"
@@ -353,6 +344,13 @@ def _by_responses(
             pass
     notes += [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
     return HeldOutFrequency(tuple(found), (), tuple(notes))
+
+
+def _without_instrument(flight: Flight, by: Sequence[str]) -> list[str]:
+    """Those of some inputs whose instrument a flight lacks; all where none of its own moves."""
+    if not any(np.ptp(flight.instruments[n]) > 0 for n in by if n in flight.instruments):
+        return list(by)
+    return [n for n in by if n not in flight.instruments]
 
 
 def _responses_of(

@@ -11,7 +11,15 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness, diverges
-from heli_jax.numbers import NOTHING, explained_text, number, p_value, percent, vaf_percent
+from heli_jax.numbers import (
+    NOTHING,
+    explained_text,
+    number,
+    p_value,
+    page_sentence,
+    percent,
+    vaf_percent,
+)
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
@@ -95,17 +103,20 @@ def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
     """By flight held out what it says in frequency; None where nothing was asked."""
     if held is None or not held.flights:
         return None
+    # Of responses no share is asked for, and a column of dashes says nothing.
+    shares = any(f.responses is None for f in held.flights)
     rows = []
     for f in held.flights:
         p = NOTHING
         if f.estimates_p_value is not None:
-            p = f"{'differ' if f.differs else 'agree'} (p {p_value(f.estimates_p_value)})"
+            words = f"{'differ' if f.differs else 'agree'} (p {p_value(f.estimates_p_value)})"
+            p = page_sentence(words)
         parts = (f"{n} {explained_text(v)}" for n, v in f.explained.items())
         between = f"{number(f.lower95, 3)} to {number(f.upper95, 3)}"
-        explained = ", ".join(parts) or NOTHING
-        rows.append((f.flight, number(f.chi_squared, 3), between, p, explained))
-    head = ("flight, held out", "chi-squared", "expected", "its own estimates", "explained")
-    return Table(head, rows)
+        explained = (", ".join(parts) or NOTHING,) if shares else ()
+        rows.append((f.flight, number(f.chi_squared, 3), between, p, *explained))
+    head = ("flight, held out", "chi-squared", "expected", "its own estimates")
+    return Table((*head, "explained") if shares else head, rows)
 
 
 def held_out_bands(held: HeldOutFrequency | None) -> Table | None:
@@ -148,7 +159,10 @@ def choice(selection: Choice) -> Table:
 def acceptance(lines: tuple[Gate, ...]) -> Table:
     """The acceptance card: what, of what, value, gate, passed or failed, remark."""
     words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
-    rows = [(g.what, g.of, shown(g), g.gate or NOTHING, words[g.passed], g.remark) for g in lines]
+    rows = [
+        (g.what, g.of, page_sentence(shown(g)), g.gate or NOTHING, words[g.passed], g.remark)
+        for g in lines
+    ]
     return Table(("", "of", "value", "gate", "", "remark"), rows)
 
 
