@@ -203,7 +203,8 @@ def _flight_by_lines(
         itself = direct._replace(by_instrument=np.asarray(float(by_instrument)))
 
         def rows(z: Array) -> Rows:
-            made = jax.device_get(errors_of_lines(layout, data, direct, z))
+            # By the program that there is already, though nobody asks for the ends here.
+            made = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
             noise = itself._replace(whitening=whitening_by(made.machine, made.errors))
             return _rows(at, layout, data, noise, z)
 
