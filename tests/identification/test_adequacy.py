@@ -223,7 +223,8 @@ def test_exit_codes(status, less, held_out, code):
 )  # fmt: skip
 def test_flights_held_out_are_held_against_their_mean_by_output_error_alone(method, vaf, worse):
     """Gusts and an unstable machine make a simulation in time what it is with the others."""
-    fitted: Any = SimpleNamespace(method=method, validation={"p": SimpleNamespace(vaf=vaf)})
+    metrics = {"p": SimpleNamespace(vaf=vaf)}
+    fitted: Any = SimpleNamespace(method=method, validation=metrics, held_out_frequency=None)
     assert Fit.held_out_worse.fget(fitted) == worse  # pyright: ignore[reportOptionalCall]
 
 

@@ -160,6 +160,13 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
     assert explained["roll, turned, held out"] is False
 
 
+def test_errors_that_are_far_too_large_stand_in_the_first_line(found):
+    all_of_them = found[0].held_out_frequency
+    assert "squared errors" not in all_of_them.doubt
+    spiked = all_of_them._replace(flights=(of(found, "same")._replace(chi_squared=9.5e3),))
+    assert spiked.doubt == "squared errors of same are 9.5e+03 times what is expected"
+
+
 def test_where_no_estimates_are_asked_for_what_its_size_may_come_of_is_said(found):
     silent = of(found, "noisy")._replace(estimates_p_value=None, furthest=None, explained={})
     [sentence] = silent.sentences

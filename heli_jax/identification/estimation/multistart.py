@@ -163,6 +163,8 @@ class Search:
         # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
         # good a place is.
         runs = [self._better_than_nothing(run, noise) for run in runs]
+        # Where one stayed its end may be the start itself, of NumPy.
+        runs = [run._replace(z=jnp.asarray(run.z)) for run in runs]
         if self.bounded.kinds == self.layout.kinds:
             return runs
         # What left its bounds begins anew from its start, in coordinates that cannot leave them.

@@ -5,6 +5,8 @@ from typing import NamedTuple
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.numbers import number, p_value, percent, plain_words
 
+_FAR_OFF = 10.0
+"""times what is expected, from which on squared errors are beyond what another day's gusts are"""
 LEVEL = 0.01
 """of the test whether a flight's own estimates are those of the fit"""
 
@@ -171,4 +173,9 @@ class HeldOutFrequency(NamedTuple):
                 "asks" if len(differing) == 1 else "ask",
             )
             words.append(f"{names} {ask} for other estimates (p {p_value(p)})")
+        words += [
+            f"squared errors of {f.flight} are {f.chi_squared:.3g} times what is expected"
+            for f in self.flights
+            if f.chi_squared > _FAR_OFF and not (f.differs or f.worse)
+        ]
         return "; ".join(words)

@@ -155,7 +155,7 @@ def _comparable(at: Solution, flight: Flight) -> tuple[Flight | None, str]:
     by = at.data.flights[0].by_instrument is not None
     missing = by and not flight.instruments
     said = [still] if still else []
-    said += ["it holds no instrument, and is judged by its inputs"] if missing else []
+    said += ["it holds no instrument, and only the size of its errors is judged"] if missing else []
     return sound, "; ".join(said)
 
 
@@ -197,8 +197,11 @@ def _flight_by_lines(
     chi = allowed / freedom
     of_noise = float(sum(2 * r.lines * len(names) for r in records_of(at.layout)))
     by_instrument = data.flights[0].by_instrument is not None
-    own = None, None
+    own, followed = (None, None), {}
+    # Of a flight without its instrument neither is asked: feedback may move the inputs.
     if by_instrument or at.data.flights[0].by_instrument is None:
+        there, by = Solution(layout, data, direct, z), instruments_of(problem)
+        followed = errors_against_excitation((flight,), there, errors, by if by_instrument else ())
         # In its own noise: stronger gusts would pass for another machine.
         itself = direct._replace(by_instrument=np.asarray(float(by_instrument)))
 
@@ -212,9 +215,6 @@ def _flight_by_lines(
             return _rows(at, layout, data, itself, z)
 
         own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fit)
-    names_by = instruments_of(problem) if by_instrument else ()
-    there = Solution(layout, data, direct, z)
-    followed = errors_against_excitation((flight,), there, errors, names_by)
     low, high = expected_interval(freedom, of_noise)
     lines = []
     for record, W, e, t in zip(records, whitening, errors, taken, strict=True):
