@@ -81,8 +81,7 @@ class HeldOutFlight(NamedTuple):
     @property
     def in_words(self) -> str:
         """In a line: chi-squared, what was expected, the estimates, what is explained."""
-        between = f"95 %: {self.lower95:.3g} to {self.upper95:.3g}"
-        known = [f"chi-squared {self.chi_squared:.3g} ({between})"]
+        known = [f"chi-squared {self.chi_squared:.3g} ({self._expected})"]
         if self.estimates_p_value is not None:
             verb = "differ" if self.differs else "agree"
             known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
@@ -124,8 +123,11 @@ class HeldOutFlight(NamedTuple):
         return tuple(said)
 
     @property
+    def _expected(self) -> str:
+        return f"95 %: {self.lower95:.3g} to {self.upper95:.3g}"
+
+    @property
     def _size(self) -> str:
-        between = f"95 %: {self.lower95:.3g} to {self.upper95:.3g}"
         size = f"squared errors are {self.chi_squared:.3g} times what"
         more = self.chi_squared > self.upper95
         if self.responses is not None:
@@ -133,8 +135,8 @@ class HeldOutFlight(NamedTuple):
             if more and self.estimates_p_value is None:
                 # They are not asked for where feedback has its part in the responses.
                 why += ", or feedback makes the responses what they are"
-            return f"{size} its own noise lets expect ({between}): {why}"
-        size = f"{size} the noise of the fitted flights lets expect ({between})"
+            return f"{size} its own noise lets expect ({self._expected}): {why}"
+        size = f"{size} the noise of the fitted flights lets expect ({self._expected})"
         # Where they are not asked for, nothing tells these from another machine.
         agree = "" if self.estimates_p_value is None else ", though its own estimates agree"
         what = "more gusts or noise than these, or more" if more else "fewer gusts and less noise"

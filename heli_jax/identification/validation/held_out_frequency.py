@@ -192,7 +192,9 @@ def _flight_by_lines(
         for W, e in zip(whitening, errors, strict=True)
     )
     freedom = float(sum(2 * e.size - t.numbers for e, t in zip(errors, taken, strict=True)))
-    r, J = _rows(at, layout, data, direct, z)
+    # A row for each unknown of interest, and one for what is left of the errors.
+    count = len(at.layout.of_interest) + 1
+    r, J = _rows(Solution(layout, data, direct, z), count)
     allowed = 2.0 * squares - explained_by_estimates(r, J, fit.information)
     chi = allowed / freedom
     of_noise = float(sum(2 * r.lines * len(names) for r in records_of(at.layout)))
@@ -209,10 +211,10 @@ def _flight_by_lines(
             # By the program that there is already, though nobody asks for the ends here.
             made = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
             noise = itself._replace(whitening=whitening_by(made.machine, made.errors))
-            return _rows(at, layout, data, noise, z)
+            return _rows(Solution(layout, data, noise, z), count)
 
         def before(z: Array) -> Rows:
-            return _rows(at, layout, data, itself, z)
+            return _rows(Solution(layout, data, itself, z), count)
 
         own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fit)
     low, high = expected_interval(freedom, of_noise)
@@ -227,12 +229,13 @@ def _flight_by_lines(
     )
 
 
-def _rows(at: Solution, layout: Layout, data: Data, noise: Noise, z: Array) -> Rows:
-    """Rows, in units in which noise has variance 1, and their derivative by what is of interest."""
-    q = len(at.layout.of_interest)
-    made = residual_and_jacobian(layout, data, noise, z)
+def _rows(there: Solution, count: int) -> Rows:
+    """So many rows, in units in which noise has variance 1, and their derivative by what is of
+    interest."""
+    made = residual_and_jacobian(*there)
     # Behind them stand the priors, which are none of this flight's news.
-    return Rows(np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q])
+    q = len(there.layout.of_interest)
+    return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
 
 
 def _with_nuisances(
@@ -369,19 +372,16 @@ def _responses_of(
     if noise.whitening == ():
         # What it was refused for.
         first_weights(problem, flights)
-    q, first = len(at.layout.of_interest), layout.first_nuisance
-    z = jnp.zeros(layout.size, at.z.dtype).at[:first].set(at.z[:first])
+    z = _with_nuisances(problem, at, layout, data, noise)
     z, noise = layout.estimator.relax(layout, data, None, noise, z)
     count = 2 * noise.whitening.used.size
 
     def before(z: Array) -> Rows:
-        made = residual_and_jacobian(layout, data, noise, z)
-        return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
+        return _rows(Solution(layout, data, noise, z), count)
 
     def rows(z: Array) -> Rows:
-        there = layout.estimator.relax(layout, data, None, noise, z)
-        made = residual_and_jacobian(layout, data, there[1], there[0])
-        return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
+        z, left = layout.estimator.relax(layout, data, None, noise, z)
+        return _rows(Solution(layout, data, left, z), count)
 
     agreement = layout.estimator.response_agreement(layout, data, noise, z, fitted=False)
     assert agreement is not None
