@@ -183,15 +183,9 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
     # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
     # add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(_cache()))
+        jax.config.update("jax_compilation_cache_dir", _private_cache())
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    from heli_jax.numerics import stored
-
-    # What was traced lies beside what was compiled of it, and is kept where that is.
-    compiled: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if compiled and jax.config.jax_enable_compilation_cache:  # pyright: ignore
-        stored.keep_in(Path(compiled) / "heli_jax-traced")
     if cpu_devices is not None:
         # Once JAX is in use their number stays as it is.
         with contextlib.suppress(RuntimeError):
@@ -213,6 +207,17 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 def _cache() -> Path:
     """Where what was compiled and measured is kept from one command to the next."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
+
+
+def _private_cache() -> str | None:
+    """The cache folder, of this user alone; None where it is not: what was compiled is code."""
+    folder = _cache()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)  # refused where it is another user's
+    except OSError:
+        return None
+    return str(folder)
 
 
 def _new_directory(options: argparse.Namespace) -> Path:
@@ -374,7 +379,7 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with (
         simulation_output.sweep_progress(quiet=options.quiet) as progress,
-        cli_options.dask_client(options, config) as client,
+        cli_options.dask_client(options) as client,
     ):
         sweep_workflow.run_sweep(
             experiment,

@@ -7,21 +7,21 @@ common. A worker that dies has its chunks computed by another.
 import contextlib
 import logging
 import signal
-import sys
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import jax
 import numpy as np
-from distributed import CancelledError, Client, LocalCluster, WorkerPlugin, as_completed
+from distributed import CancelledError, Client, LocalCluster, Security, WorkerPlugin, as_completed
 from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
+from heli_jax import import_path
 from heli_jax.errors import InputError
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.spec import Job
@@ -57,8 +57,8 @@ class Prepared(WorkerPlugin):
     # dask keeps one plugin of a name: a second sweep on the same scheduler replaces the first's.
     name: Any = "heli_jax"
 
-    def __init__(self, x64: bool, folder: str | None, cache: str | None) -> None:
-        self.x64, self.folder, self.cache = x64, folder, cache
+    def __init__(self, x64: bool, folders: tuple[str, ...], cache: str | None) -> None:
+        self.x64, self.folders, self.cache = x64, folders, cache
 
     def setup(self, worker: distributed.Worker) -> None:
         """Called by dask in every worker, later ones too."""
@@ -66,25 +66,23 @@ class Prepared(WorkerPlugin):
         jax.config.update("jax_enable_x64", self.x64)
         if self.cache:
             jax.config.update("jax_compilation_cache_dir", self.cache)
-        if self.folder and self.folder not in sys.path:
-            sys.path.insert(0, self.folder)
+        import_path.search(self.folders)
 
 
 @contextlib.contextmanager
 def connected(
     scheduler: str | None = None,
     workers: int | None = None,
-    folder: Path | None = None,
 ) -> Iterator[Client]:
     """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
 
     Args:
         scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
         workers: processes of that cluster; as many as dask thinks fit unless given.
-        folder: where the user's own modules lie.
 
     Raises:
-        InputError: nothing answers there, or workers have other versions than this process.
+        InputError: nothing answers there, workers have other versions than this process, or a
+            cluster of one's own cannot be protected.
     """
     cache: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
     with contextlib.ExitStack() as stack:
@@ -99,22 +97,50 @@ def connected(
                 ) from e
             cache = None  # a folder of this machine; theirs may have none of that name
         else:
-            local: Any = LocalCluster  # whose annotations leave out that workers may be None
-            with _ignore_sigint():
-                # One thread a process: a chunk takes all devices of its process already. No
-                # dashboard: it would open a port.
-                cluster = local(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                )
-            client = stack.enter_context(Client(stack.enter_context(cluster)))
+            client = stack.enter_context(Client(stack.enter_context(_local_cluster(workers))))
         x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
         _check_versions(client, scheduler or "--workers")
-        client.register_plugin(Prepared(x64, None if folder is None else str(folder), cache))
+        client.register_plugin(Prepared(x64, import_path.searched(), cache))
         yield client
+
+
+def _local_cluster(workers: int | None) -> LocalCluster:
+    """A cluster on this machine that this process alone can use.
+
+    Its ports are open to every user of the machine, and whoever dask listens to can run code: it
+    listens to holders of a certificate made here, which stays in memory.
+    """
+    local: Any = LocalCluster  # whose annotations leave out that workers may be None
+    # dask starts its HTTP servers whatever it is told. They have no pages then, and are stopped.
+    try:
+        security = Security.temporary()
+    except ImportError as e:
+        raise InputError(
+            "--workers: cryptography is not installed, by which only this process reaches its "
+            "workers, expected the extra distributed: pip install 'heli_jax[distributed]'"
+        ) from e
+    no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
+    with _ignore_sigint(), dask.config.set(no_pages):
+        # One thread a process: a chunk takes all devices of its process already.
+        cluster = local(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            security=security,
+            plugins=(_NoHttp(),),
+        )
+    cluster.scheduler.http_server.stop()
+    return cluster
+
+
+class _NoHttp(WorkerPlugin):
+    """A worker without the HTTP server that dask gives it."""
+
+    def setup(self, worker: distributed.Worker) -> None:
+        """Called by dask as the worker begins."""
+        worker.http_server.stop()
 
 
 @contextlib.contextmanager

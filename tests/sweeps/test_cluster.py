@@ -5,8 +5,9 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
-from distributed import CancelledError
+from distributed import CancelledError, Client
 from distributed.comm.core import CommClosedError
 
 from heli_jax import models, sweep
@@ -27,6 +28,7 @@ def pids(client):
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing(bench30, record):
     pytest.importorskip("distributed")
+    pytest.importorskip("cryptography")
     from heli_jax.sweeps.cluster import connected
 
     design = sobol({"Ixx": Range(0.02, 0.05), "a": Range(4.0, 6.0)}, 600)
@@ -34,6 +36,13 @@ def test_a_worker_that_dies_costs_nothing(bench30, record):
     options = {"chunk": 32, "lanes": 16}
     alone = sweep(ROLL, bench30, record, design, reduce, **options)
     with connected(workers=2) as client:
+        # Of the scheduler, each worker and each nanny one, all encrypted, and none of HTTP.
+        of_all = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = [c.laddr for p in of_all for c in p.net_connections() if c.status == "LISTEN"]
+        assert len(listening) == 5
+        for at in listening:
+            with pytest.raises((OSError, CommClosedError)):
+                Client(f"tcp://{at.ip}:{at.port}", timeout=1)
         killed = []
 
         def kill(progress):
