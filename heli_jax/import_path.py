@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import os
 import re
 import sys
 import traceback
@@ -68,6 +69,11 @@ def search(folders: Iterable[str]) -> None:
 def searched() -> tuple[str, ...]:
     """Folders in which modules of configurations were looked for; none where none was named."""
     return tuple(_looked_in)
+
+
+def environment() -> dict[str, str]:
+    """The environment in which another Python finds the modules that this one does."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
 def _check_size(module_name: str, where: str) -> None:
