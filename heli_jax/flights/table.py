@@ -149,6 +149,22 @@ class Budget:
         raise wrong(self._path, f"{problem} {remedy}")
 
 
+_LONGEST_NAME = 1000
+"""letters of a column's name: patterns that look at names take their square"""
+
+
+def require_short_names(path: str, names: Sequence[str]) -> None:
+    """Refuse a column's name that is no name.
+
+    Raises:
+        InputError: naming the length.
+    """
+    longest = max(map(len, names), default=0)
+    if longest > _LONGEST_NAME:
+        problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
+        raise wrong(path, problem)
+
+
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
     """Refuse a column that is missing or stands in the file twice.
 

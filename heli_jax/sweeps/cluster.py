@@ -5,12 +5,13 @@ common. A worker that dies has its chunks computed by another.
 """
 
 import contextlib
+import functools
 import logging
 import signal
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import dask
@@ -232,7 +233,9 @@ def split_there(client: Client, job: Job, **options: Any) -> Split:
     with _answering():
         # Not pure: dask would give the answer that it remembers of an equal job, which may be of
         # other workers.
-        return Split(*client.submit(_split, job, options, pure=False).result())
+        running = _gathered([client.submit(_split, job, options, pure=False)])
+        ((_, split),) = _as_they_end(client, running)
+        return Split(*split())
 
 
 def _threads(client: Client) -> int:
@@ -275,10 +278,10 @@ def computed(
         return client.submit(_chunk, shipped, tuple(split), chunk, token, key=key, retries=_RETRIES)
 
     first = [submitted(k) for _, k in zip(range(_AHEAD * threads), waiting, strict=False)]
-    running = as_completed(first)
-    for future in _as_they_end(client, running):
+    running = _gathered(first)
+    for future, result in _as_they_end(client, running):
         with _answering():
-            chunk, results = future.result()
+            chunk, results = result()
         # Before the chunk is written, or the worker would keep its results for as long.
         future.release()
         following = next(waiting, None)
@@ -287,18 +290,26 @@ def computed(
         yield chunk, results
 
 
-# Any: dask's as_completed, whose futures have no type.
-def _as_they_end(client: Client, running: Any) -> Iterator[Any]:
-    """The futures as they end, in any order; more may be added meanwhile.
+# Any: dask's futures and as_completed have no types.
+def _gathered(futures: list[Any]) -> Any:
+    """Futures as they are done and their results are here: to fetch one may wait without end, where
+    the worker that holds it has died."""
+    return as_completed(futures, with_results=True, raise_errors=False)
+
+
+def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
+    """The futures as they end, in any order, each with what gives its result or raises its error;
+    more may be added meanwhile.
 
     Raises:
-        InputError: the scheduler is gone, or has had no worker for long: tasks would wait for one
-            without end, and nobody would be told.
+        InputError: the scheduler is gone, or has had no worker for long that takes work: tasks
+            would wait for one without end, and nobody would be told.
     """
     seen = looked = time.monotonic()
     while not running.is_empty():
         if running.has_ready():
-            yield next(running)
+            future, result = next(running)
+            yield future, functools.partial(_value, future, result)
             seen = looked = time.monotonic()
             continue
         time.sleep(_WAIT_S)
@@ -306,14 +317,30 @@ def _as_they_end(client: Client, running: Any) -> Iterator[Any]:
         if now - looked < _LOOK_S:
             continue
         looked = now
-        there: Any = client.nthreads
         with _answering():
-            seen = now if there() else seen
+            there = client.scheduler_info()["workers"].values()
+        seen = now if any(map(_works, there)) else seen
         if now - seen > _ALONE_S:
+            paused = f"no worker but {len(there)} that lack memory" if there else "no worker"
             raise InputError(
-                f"dask: the scheduler has had no worker for {now - seen:.0f} s, expected one at "
+                f"dask: the scheduler has had {paused} for {now - seen:.0f} s, expected one at "
                 "least to run to the end; what is finished is kept: --resume goes on"
             )
+
+
+def _value(future: Any, result: Any) -> Any:
+    """The result of a future that ended, or its error raised."""
+    if future.status == "error":
+        raise result[1]
+    if isinstance(result, CancelledError):
+        raise result
+    return result
+
+
+def _works(worker: Mapping[str, Any]) -> bool:
+    """True if a worker takes tasks or is at one: dask pauses those that are short of memory."""
+    counts = worker.get("metrics", {}).get("task_counts", {})
+    return worker.get("status") != "paused" or bool(counts.get("executing"))
 
 
 def mapped[T, R](
@@ -341,19 +368,19 @@ def mapped[T, R](
         return client.submit(function, items[k], key=f"item-{k}-{token}", pure=False)
 
     at_once = _AHEAD * _threads(client)
-    running = as_completed([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
-    for future in _as_they_end(client, running):
+    running = _gathered([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
+    for future, result in _as_they_end(client, running):
         with _answering():
             try:
-                result = future.result()
+                found = result()
             # dask counts how many workers died over one task: the others go on.
             except KilledWorker:
-                result = None
+                found = None
         future.release()
         following = next(waiting, None)
         if following is not None:
             running.add(submitted(following))
-        yield places.pop(future.key), result
+        yield places.pop(future.key), found
 
 
 def _received(job: Job) -> Job:
