@@ -1,5 +1,6 @@
 """Anyone's own objects by import path, as a configuration names them."""
 
+import contextlib
 import importlib
 import importlib.util
 import os
@@ -69,6 +70,14 @@ def search(folders: Iterable[str]) -> None:
 def searched() -> tuple[str, ...]:
     """Folders in which modules of configurations were looked for; none where none was named."""
     return tuple(_looked_in)
+
+
+def pass_over_style_of_folder() -> None:
+    """Import Matplotlib now where the working folder holds a file that it would read as its
+    settings, whatever is in it."""
+    if os.path.lexists("matplotlibrc"):
+        with contextlib.chdir(os.sep):
+            importlib.import_module("matplotlib")
 
 
 def environment() -> dict[str, str]:
