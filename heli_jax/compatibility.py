@@ -18,6 +18,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
+from heli_jax.finding import sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import FAR
 from heli_jax.numbers import with_sd
@@ -276,7 +277,7 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
     """What a fit says of itself, and errors that no sensor has."""
     # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
-    notes = tuple(n for n in run.fit.notes if n not in run.fit.adequacy.sentences)
+    notes = tuple(sentences(f for f in run.fit.findings if f not in run.fit.adequacy.findings))
     scales = [
         e
         for e in errors

@@ -8,6 +8,7 @@ import numpy as np
 
 from heli_jax import run_directory
 from heli_jax.config.frequency import missing_handling
+from heli_jax.finding import Finding
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate, Fit
@@ -15,7 +16,6 @@ from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
@@ -100,13 +100,8 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    held = f". Held out: {doubt}" if (doubt := report_tables.held_out_doubt(fit)) else ""
-    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
-    # Reasons have a line each below: they are said once.
-    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
-    below = why and not fit.adequate and not fit.adequacy.unjudged
-    adequate = "no (why: below)" if below else report_tables.adequate(fit)
-    tell(f"{arrived}: {text} adequate: {adequate}{held}")
+    converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
+    tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         tell(f"! {line}")
@@ -256,14 +251,14 @@ def print_check(check: Check) -> None:
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
         tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
+    follows = all(f.code != NOTHING_FOLLOWS for f in check.findings)
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         tell(f"! {sentence}")
     for note in check.further_notes:
-        tell(f"! {note}")
+        tell(f"! {note.sentence}")
     _print_findings(check.findings)
 
 

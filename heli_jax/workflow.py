@@ -19,6 +19,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, require_kind
+from heli_jax.finding import Finding, note
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -29,7 +30,6 @@ from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
@@ -152,8 +152,8 @@ def _fit_run(
             )
         problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
     try:
@@ -217,7 +217,8 @@ def _keep(run: FitRun, out: str | Path, progress: Say) -> None:
     """Write a fit before further intervals are sought, so that an interrupt does not lose it."""
     words = "The further intervals that were asked for are not in it: the run was interrupted."
     # Its own times: the run's go on.
-    fitted = replace(run.fit, notes=(*run.fit.notes, words), timing=dict(run.fit.timing))
+    findings = (*run.fit.findings, note("uncertainty.interrupted", words))
+    fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
     with stage("writing the fit", name="report before further intervals"):
         write_report(replace(run, fit=fitted), out)
     progress(f"the fit is in {out}; what else was asked for comes into it")
@@ -255,8 +256,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     """
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     try:
         with stage("what the log can determine"):
             return check(problem)

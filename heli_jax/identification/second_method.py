@@ -21,15 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.fit import fit
 from heli_jax.identification.identifiability.through_inputs import through_inputs
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Estimate, Fit, SecondMethod
+from heli_jax.identification.result import Estimate, Fit, concluded
 from heli_jax.identification.validation.borne_out import by_the_inputs
 
-_METHOD = "frequency-error"
+_METHOD, SECOND_METHOD = "frequency-error", "agreement.second-method"
 _WELL_EXPLAINED = 0.95
 """VAF of every output from which on a disturbance is too small to make an optimum of its own"""
 _APART = 3.3
@@ -98,24 +99,39 @@ def with_second_method(
         return first
     if other.status == "not-converged" or other.untrusted:
         return first
-    estimates = {
-        n: _interval(other.estimates[n])
-        for n, a in first.estimates.items()
-        if question.is_apart(a, other.estimates[n])
-    }
-    second = SecondMethod(METHODS[_METHOD].label, estimates)
-    notes = first.notes
-    if estimates:
-        notes = (*notes, sentence(second, question.remedy))
-    elif filtered:
-        doubted = {
-            n: _interval(other.estimates[n])
-            for n, a in first.estimates.items()
-            if _excluded(a, other.estimates[n], _DOUBTED)
-        }
-        if doubted:
-            notes = (*notes, sentence(second._replace(estimates=doubted), _OF_DOUBT))
-    return dataclasses.replace(first, second_method=second, notes=notes)
+    apart = [n for n, a in first.estimates.items() if question.is_apart(a, other.estimates[n])]
+    code, why, named = SECOND_METHOD, question.remedy, apart
+    if not apart and filtered:
+        pairs = ((n, a, other.estimates[n]) for n, a in first.estimates.items())
+        code, why = "agreement.second-method-doubt", _OF_DOUBT
+        named = [n for n, a, b in pairs if _excluded(a, b, _DOUBTED)]
+    if not named:
+        return first
+    found = _finding(code, first, other, named, why)
+    if apart:
+        # One estimate of a wrong optimum is as wrong as another.
+        every = tuple(n for n, e in first.estimates.items() if e.sd is not None)
+        found = found._replace(severity="doubt", distrusts=every)
+    return concluded(dataclasses.replace(first, findings=(*first.findings, found)))
+
+
+def _finding(code: str, first: Fit, other: Fit, names: list[str], why: str) -> Finding:
+    """A note of what the other method has instead, in parameters that it does not bear out."""
+    label, words = METHODS[_METHOD].label, []
+    for n in names:
+        v = _interval(other.estimates[n])
+        words.append(
+            f"{n} not determined"
+            if v is None
+            else f"{n} {v[0]:.3g} (95 % {v[1]:.3g} to {v[2]:.3g})"
+        )
+    sentence = (
+        f"Weighed by the spectrum of what disturbs the record, by {label}: {', '.join(words)}. "
+        f"{why}"
+    )
+    knows = "any gusts" if first.method == "filter-error" else "gusts"
+    brief = f"{label}, which allows for {knows}, has other values of {', '.join(names)}"
+    return Finding(code, "note", sentence, subjects=tuple(names), brief=brief)
 
 
 def _is_doubtful(problem: Problem, first: Fit) -> bool:
@@ -177,20 +193,6 @@ def _excluded(a: Estimate, b: Estimate, apart: float = _APART) -> bool:
         return False
     sd = (value - low if a.value < value else high - value) / _NORMAL
     return abs(a.value - value) > apart * sd * math.sqrt(max(_LEAST, 1.0 - (a.sd / b.sd) ** 2))
-
-
-def sentence(second: SecondMethod, why: str) -> str:
-    """For the notes of a fit.
-
-    Args:
-        second: with a parameter at least that it does not bear out.
-        why: what that tells, and the remedy.
-    """
-    each = ", ".join(
-        f"{n} not determined" if v is None else f"{n} {v[0]:.3g} (95 % {v[1]:.3g} to {v[2]:.3g})"
-        for n, v in second.estimates.items()
-    )
-    return f"Weighed by the spectrum of what disturbs the record, by {second.label}: {each}. {why}"
 
 
 _OF_DOUBT = (

@@ -145,9 +145,7 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
 def _of_verdicts(fit: Fit) -> list[Gate]:
     """What the first line says: the reason for its `no` need not show in any number of the card."""
     determined = "determined" if fit.verdict.identifiable else "not determined"
-    # `no: p looks like ...` instead of `no (p looks like ...)`, since a summary has it in brackets.
-    verdict, _, why = fit.adequacy.summary.partition(" (")
-    adequate = f"{verdict}: {why[:-1]}" if why.endswith(")") else fit.adequacy.summary
+    adequate = fit.adequate_in_words.replace(" (", ": ", 1).removesuffix(")")
     return [
         Gate(
             "identifiability",

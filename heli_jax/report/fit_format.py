@@ -8,6 +8,7 @@ from typing import Literal, TypedDict
 from heli_jax.analysis.attitude_responses import HandlingPair
 from heli_jax.analysis.handling_qualities import Number
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding
 from heli_jax.identification.equation_error.first_guess import Equation, StartValue
 from heli_jax.identification.equation_error.stepwise import Step
 from heli_jax.identification.estimation.multistart import StartRow
@@ -18,7 +19,6 @@ from heli_jax.identification.uncertainty.nuts import Convergence
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Moved
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness

@@ -16,13 +16,14 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.finding import Finding, Severity
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
-from heli_jax.identification.validation.finding import Finding, Severity
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
 
+LOGGING_RATE = "timing.logging-rate"
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
 _SETTLED = 1.0
@@ -102,7 +103,7 @@ def _not_judged(label: str, hz: float) -> Finding:
         f"{label}: whether the rate is enough was not judged: at the start values no mode of the "
         f"model (the fastest has {hz:.3g} Hz) moves an output by {SHOWS:g} times its noise."
     )
-    return Finding("logging rate", "doubt", words)
+    return Finding(LOGGING_RATE, "doubt", words)
 
 
 def _modes_that_show(
@@ -195,7 +196,7 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
             f": {number(ratio, 2)} samples in a period hardly show it, and what happened "
             f"between them biases the estimates; log at {ENOUGH * hz:.3g} Hz."
         )
-    return Finding("logging rate", severity, f"{begun}{ending}", ratio, criterion)
+    return Finding(LOGGING_RATE, severity, f"{begun}{ending}", ratio, criterion)
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:

@@ -13,6 +13,7 @@ import scipy.linalg
 import scipy.special
 
 from heli_jax.dynamics.kinematics import FORCES
+from heli_jax.finding import Finding, note
 from heli_jax.identification.validation.metrics import cross_correlation
 from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.numbers import percent
@@ -70,8 +71,8 @@ class Explained(NamedTuple):
 
 def missing_dynamics(
     flights: tuple[Left, ...], *, sensors: bool = False, mentioned: bool = False
-) -> list[str]:
-    """Sentences on what inputs still explain of the residuals.
+) -> list[Finding]:
+    """Findings of what inputs still explain of the residuals.
 
     Args:
         flights: those that were fitted.
@@ -100,10 +101,13 @@ def missing_dynamics(
         }
         explained = {pair: e for pair, e in explained.items() if e.share == most[pair[0]]}
     remedy = "" if mentioned else _OF_SENSORS if sensors else _OF_A_MACHINE
-    sentences = []
+    findings = []
     for (output, name), one in explained.items():
         away = output in FORCES and not sensors
-        sentences.append(_sentence(output, name, one, remedy + away * _OF_AN_ACCELERATION))
+        words = _sentence(output, name, one, remedy + away * _OF_AN_ACCELERATION)
+        code = "dynamics.residual-precedes-input" if one.lag < 0 else "dynamics.input-explains"
+        criterion = f"part of the whitened residual, {_WORTH_IT:g}"
+        findings.append(Finding(code, "note", words, one.share, criterion, (output, name)))
         # The remedy of all of them is the same: the first one says it.
         remedy = remedy if one.lag < 0 else ""
     gappy = {
@@ -113,11 +117,9 @@ def missing_dynamics(
         if own_samples(np.isfinite(r)) is None
     }
     if gappy:
-        sentences.append(
-            f"Whether the model lacks dynamics was not asked of {', '.join(gappy)}, of which "
-            "samples are missing."
-        )
-    return sentences
+        words = f"Missing dynamics of {', '.join(gappy)} were not tested: samples are missing."
+        findings.append(note("dynamics.not-tested", words, *gappy))
+    return findings
 
 
 def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:

@@ -73,6 +73,8 @@ class Strongest(NamedTuple):
     """by which the unknowns move where the filter is in the model"""
     step: Float[np.ndarray, " q"]
     """of the unknowns to where the whitened residual is least without it"""
+    amount: float
+    """of the drive that the residual asks for, counted as a step of an unknown is"""
 
 
 def lines_of(
@@ -152,7 +154,7 @@ def strongest(
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > max(_AT_LEAST, least):
-        return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])))
+        return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])), 0.0)
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
@@ -309,17 +311,19 @@ def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray
 
 def _steps(
     J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
-) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
-    """The step of the unknowns beside further columns less that without, and that without."""
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], float]:
+    """The step of the unknowns beside further columns less that without, that without, and the sum
+    of the steps along the last two columns: a drive and the drive one sample later."""
     columns = np.concatenate([J, more], axis=1)
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
     q = J.shape[1]
     # e falls by J times the step.
     alone = -np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-6)[0]
-    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0][:q]
-    over = np.where(sizes[:q] > 0, sizes[:q], np.inf)
-    return (beside - alone) / over, alone / over
+    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0]
+    over = np.where(sizes > 0, sizes, np.inf)
+    amount = float(np.sum(beside[-2:] / over[-2:]))
+    return (beside[:q] - alone) / over[:q], alone / over[:q], amount
 
 
 def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:

@@ -1,6 +1,7 @@
 """Angles whose error is no white noise, as those that an autopilot integrates from its gyros."""
 
 from heli_jax.dynamics.model import axes_of
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -8,7 +9,7 @@ from heli_jax.identification.validation.decimated import is_decimated
 from heli_jax.numerics.white_noise import wanders
 
 
-def wandering_notes(problem: Problem) -> list[str]:
+def wandering_notes(problem: Problem) -> list[Finding]:
     """Of filter error, which takes every output's error for white noise: the angles whose is not.
 
     Args:
@@ -23,9 +24,13 @@ def wandering_notes(problem: Problem) -> list[str]:
         if any(_wanders_beside(f, angle, rate) for f in problem.flights)
     ]
     return [
-        f"The error of {angle} is no white noise, which the filter takes it for: it looks "
-        f"integrated from a gyro, as an autopilot's attitude is, and wanders. That can bias every "
-        f"estimate: fit without {angle}, which says nothing that {rate} does not, and compare."
+        note(
+            "noise.wandering-angle",
+            f"The error of {angle} is no white noise, which the filter takes it for: it looks "
+            "integrated from a gyro, as an autopilot's attitude is, and wanders. That can bias "
+            f"every estimate: fit without {angle}, which says nothing that {rate} does not.",
+            angle,
+        )
         for angle, rate in wandering
     ]
 
