@@ -165,9 +165,7 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
         findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        findings.append(
-            Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, None, criterion)
-        )
+        findings.append(Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, None, criterion))
     return findings
 
 

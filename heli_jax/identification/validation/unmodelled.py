@@ -21,6 +21,7 @@ from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.residual_drives import (
     changing,
@@ -85,7 +86,7 @@ def unmodelled(
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            lacking.append(_said(at, e, name, one, flights))
+            lacking.append(_said(at, e, name, one, J, flights))
     return tuple(lacking)
 
 
@@ -189,7 +190,14 @@ def _of_output(
     return _Asked(best, by_amplitude, over, float(deviance), odd, asked, before)
 
 
-def _said(at: Solution, e: Evaluation, name: str, one: _Asked, flights: Sequence[str]) -> Finding:
+def _said(
+    at: Solution,
+    e: Evaluation,
+    name: str,
+    one: _Asked,
+    J: Mapping[tuple[int, str], np.ndarray],
+    flights: Sequence[str],
+) -> Finding:
     strong, moving, slopes = one.strong, moving_inputs(at), np.asarray(e.slopes)
     k = slopes.size
     shifts = strong.shift[:k] * slopes
@@ -204,6 +212,7 @@ def _said(at: Solution, e: Evaluation, name: str, one: _Asked, flights: Sequence
     where = f" near {frequency:.2g} rad/s" if strong.damping < 1.0 else ""
     chance = f"twice the log-likelihood gains {strong.statistic:.3g}, p {p_value(strong.p_value)}"
     if one.by_amplitude:
+        shifts = _by_amplitude(at, e, name, J) * slopes
         code, subjects = "dynamics.depends-on-amplitude", (name,)
         brief = f"the response of {name} depends on amplitude"
         remedy = (
@@ -241,6 +250,36 @@ def _said(at: Solution, e: Evaluation, name: str, one: _Asked, flights: Sequence
         dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
         brief,
     )
+
+
+def _by_amplitude(
+    at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
+) -> np.ndarray:
+    """By unknown of interest (k,) its change over one standard deviation of the amplitude of an
+    input or of the output, whichever explains more.
+
+    The residual is regressed on the sensitivities, and on these times the amplitude. It is not
+    whitened: the answer that depends on amplitude is as slow as the response itself.
+    """
+    k, samples = len(at.layout.of_interest), of_one_clock(at, e, name)
+    left = np.concatenate([np.asarray(e.raw[i][name])[own.rows] for i, own in samples])
+    rows = np.concatenate([J[i, name][own.rows] for i, own in samples])
+    best, least = np.zeros(k), np.inf
+    for drive in (*moving_inputs(at), None):
+        signals = [
+            np.asarray(e.simulated[i][name] if drive is None else getattr(f.inputs, drive))[
+                own.rows
+            ]
+            for (i, own), f in ((pair, at.data.flights[pair[0]]) for pair in samples)
+        ]
+        amplitude = np.abs(np.concatenate(signals))
+        amplitude = (amplitude - amplitude.mean()) / max(float(np.std(amplitude)), 1e-300)
+        columns = np.concatenate([rows, rows[:, :k] * amplitude[:, None]], axis=1)
+        change = -pseudoinverse(columns) @ left
+        squares = float(np.sum((left + columns @ change) ** 2))
+        if squares < least:
+            best, least = change[rows.shape[1] :], squares
+    return best
 
 
 def _between(one: _Asked, flights: Sequence[str]) -> tuple[str, ...]:

@@ -43,12 +43,12 @@ def _adequate(fit: Fit) -> str:
             f"the error of the {what} has at most {EXPECTED:g} times the power that the estimated "
             "disturbance makes, with innovations that are white or have an autocorrelation below "
             f"{FAR_FROM_WHITE:g} at one sample; or the simulation explains {percent(EXPLAINED, 0)} "
-            "of what is not white noise. Nothing in the record itself speaks against any model."
+            "of what is not white noise. Nothing in the record speaks against every model."
         )
     return (
         f"the simulation explains at least {percent(EXPLAINED, 0)} of what is not white noise, or "
         f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. Nothing "
-        "in the record itself speaks against any model."
+        "in the record speaks against every model."
     )
 
 
