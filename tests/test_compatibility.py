@@ -13,6 +13,7 @@ from heli_jax import Prior, compatibility, config, run_directory, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.finding import note
 from heli_jax.identification.validation.advice import OutputAdequacy
 
 RATE, DURATION = 25.0, 16.0
@@ -126,6 +127,7 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     y = np.sin(np.arange(100.0))
     left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
     signals = SimpleNamespace(measured=dict.fromkeys(shares, y), simulated=left, hold_out=False)
+    of_machine = note("of.machine", "of a machine")
     fit = SimpleNamespace(
         estimates={
             n: Estimate(v, 0.5 * w, v - w, v + w, "1", 0.0, 0.9 if n == "b_r" else 0.0, False)
@@ -135,8 +137,9 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         status=status,
         signals=[signals],
         notes=("of the fit", "of a machine"),
+        findings=(note("of.fit", "of the fit"), of_machine),
         adequacy=SimpleNamespace(
-            sentences=("of a machine",),
+            findings=(of_machine,),
             judged=[OutputAdequacy(n, True, r, 1.0, True, 0.0, 0.4) for n, r in shares.items()],
         ),
         method="filter-error",
