@@ -5,6 +5,7 @@ is an error of the linear model that no noise explains, and moves the estimates 
 outputs does.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,15 +24,11 @@ from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import driven
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, unpack
 from heli_jax.simulation.simulate import simulate
 
 # Params, State and Inputs are a model's own classes: they are annotated Any.
 
-_DOUBTFUL = 0.05
-"""of an output's motion, above which what the linear model leaves out of it is doubtful"""
-_MOVED = 1.0
-"""standard deviations by which it moves an estimate, above which that is"""
 _TOLD = 0.3
 """standard deviations from which on an estimate is named"""
 _TIMES = 3.0

@@ -175,7 +175,9 @@ def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Fi
         brief = f"{name} looks like {unit} read as {signal.unit}"
         # What was flown upside down is in its own unit as likely as not.
         code = "units.flown-or-degrees" if flown and not certain else UNIT_IN_DOUBT
-        yield Finding(code, "doubt", words, size, criterion, (name,), brief=brief, denies=certain)
+        yield Finding(
+            code, "doubt", words, size, criterion, (str(name),), brief=brief, denies=certain
+        )
 
 
 def _of_fuselage(model: Model, name: str) -> bool:

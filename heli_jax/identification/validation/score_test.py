@@ -154,7 +154,8 @@ def strongest(
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > max(_AT_LEAST, least):
-        return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])), 0.0)
+        nothing = np.zeros(J.shape[1])
+        return Strongest(gain, 1.0, drive, *one, nothing, nothing, 0.0)
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
