@@ -45,6 +45,7 @@ from heli_jax.identification.validation.explains_nothing import unless_explains_
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of, untested
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_stick import late_stick
+from heli_jax.identification.validation.logging_rate import loop_between_samples
 from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.noisy_inputs import noisy_inputs
@@ -217,7 +218,9 @@ def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], list[Fi
             f._replace(severity="doubt", brief=_IN_A_LOOP, distrusts=tuple(estimates))
             for f in findings
         ]
-    return feedback, [*findings, *untested(problem)]
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    fast = [f._replace(distrusts=tuple(estimates)) for f in loop_between_samples(flights, feedback)]
+    return feedback, [*fast, *findings, *untested(problem)]
 
 
 def _missing(end: End, adequacy: Adequacy, *, mentioned: bool) -> list[Finding]:

@@ -16,7 +16,11 @@ from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Fe
 from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
-from heli_jax.identification.validation.logging_rate import LOGGING_RATE, logging_rate
+from heli_jax.identification.validation.logging_rate import (
+    LOGGING_RATE,
+    logging_rate,
+    loop_between_samples,
+)
 from heli_jax.identification.validation.misread import misread
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
@@ -60,6 +64,7 @@ def is_it_enough(
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [
         *logging_rate(problem, flights, at.noise.sd),
+        *loop_between_samples(flights, feedback),
         *bands(problem.training),
         *_of_feedback(problem, feedback),
         *saturation(flights),

@@ -47,8 +47,8 @@ def _adequate(fit: Fit) -> str:
         )
     return (
         f"the simulation explains at least {percent(EXPLAINED, 0)} of what is not white noise, or "
-        f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. Nothing "
-        "in the record speaks against every model."
+        f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. "
+        "Nothing in the record speaks against every model."
     )
 
 
