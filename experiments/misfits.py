@@ -199,6 +199,33 @@ def degrees(rng: np.random.Generator) -> Case:
     return Case(problem(flight(r._replace(p=np.degrees(r.p)), "p", "phi")), TRUTH)
 
 
+def in_gusts(feedback: float) -> Make:
+    def make(rng: np.random.Generator) -> Case:
+        base = problem(flight(flown(Roll(gust=8.0, feedback=feedback), rng), "p", "phi"))
+        return Case(filtered(base), TRUTH)
+
+    return make
+
+
+def filtered(base: Problem) -> Problem:
+    """The problem by filter error, with gusts of one pole."""
+    model = with_disturbance(ROLL, "p")
+    gusts = {"sigma_w": jnp.asarray(4.0), "tau_w": jnp.asarray(0.3)}
+    params = model.Params(**base.vehicle._asdict(), **gusts)
+    return dataclasses.replace(base, model=model, vehicle=params, method="filter-error")
+
+
+def wandering(rng: np.random.Generator) -> Case:
+    """Filter error beside an attitude that an autopilot integrated from its gyro."""
+    case = in_gusts(0.0)(rng)
+    f = case.problem.flights[0]
+    walk = np.cumsum(NOISE * DT**0.5 * rng.standard_normal(f.n_samples))
+    outputs = {**f.outputs, "phi": f.outputs["phi"] + walk}
+    return case._replace(
+        problem=dataclasses.replace(case.problem, flights=[dataclasses.replace(f, outputs=outputs)])
+    )
+
+
 UNSOUND: dict[str, Make] = {
     "input logged 30 ms late": one(Roll(late=0.03), "p"),
     "input logged 80 ms late, smooth stick": one(Roll(late=0.08, smooth=True), "p", hold="linear"),
@@ -219,6 +246,7 @@ UNSOUND: dict[str, Make] = {
     "wrong dt of p and phi": one(Roll(), "p", "phi", dt=1.25 * DT),
     "noisy input": one(Roll(input_noise=0.15, smooth=True), "p", hold="linear"),
     "strong gusts": one(Roll(gust=60.0), "p", "phi"),
+    "angle that wanders": wandering,
     "servo of 60 ms in gusts": one(Roll(lag=0.06, gust=5.0), "p"),
 }
 
@@ -243,22 +271,6 @@ def offsets(rng: np.random.Generator) -> Case:
 
 def two_flights(rng: np.random.Generator) -> Case:
     return Case(problem(*(flight(flown(Roll(), rng), "p") for _ in range(2))), TRUTH)
-
-
-def in_gusts(feedback: float) -> Make:
-    def make(rng: np.random.Generator) -> Case:
-        base = problem(flight(flown(Roll(gust=8.0, feedback=feedback), rng), "p", "phi"))
-        return Case(filtered(base), TRUTH)
-
-    return make
-
-
-def filtered(base: Problem) -> Problem:
-    """The problem by filter error, with gusts of one pole."""
-    model = with_disturbance(ROLL, "p")
-    gusts = {"sigma_w": jnp.asarray(4.0), "tau_w": jnp.asarray(0.3)}
-    params = model.Params(**base.vehicle._asdict(), **gusts)
-    return dataclasses.replace(base, model=model, vehicle=params, method="filter-error")
 
 
 SOUND: dict[str, Make] = {
@@ -313,8 +325,8 @@ def main() -> int:
                     flush=True,
                 )
     print(
-        f"{silent} of {counts[0]} faulty records end in silence, {alarms} of {counts[1]} sound ones "
-        f"in an alarm, {time.monotonic() - begin:.0f} s"
+        f"{silent} of {counts[0]} faulty records end in silence, {alarms} of {counts[1]} sound "
+        f"ones in an alarm, {time.monotonic() - begin:.0f} s"
     )
     return int(silent > 0 or alarms > 1)
 

@@ -25,7 +25,6 @@ from heli_jax.identification.uncertainty.estimates import (
 from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.other_hold import other_hold
-from heli_jax.identification.validation.wandering_angles import wandering_notes
 
 STOPPED = "search.stopped"
 _NO_DISTURBANCE = "noise.no-disturbance"
@@ -112,7 +111,6 @@ def fit_notes(
         *optimum.notes,
         *layout.estimator.notes(at, e, labels(problem.training), numbers.ill),
         *stated_noise_notes(problem, numbers.noise),
-        *wandering_notes(problem),
         *_correlation_notes(correlated),
         *delay_findings(problem, numbers.of_interest),
         *prior_findings(problem, {k: numbers.of_interest[k] for k in layout.free}),

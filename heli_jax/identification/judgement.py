@@ -8,7 +8,6 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import Finding
 from heli_jax.identification.agreement import (
     correlated_residuals,
@@ -47,7 +46,6 @@ from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_stick import late_stick
 from heli_jax.identification.validation.logging_rate import loop_between_samples
 from heli_jax.identification.validation.metrics import Whiteness, metrics
-from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.noisy_inputs import noisy_inputs
 from heli_jax.identification.validation.unmodelled import unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
@@ -164,7 +162,6 @@ def judge(
         *weak_note(weak),
         *misfits,
         *adequacy.findings,
-        *_missing(end, adequacy, mentioned=bool(misfits)),
     )
     return Judgement(errors, numbers, adequacy, loop, responses, findings)
 
@@ -221,21 +218,6 @@ def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], list[Fi
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     fast = [f._replace(distrusts=tuple(estimates)) for f in loop_between_samples(flights, feedback)]
     return feedback, [*fast, *findings, *untested(problem)]
-
-
-def _missing(end: End, adequacy: Adequacy, *, mentioned: bool) -> list[Finding]:
-    """What inputs still explain of the residuals (innovations)."""
-    # Where the model is inadequate its own sentences say more.
-    if end.all_white or adequacy.denied:
-        return []
-    return missing_dynamics(
-        tuple(
-            Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
-            for s, flight in zip(end.signals, end.problem.training, strict=True)
-        ),
-        sensors=is_kinematic(end.problem.model),
-        mentioned=mentioned,
-    )
 
 
 def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:

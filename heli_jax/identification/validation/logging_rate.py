@@ -119,8 +119,8 @@ def loop_between_samples(
             words = (
                 f"{label}: {name} closes a loop, and its power does not fall off before half of "
                 f"its rate of {rate:.3g} Hz ({100 * share:.2g} % above a quarter): it moved "
-                "between samples by what it saw of the response there, which biases the estimates. Log "
-                "at the rate of the controller and state hold: zero-order, or use an excitation "
+                "between samples by what it saw of the response there, which biases the estimates. "
+                "Log at the controller's rate and state hold: zero-order, or use an excitation "
                 "(signals.instruments)."
             )
             criterion = f"part of the power above a quarter of the rate, {_FAST_SHARE:g}"

@@ -18,11 +18,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.identification.validation.missing_dynamics import ORDER, across, whitening
-
+ORDER = 10
+"""of the autoregression that whitens"""
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
 BROAD = NARROW[2:]
@@ -112,6 +113,29 @@ def lines_of(
     q = J.shape[1]
     angles = 2.0 * np.pi * np.arange(1, len(v) + 1) / n
     return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles, size)
+
+
+def across(holes: Sequence[int], size: int) -> np.ndarray:
+    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    after = np.zeros(size, bool)
+    for first in holes:
+        after[first : first + ORDER] = True
+    return after
+
+
+def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
+    """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
+
+    Args:
+        e: the signal (N,), of mean zero.
+        holes: the samples before which others are missing.
+    """
+    # With zeros between no sample is compared with one beyond a hole.
+    e = np.insert(e, np.repeat(np.asarray(holes, int), ORDER), 0.0)
+    c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(ORDER + 1)]) / e.size
+    # A little white noise, so that a residual without any has a filter too.
+    c[0] *= 1.0 + 1e-9
+    return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])
 
 
 def strongest(
