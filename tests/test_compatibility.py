@@ -12,8 +12,8 @@ import yaml
 from heli_jax import Prior, compatibility, config, run_directory, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
-from heli_jax.identification.result import Estimate
 from heli_jax.finding import note
+from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.advice import OutputAdequacy
 
 RATE, DURATION = 25.0, 16.0

@@ -195,8 +195,8 @@ def test_a_check_for_other_programs(config, capsys):
     found = json.loads(capsys.readouterr().out)
     check = heli_jax.run_check(config)
     assert (found["identifiable"], found["refused"]) == (True, False)
-    assert [(f["topic"], f["sentence"]) for f in found["record"]] == [
-        (f.topic, f.sentence) for f in check.findings
+    assert [(f["code"], f["value"]) for f in found["record"]] == [
+        (f.code, f.value) for f in check.findings
     ]
     sd = found["expected_relative_sd"]
     np.testing.assert_allclose(list(sd.values()), np.sqrt(np.diag(check.verdict.covariance)))

@@ -33,7 +33,7 @@ def without(f, *holes):
 
 
 def band(f):
-    return [x for x in bands([f]) if x.topic == "excited band"]
+    return [x for x in bands([f]) if x.code == "excitation.excited-band"]
 
 
 def test_few_missing_samples_leave_the_band_as_it_is():
@@ -191,6 +191,6 @@ def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_toget
     short = moved(500, 1.0)
     for resting in (0, 8):
         found = bands([short, *(moved(1500, 0.0) for _ in range(resting))])
-        [together] = [x for x in found if x.topic == "inputs together"]
+        [together] = [x for x in found if x.code == "excitation.inputs-together"]
         assert together.severity == "ok"
         assert together.sentence.startswith("no two inputs move together")

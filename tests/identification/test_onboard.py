@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import scipy.signal
+from heli_jax.identification.validation.missing_dynamics import explained_by
 
 from heli_jax import Flight, Free, Problem, fit, linear_model, models, naming
 from heli_jax.identification.estimation.data import data_of
@@ -12,7 +13,6 @@ from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.multistart import named_values
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.identification.validation.missing_dynamics import explained_by
 
 ROLL = linear_model("roll-flybarless")
 LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
@@ -68,7 +68,7 @@ def test_a_servo_and_two_delays_are_recovered():
         assert estimate.lower95 < value < estimate.upper95, name
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
-    assert not any("lacks dynamics" in note for note in found.notes)
+    assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
 
 @pytest.mark.slow
@@ -83,8 +83,8 @@ def test_a_servo_that_is_left_out_is_named():
     assert absorbed == pytest.approx(2.0 * ZETA / OMEGA, abs=4e-3)
     assert found.metrics["p"].vaf > 0.99
     assert not found.white
-    (note,) = (note for note in found.notes if "lacks dynamics" in note)
-    assert "lat still explains" in note
+    codes = ("dynamics.input-explains", "dynamics.residual-follows-input")
+    assert ("p", "lat") in {f.subjects for f in found.findings if f.code in codes}
     # Five starts, since a delay is free; all of them arrive.
     assert len(found.starts) == 5
     assert len({row.start["delay_lat"] for row in found.starts}) == 5

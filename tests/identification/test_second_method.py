@@ -80,10 +80,11 @@ def test_estimates_that_gusts_have_made_are_not_to_be_trusted(tmp_path):
     z = {n: (e.value - TRUTH[n]) / (e.sd or np.inf) for n, e in found.estimates.items()}
     assert max(abs(v) for v in z.values()) > 4.0  # or there is nothing to be said
     beside = with_second_method(problem, found)
-    assert beside.not_borne_out
+    assert beside.findings[-1].code == "agreement.second-method"
+    assert set(beside.findings[-1].subjects) <= set(TRUTH)
     assert beside.untrusted == tuple(TRUTH)
-    assert "does not bear" in beside.distrust
-    assert any("frequency-error, or filter-error" in note for note in beside.notes)
+    assert all(e.lower95 is None for e in beside.estimates.values())
+    assert beside.exit_code == 3
 
 
 ROTOR = {"tau_f": 0.09, "Lb": 95.0, "Blat": 0.12}
@@ -144,9 +145,9 @@ def test_a_disturbance_in_the_wrong_place_is_told_by_the_inputs(tmp_path, pushed
     if borne_out:
         assert not beside.untrusted
     else:
-        assert "tau_f" in beside.not_borne_out
-        assert "allows for any gusts" in beside.distrust
-        assert any("the disturbance acts elsewhere" in note for note in beside.notes)
+        assert "tau_f" in beside.findings[-1].subjects
+        assert beside.distrusts["tau_f"].code == "agreement.second-method"
+        assert beside.exit_code == 3
 
 
 def test_what_the_inputs_ask_for_is_told_in_any_colour():

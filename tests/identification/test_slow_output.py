@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
+from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.flights.slower import Timed, at_nearest
@@ -13,7 +14,6 @@ from heli_jax.identification.equation_error.baseline import baseline
 from heli_jax.identification.equation_error.smoothing import segments
 from heli_jax.identification.validation.feedback import untested
 from heli_jax.identification.validation.metrics import whiteness
-from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.report.figures.residuals import residual_correlation
 from heli_jax.report.figures.time_domain import response
 
@@ -71,7 +71,7 @@ def test_the_estimates_are_those_of_the_full_rate(fits):
         assert full.estimates[name].sd < one.sd
     assert slow.noise["flight 1/roll"] == pytest.approx(NOISE["roll"], rel=0.2)
     assert slow.whiteness["flight 1/roll"].white
-    assert slow.adequacy.adequate
+    assert slow.adequate
     assert slow.metrics["roll"].vaf > 0.99
 
 

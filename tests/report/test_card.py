@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 import numpy as np
-import pytest
 
 from heli_jax.finding import Finding
 from heli_jax.report.card import card, failed, shown, summary

@@ -128,9 +128,8 @@ def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path,
     brief = "closed loop without an instrument"
     untrusted = {"Ixx": {"code": "loop.no-instrument", "shift": None, "brief": brief}}
     a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
-    b = write_run(
-        tmp_path / "b", {"Ixx": (0.03, 0.001)}, untrusted=untrusted, distrust=sentence, adequate=False
-    )
+    against = {"untrusted": untrusted, "distrust": sentence, "adequate": False}
+    b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)}, **against)
     compared = compare_runs([a, b])
     assert compared.verdicts.rows[1][4] == f"The data determine all. {sentence}"
     assert f"b: {sentence}" in compared.notes
