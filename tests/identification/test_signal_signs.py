@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.signal
-from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 
 from heli_jax import Flight, linear_model
 from heli_jax.identification.validation.follows_response import Feedback
@@ -130,19 +129,6 @@ def a_stick_and_its_answer(late):
     u = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(N))
     answer = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
     return u, answer, np.roll(u, late), np.roll(answer, late), 1e-3 * rng.standard_normal(N)
-
-
-def test_a_stick_that_is_logged_late_is_no_missing_servo():
-    u, answer, u_late, answer_late, noise = a_stick_and_its_answer(8)
-    # What a fit leaves that takes the stick as it is logged, and one without the servo's lag.
-    cut = slice(50, None)
-    late = Left(DT, {"p": (answer - answer_late + noise)[cut]}, {"u": u_late[cut]})
-    servo = Left(DT, {"p": (answer_late - answer + noise)[cut]}, {"u": u[cut]})
-    [found] = missing_dynamics((late,))
-    assert (found.code, found.subjects) == ("dynamics.residual-precedes-input", ("p", "u"))
-    [found] = missing_dynamics((servo,))
-    assert (found.code, found.subjects) == ("dynamics.input-explains", ("p", "u"))
-    assert found.severity == "note"
 
 
 def test_an_output_before_its_stick_is_said_before_any_fit():

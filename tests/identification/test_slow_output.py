@@ -6,7 +6,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
-from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.flights.slower import Timed, at_nearest
@@ -86,24 +85,10 @@ def test_slow_residuals_that_are_not_white_are_told(fits):
 
 def test_feedback_that_cannot_be_told_is_said(fits):
     flight = record(0, slow=True)
-    (words,) = untested(problem(flight))
-    assert words == (
-        "flight 1: whether the inputs follow roll was not tested, since more than 20 % of the "
-        "samples are missing."
-    )
     alone = dataclasses.replace(flight, outputs={"roll": flight.outputs["roll"]})
-    (words,) = untested(problem(alone))
-    assert "roll was not tested" in words
-    assert "no other output was measured" in words
-
-
-def test_missing_dynamics_name_what_they_were_not_asked_of():
-    flight, rng = record(0, slow=True), np.random.default_rng(0)
-    left = {n: np.where(np.isnan(y), y, rng.normal(size=N)) for n, y in flight.outputs.items()}
-    (words,) = missing_dynamics((Left(DT, left, flight.inputs),))
-    assert words == (
-        "Whether the model lacks dynamics was not asked of roll, of which samples are missing."
-    )
+    for one in (flight, alone):
+        (said,) = untested(problem(one))
+        assert (said.code, said.subjects) == ("loop.not-tested", ("roll",))
 
 
 def test_an_equation_error_start_has_something_to_smooth():
