@@ -223,11 +223,12 @@ def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
         return (name, at, "", "", e.unit, percent(e.prior_share, 0))
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
-    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
+    if e.sd is None or not math.isfinite(e.sd):
         return (name, "not determined", "", "", e.unit, percent(e.prior_share, 0))
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)
-    return (name, value + at_bound, sd, _range(e), e.unit, percent(e.prior_share, 0))
+    interval = "not trusted" if e.lower95 is None or e.upper95 is None else _range(e)
+    return (name, value + at_bound, sd, interval, e.unit, percent(e.prior_share, 0))
 
 
 def print_check(check: Check) -> None:

@@ -125,7 +125,7 @@ ROOMS = (
     "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns",
     "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
     "agreement", "fit_notes", "judgement", "assemble", "further_starts", "fit", "likelier_hold",
-    "second_method", "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
+    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 
