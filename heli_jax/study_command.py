@@ -80,10 +80,13 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
 
 
 def _code(result: "xr.Dataset") -> int:
-    statuses = set(map(str, result["status"].to_numpy().ravel()))
-    if statuses - {"converged", "not-identifiable"}:
+    """The exit code of the worst fit."""
+    status, adequate, untrusted = (
+        set(map(str, result[n].to_numpy().ravel())) for n in ("status", "adequate", "untrusted")
+    )
+    if status - {"converged", "not-identifiable"} or "no" in adequate:
         return NOT_CONVERGED
-    return NOT_DETERMINED if "not-identifiable" in statuses else DONE
+    return NOT_DETERMINED if "not-identifiable" in status or untrusted - {""} else DONE
 
 
 def print_study(result: "xr.Dataset") -> None:

@@ -127,7 +127,7 @@ def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Find
         problem: with the starts.
         estimates: by name.
     """
-    turned = []
+    turned = {}
     for name, free in problem.free.items():
         e = estimates[name]
         # A delay says by itself what it means to be negative.
@@ -135,11 +135,11 @@ def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Find
             continue
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
         if surely and abs(free.start) > _NEAR_ZERO * abs(e.value):
-            turned.append(f"{name} ({free.start:.3g} to {e.value:.3g})")
+            turned[name] = f"{name} ({free.start:.3g} to {e.value:.3g})"
     if not turned:
         return []
     words = (
-        f"{listed(turned)} ended with the other sign than the start's: where that sign is known, "
+        f"{listed(list(turned.values()))} ended with the other sign than the start's: where that sign is known, "
         "an input or an output has the wrong one in the log, or an axis points the other way "
         "(`invert: true`)."
     )
