@@ -14,7 +14,7 @@ from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.excitation import sampling
-from heli_jax.report import figures, frequency
+from heli_jax.report import frequency
 from heli_jax.report.frequency import FittedFlight
 from tests.dynamics import whole_helicopter as oracle
 
@@ -89,14 +89,6 @@ def test_a_record_of_forward_flight_is_linearised_there(xcell):
     rates = model.vector_field(xcell, at.state, at.inputs)
     for name in ("dx", "dy", "dz", "dphi", "dtheta", "dpsi", "Omega"):
         assert abs(float(getattr(rates, name))) < 1e-6
-
-
-def test_the_figure_says_where(xcell):
-    model = models.helicopter("consistent")
-    flight = FittedFlight(model, xcell, NO_NUISANCE, signals({"z": np.zeros(N)}))
-    axes = figures.bode(flight, None, output="z", input="x_throttle")
-    said = " ".join(t.get_text() for t in axes[0].texts)
-    assert "linearised about the trim in hover" in said
 
 
 def test_a_linear_model_is_the_same_everywhere(bench30):

@@ -75,7 +75,8 @@ def test_noise_of_a_sensor_is_said_with_what_it_does():
     found = fitted(record(felt=False))
     [noisy] = [f for f in found.findings if f.code == "dynamics.noisy-input"]
     assert noisy.subjects == ("om",)
-    assert noisy.value == pytest.approx(NOISE, rel=0.1)
+    # The motion itself is not all slow.
+    assert noisy.value == pytest.approx(NOISE, rel=0.2)
     share = -noisy.shifts["Zo"] / found.estimates["Zo"].value
     # Of six records like this the mean of Zo is 0.83 % too small; a single one has an sd of 0.8 %.
     assert share == pytest.approx(-0.009, abs=0.004)
