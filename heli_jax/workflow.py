@@ -27,7 +27,6 @@ from heli_jax.identification.method_comparison import MethodComparison, compare_
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
-from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
 from heli_jax.report import files
@@ -169,14 +168,6 @@ def _fit_run(
             )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
-    with stage("beside another method", name="second method"):
-        fitted = with_second_method(
-            problem,
-            fitted,
-            undisturbed=lambda: configuration.by_method(config, problem, "frequency-error"),
-            max_steps=options.max_steps,
-            progress=progress,
-        )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     if out is not None and _long_intervals(config):

@@ -228,6 +228,17 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
     return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
 
 
+def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
+    """The step of the unknowns to where the whitened residual is least.
+
+    Args:
+        records: of all outputs.
+    """
+    e = _real(np.concatenate([record.e for record in records])[:, None])
+    J = _real(np.concatenate([record.J for record in records]))
+    return _steps(J, np.zeros((len(J), 2)), e)[1]
+
+
 class _Asked(NamedTuple):
     """What is asked of a residual; columns stand before the filter."""
 

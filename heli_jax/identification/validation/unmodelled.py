@@ -40,6 +40,8 @@ from heli_jax.identification.validation.score_test import (
     NARROW,
     Strongest,
     lines_of,
+    pulled_away,
+    step_to_least,
     strongest,
 )
 from heli_jax.numbers import p_value
@@ -87,7 +89,48 @@ def unmodelled(
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
             lacking.append(_said(at, e, name, one, J, flights))
-    return tuple(lacking)
+    return (*lacking, *_asked_otherwise(at, e, names, J))
+
+
+def _asked_otherwise(
+    at: Solution, e: Evaluation, names: Sequence[str], J: Mapping[tuple[int, str], np.ndarray]
+) -> list[Finding]:
+    """A finding where the whitened answer to the inputs asks for other values of the parameters.
+
+    Output error takes slow drift for slow modes; filter error learns also from how its disturbance
+    goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
+    """
+    k, lines, chances = len(at.layout.of_interest), [], []
+    for name in names:
+        of_output = []
+        for i, own in of_one_clock(at, e, name):
+            left, slopes = np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows]
+            of_output.append(lines_of(left, slopes, np.zeros((left.size, 0)), own.holes))
+        of_output = [one for one in of_output if one is not None]
+        if of_output:
+            chances.append(pulled_away(of_output, k))
+            lines += of_output
+    if not chances or min(chances) * len(chances) > IN_COLOUR:
+        return []
+    p = min(1.0, min(chances) * len(chances))
+    shifts = step_to_least(lines)[:k] * np.asarray(e.slopes)
+    words = (
+        f"The answer to the inputs asks for other values (p {p_value(p)}): a disturbance, drift or "
+        "the assumed place or spectrum of the gusts has moved the estimates. Compare method: "
+        "frequency-error (fit.also), or another disturbance (on, poles)."
+    )
+    return [
+        Finding(
+            "agreement.inputs-ask-otherwise",
+            "doubt",
+            words,
+            p,
+            f"probability of as much by chance, {IN_COLOUR:g}",
+            tuple(at.layout.of_interest),
+            dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
+            "the answer to the inputs asks for other values",
+        )
+    ]
 
 
 class _Asked(NamedTuple):
