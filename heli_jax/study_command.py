@@ -120,7 +120,7 @@ def print_study(result: "xr.Dataset") -> None:
     _print_scatter(flat, parameters)
     for names, runs in _distrusted(flat).items():
         more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-        tell(f"! Not to be trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
+        tell(f"! Not trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
     failures = _failures(flat)
     for run, sentence in failures[:_MOST_FAILURES]:
         tell(f"! {run}: {sentence}")
@@ -169,7 +169,7 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
 
 
 def _distrusted(flat: "xr.Dataset") -> dict[str, list[str]]:
-    """By the parameters that are not to be trusted the fits whose they are."""
+    """By the parameters whose intervals are not trusted the fits."""
     by_names: dict[str, list[str]] = {}
     for run, names in zip(flat["run"].to_numpy(), flat["untrusted"].to_numpy(), strict=True):
         if names:

@@ -41,7 +41,7 @@ class MethodResult(NamedTuple):
         words += [] if self.fit.adequate else ["not adequate"]
         words += ["intervals too narrow"] if self.fit.overconfident else []
         doubted = self.fit.untrusted
-        words += [f"{', '.join(doubted)} not to be trusted"] if doubted else []
+        words += [f"{', '.join(doubted)} not trusted"] if doubted else []
         return ", ".join(words) or "converged, adequate"
 
 

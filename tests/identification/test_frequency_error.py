@@ -313,7 +313,7 @@ def test_methods_are_laid_side_by_side(by):
     shifts = {"If": 2.0 * b.sd}
     doubt = Finding("dynamics.depends-on-amplitude", "doubt", "", shifts=shifts)
     doubted = dataclasses.replace(other, findings=(doubt,))
-    assert MethodResult("frequency-error", doubted, "", 0.5).word == "If not to be trusted"
+    assert MethodResult("frequency-error", doubted, "", 0.5).word == "If not trusted"
     written = methods_content(compared)["results"]
     assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
     assert written["filter-error"]["reason"] == "there is no disturbance"
