@@ -139,9 +139,9 @@ def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Find
     if not turned:
         return []
     words = (
-        f"{listed(list(turned.values()))} ended with the other sign than the start's: where that sign is known, "
-        "an input or an output has the wrong one in the log, or an axis points the other way "
-        "(`invert: true`)."
+        f"{listed(list(turned.values()))} ended with the other sign than the start's: "
+        "where that sign is known, an input or an output has the wrong one in the log, or an axis "
+        "points the other way (`invert: true`)."
     )
     return [Finding("signs.turned-from-start", "note", words, subjects=tuple(turned))]
 
