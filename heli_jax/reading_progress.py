@@ -9,6 +9,7 @@ from typing import Any
 
 from heli_jax.flights import progress
 from heli_jax.regular_file import size_words
+from heli_jax.terminal_table import plain_text
 
 _AFTER = 2.0
 """s: what is read sooner shows nothing"""
@@ -42,8 +43,7 @@ class _Bar:
             path: of the file.
             size: of it [bytes].
         """
-        # Names may hold anything; a terminal obeys escape sequences.
-        name = "".join(c if c.isprintable() else "?" for c in Path(path).name)[:40]
+        name = plain_text(Path(path).name)[:40]
         self.words, self.size, self.done = f"reading {name} ({size_words(size)})", size, 0
         self.timer = threading.Timer(_AFTER, self._show)
         self.timer.daemon = True

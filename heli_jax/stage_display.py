@@ -11,6 +11,7 @@ from typing import Any
 from heli_jax import stages
 from heli_jax.numbers import terminal_sentence
 from heli_jax.stages import Stage
+from heli_jax.terminal_table import plain_text
 
 _AFTER = 2.0
 """s: what is done sooner shows nothing"""
@@ -80,7 +81,7 @@ class _Display:
             stage = self.stack[-1]
         except IndexError:
             return ""
-        return terminal_sentence(in_words(stage, self.compiling, time.perf_counter()))
+        return plain_text(terminal_sentence(in_words(stage, self.compiling, time.perf_counter())))
 
     def _listen(self) -> None:
         # The first stage comes after JAX has been imported.

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 
 from heli_jax import reading_progress, stage_display
+from heli_jax.errors import shortened
 from heli_jax.stages import Note
 from heli_jax.terminal_table import tell
 
@@ -12,7 +13,7 @@ from heli_jax.terminal_table import tell
 def say(text: str) -> None:
     """Print a line."""
     # On standard error: standard output is for results, which may be piped on.
-    tell(f"heli-jax: {text}", sys.stderr)
+    tell(f"heli-jax: {shortened(text)}", sys.stderr)
 
 
 def say_notes(text: str) -> None:
