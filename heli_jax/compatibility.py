@@ -34,7 +34,7 @@ _AS_SHOWN = 1.5
 """times the noise that the sensors themselves show, up to which the noise that lets a channel drift
 is theirs: of a wrong unit or sign it is many times as much"""
 _RESTS = 0.5
-"""share of the prior in what is known of an error from which on the record does not determine it"""
+"""share of the priors in the variance of an error from which on the record does not determine it"""
 _NO_NOISE = 1e-9
 """part of a signal below which noise is none: no log has so many digits"""
 _LARGEST_SCALE = 0.1

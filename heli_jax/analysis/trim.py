@@ -378,8 +378,8 @@ def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
 def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:
     if model.limits is None:
         return
-    # A root of equations outside their range is a number without a machine, such as a steady
-    # descent in a vortex ring.
+    # A root of equations outside their range is a number without a machine, such as a flight with
+    # reversed flow over half of the rotor.
     limits = model.limits(params, result.state, result.inputs)
     outside = [name for name, out in limits.items() if bool(out)]
     if outside:
