@@ -5,6 +5,7 @@ import contextlib
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -62,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # With arguments of their own tests and programs call it, which an interrupt must not end.
     if arguments is None:
         import_path.pass_over_style_of_folder()
+        # Of numbers that a log or a configuration holds: the sentence says what is wrong.
+        warnings.filterwarnings(
+            "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
+        )
     with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
         for text in sys.argv[1:] if arguments is None else arguments:
             if any("\ud800" <= c <= "\udfff" for c in text):

@@ -119,8 +119,7 @@ def run_compatibility(
     progress("writing the report")
     further = run.supplementary._replace(sensors=_agreement(compatibility))
     run = workflow.write_report(dataclasses.replace(run, supplementary=further), out)
-    assert run.directory is not None
-    place = run.directory / FILE
+    place = (run.directory or Path(out)) / FILE
     with run_directory.whole_file(place, f"--out {place}") as part:
         part.write_text(as_yaml(compatibility.corrections), encoding="utf-8")
     return dataclasses.replace(compatibility, run=run)

@@ -1,7 +1,6 @@
 """Directories and files that appear whole or not at all."""
 
 import contextlib
-import errno
 import itertools
 import os
 import secrets
@@ -85,11 +84,9 @@ def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
     """Give the directory its name, or where another process has made it the next; returns it."""
     beside = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     place = path
-    # A rename takes the place of an empty directory.
-    while os.path.lexists(place):
-        if not or_beside:
-            raise FileExistsError(errno.EEXIST, "another process has made it meanwhile", str(path))
+    while or_beside and os.path.lexists(place):
         place = next(beside)
+    # It takes the place of an empty directory, and of nothing else.
     os.rename(temporary, place)
     return place
 

@@ -204,6 +204,19 @@ def test_names_of_a_log_cannot_leave_their_place(tmp_path: Path) -> None:
     assert made.flights[0].signals.outputs["p"].signal == "p"
 
 
+@pytest.mark.parametrize("mark", ["\x1b[2J", "\x7f", "\x9b", "\u202e", "\ufeff", "\U000e0001", "é"])
+def test_what_a_name_holds_is_read_back(
+    tmp_path: Path, mark: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write(tmp_path / f"run{mark}.csv", table(stick=f"aileron{mark} pwm"))
+    out = tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-flybarless"]) == 0
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    assert made.flights[0].log == log.name
+    printed = "".join(capsys.readouterr())
+    assert all(c.isprintable() for line in printed.split("\n") for c in line)
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

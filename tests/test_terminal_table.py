@@ -34,6 +34,15 @@ def test_every_cell_is_whole_and_lines_fit(
         assert max(map(len, lines)) <= width
 
 
+def test_a_terminal_obeys_no_name(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "p\x1b[2J\x07\x9b1m\u202e\u2066\u200f\u2028\udcff\tq"
+    tell(f"log {name}\nnext")
+    print_table(("channel", name), [(name, "1")])
+    out = capsys.readouterr().out
+    assert out.startswith("log p?[2J??1m???")
+    assert all(c.isprintable() for line in out.split("\n") for c in line)
+
+
 @pytest.mark.parametrize("width", [None, 80, 50])
 def test_sentences_begin_new_lines_between_words(
     width: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

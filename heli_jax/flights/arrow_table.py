@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from heli_jax.flights.digest import Digest
-from heli_jax.flights.parquet_table import ColumnTable
+from heli_jax.flights.parquet_table import ColumnTable, is_nested
 from heli_jax.flights.table import Budget, require_few_columns, wrong
 from heli_jax.regular_file import read_regular
 
@@ -75,5 +75,9 @@ class ArrowTable(ColumnTable):
         self._table = table
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
-        table = self._table if names is None else self._table.select(list(names))
-        yield from table.to_batches()
+        # By place: of two columns of one name `select` takes neither.
+        fields = enumerate(self._schema)
+        kept = [
+            i for i, f in fields if names is None or (f.name in names and not is_nested(f.type))
+        ]
+        yield from self._table.select(kept).to_batches()

@@ -132,16 +132,16 @@ class ColumnTable:
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text. Lists and records within cells are
         not read, so that all of their cells count as filled."""
-        nested = [_is_nested(f.type) for f in self._schema]
-        flat = [f.name for f, is_nested in zip(self._schema, nested, strict=True) if not is_nested]
+        nested = [is_nested(f.type) for f in self._schema]
+        flat = [f.name for f, n in zip(self._schema, nested, strict=True) if not n]
         data = self._read(flat if any(nested) else None)
         # By name: two columns may have the same, and come in an order of their own.
         columns: dict[str, list[pa.ChunkedArray]] = {}
         for name, x in zip(data.column_names, data.columns, strict=True):
             columns.setdefault(name, []).append(x)
         surveys = []
-        for name, is_nested in zip(self.names, nested, strict=True):
-            if is_nested:
+        for name, of_lists in zip(self.names, nested, strict=True):
+            if of_lists:
                 surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)
@@ -222,7 +222,8 @@ class ParquetTable(ColumnTable):
             raise wrong(self.path, "is no whole Parquet file")
 
 
-def _is_nested(kind: "pa.DataType") -> bool:
+def is_nested(kind: "pa.DataType") -> bool:
+    """Whether cells hold lists or records."""
     import pyarrow as pa
 
     return pa.types.is_nested(kind)
