@@ -242,7 +242,8 @@ def _fit(options: argparse.Namespace) -> int:
     experiment = workflow.load_config(options.config, options.set)
     run = workflow.run_fit(experiment, out, progress=options.say, began=began)
     if options.json:
-        print((out / "fit.json").read_text(encoding="utf-8"), end="")
+        assert run.directory is not None
+        print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
     else:
         output.print_fit(run)
     return _fit_code(run.fit)
@@ -296,10 +297,11 @@ def _windows(options: argparse.Namespace) -> int:
 
 
 def _compatibility(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import output
 
-    compatible = output.run_compatibility(options.config, options.out, options.set, options.say)
+    compatible = output.run_compatibility(options.config, out, options.set, options.say)
     return DONE if compatible else NOT_CONVERGED
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax import run_directory
 from heli_jax.config.frequency import missing_handling
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
@@ -129,13 +128,13 @@ def _print_handling(run: FitRun) -> None:
 
 
 def run_compatibility(
-    config: str, out: str | None, overrides: list[str], say: Callable[[str], None]
+    config: str, out: Path, overrides: list[str], say: Callable[[str], None]
 ) -> bool:
     """Compare a log's sensors and print what was found; whether they agree.
 
     Args:
         config: the configuration.
-        out: a new directory; runs/NAME-DATE-TIME unless given.
+        out: a new directory.
         overrides: of `--set`.
         say: for words as the work goes on.
 
@@ -145,8 +144,7 @@ def run_compatibility(
     # Here: of all commands only this one needs it.
     from heli_jax import compatibility
 
-    place = run_directory.default_directory(Path(config)) if out is None else Path(out)
-    result = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
+    result = compatibility.run_compatibility(config, out, overrides=overrides, progress=say)
     tell(result.verdict)
     for line in result.doubts:
         tell(f"! {line}")
@@ -156,8 +154,9 @@ def run_compatibility(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
     )
-    tell(f"corrections: {place / compatibility.FILE}")
-    tell(f"report: {place / 'report.html'}")
+    assert result.run.directory is not None
+    tell(f"corrections: {result.run.directory / compatibility.FILE}")
+    tell(f"report: {result.run.directory / 'report.html'}")
     return result.compatible
 
 

@@ -114,17 +114,17 @@ def run_fit(
 
     Args:
         config: of `load_config`, or the path of a configuration.
-        out: a new directory for the report, as of `write_report`; none is written unless given.
+        out: directory for the report, as of `write_report`; none is written unless given.
         progress: called with what the log's reader assumed and what is going on, in words.
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
         InputError: a log or something of the configuration is wrong, a log is too slow for the
-            model at its start values (docs/enough.md), or `out` exists.
+            model at its start values (docs/enough.md), or `out` cannot be written.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
-        run_directory.require_free(Path(out))  # before the work, not after it
+        out = run_directory.free_directory(Path(out))  # before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began, out)
@@ -384,7 +384,8 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
-    The directory appears whole or not at all. Returns the run with `directory` set.
+    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or with a
+    warning a numbered sibling where `out` exists.
 
     Args:
         run: of `run_fit`.
@@ -392,7 +393,7 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
         replaces: whether it stands there from an earlier moment of this run.
 
     Raises:
-        InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
+        InputError: `out` cannot be written to, or the extra `bayes` is missing.
         TypeError: `run` is no FitRun.
     """
     require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
@@ -403,7 +404,7 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
 
     out = Path(out)
     if not replaces:
-        run_directory.require_free(out)
+        out = run_directory.free_directory(out)
     started = time.perf_counter()
     # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
