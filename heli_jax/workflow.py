@@ -384,8 +384,8 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
-    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or with a
-    warning a numbered sibling where `out` exists.
+    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or where
+    that exists a numbered sibling, with a warning.
 
     Args:
         run: of `run_fit`.

@@ -114,7 +114,7 @@ def test_nothing_is_written_over(config, run):
         third = heli_jax.write_report(run, run.directory)
     for written, number in ((again, 2), (third, 3)):
         assert written.directory == run.directory.with_name(f"{run.directory.name}-{number}")
-        assert (run.directory / "report.html").exists()
+        assert (written.directory / "report.html").exists()
     assert (run.directory / "fit.json").read_bytes() == before
 
 
