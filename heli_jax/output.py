@@ -1,7 +1,7 @@
 """What the commands print and write."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +30,7 @@ def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     _print_outcome(fit)
-    # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
-    # stand in fit.json and the report.
-    shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
+    shown = {**fit.estimates, **_shown_nuisances(fit.nuisance)}
     stopped = fit.status == "not-converged"
     rows = [_row(name, e, stopped=stopped) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
@@ -91,6 +89,22 @@ def print_fit(run: FitRun) -> None:
         _print_baseline(run.baseline)
     if run.directory is not None:
         tell(f"report: {run.directory / 'report.html'}")
+
+
+def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Those of all flights, and offsets of inputs that are not zero, the most significant ones."""
+    # Others of a single flight ('flight/bias') are many and of interest to few: they stand in
+    # fit.json and the report. An offset says that a stick's zero is not the log's.
+    common = {n: e for n, e in nuisance.items() if "/" not in n}
+    offsets = {
+        n: abs(e.value) / e.sd
+        for n, e in nuisance.items()
+        if "/offset " in n and e.sd and e.lower95 is not None and e.upper95 is not None
+        # The interval is without zero.
+        if e.lower95 * e.upper95 > 0
+    }
+    most = sorted(offsets, key=lambda n: -offsets[n])[:_MOST_OFFSETS]
+    return common | {n: nuisance[n] for n in most}
 
 
 def _print_outcome(fit: Fit) -> None:
@@ -193,6 +207,8 @@ def _range(estimate: Estimate | Combination) -> str:
     return f"{shown[0]} to {shown[1]}"
 
 
+_MOST_OFFSETS = 4
+"""offsets of inputs that the terminal shows"""
 _GATES = 5
 """failed gates that the terminal names; the report has all"""
 _NEAR = 10.0

@@ -303,7 +303,7 @@ def is_unit(unit: str) -> bool:
 
 
 def as_text(exponents: Mapping[str, int]) -> str:
-    """The shortest SI unit with these exponents of kg, m, s, rad, A and K: `N m/rad`, `rad/s^2/V`."""
+    """The SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2`, `rad/s^2/V`."""
 
     def power(unit: str, n: int) -> str:
         return unit if n == 1 else f"{unit}^{n}"
@@ -314,7 +314,7 @@ def as_text(exponents: Mapping[str, int]) -> str:
 
 
 def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
-    """The exponents with volt in place of ampere and newton in place of kg, where these are less."""
+    """The exponents with volt for ampere and newton for kg, where these are less."""
     spellings = [dict(exponents)]
     volts = -exponents.get("A", 0)
     for volt in range(min(volts, 0), max(volts, 0) + 1):  # kg m^2/s^3/A
