@@ -1,9 +1,9 @@
 """What the site takes from the code when it is built, so that no page can lag behind it.
 
-A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`, or `console`,
-which runs the block of commands below it and shows what each prints. Exit codes have to be 0, unless
-`$ echo $?` follows. Beside them stand the figures and the report of the demo, of which nothing is kept
-in the repository.
+A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`, or
+`console`, which runs the block of commands below it and shows what each prints; exit codes have to
+be 0, unless `$ echo $?` follows. Beside them stand the figures and the report of the demo, of which
+nothing is kept in the repository.
 """
 
 import contextlib
