@@ -141,8 +141,7 @@ def _fit_run(
 ) -> FitRun:
     """`run_fit` without its report; before intervals that take long, that of the fit alone."""
     with_findings = out is not None
-    # A reader shows how far it is by itself.
-    with stage("reading the log", name="reading", shown=False):
+    with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # One fit of it alone would look like the study's result.
         if config.config.study is not None:
