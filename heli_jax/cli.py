@@ -317,10 +317,11 @@ def _windows(options: argparse.Namespace) -> int:
 
 
 def _compatibility(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import output
 
-    compatible = output.run_compatibility(options.config, options.out, options.set, options.say)
+    compatible = output.run_compatibility(options.config, out, options.set, options.say)
     return DONE if compatible else NOT_CONVERGED
 
 

@@ -91,15 +91,16 @@ def run_compatibility(
 
     Args:
         config: a configuration with `model: kinematics`.
-        out: a new directory for the report and compatibility.yaml; none is written unless given.
+        out: directory for the report and compatibility.yaml, a numbered sibling where it exists;
+            none is written unless given.
         overrides: values in place of the file's, as of `load_config`.
         progress: called with what is going on, in words.
 
     Raises:
-        InputError: a log or something of the configuration is wrong, or `out` exists.
+        InputError: a log or something of the configuration is wrong, or `out` cannot be written.
     """
     if out is not None:
-        run_directory.require_free(Path(out))
+        out = run_directory.free_directory(Path(out))
     experiment = workflow.load_config(config, overrides)
     if not is_kinematic(experiment.model):
         raise InputError(
@@ -119,7 +120,8 @@ def run_compatibility(
     progress("writing the report")
     further = run.supplementary._replace(sensors=_agreement(compatibility))
     run = workflow.write_report(dataclasses.replace(run, supplementary=further), out)
-    place = (run.directory or Path(out)) / FILE
+    assert run.directory is not None
+    place = run.directory / FILE
     with run_directory.whole_file(place, f"--out {place}") as part:
         part.write_text(as_yaml(compatibility.corrections), encoding="utf-8")
     return dataclasses.replace(compatibility, run=run)

@@ -113,17 +113,17 @@ def run_fit(
 
     Args:
         config: of `load_config`, or the path of a configuration.
-        out: a new directory for the report, as of `write_report`; none is written unless given.
+        out: directory for the report, as of `write_report`; none is written unless given.
         progress: called with what the log's reader assumed and what is going on, in words.
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
         InputError: a log or something of the configuration is wrong, a log is too slow for the
-            model at its start values (docs/enough.md), or `out` exists.
+            model at its start values (docs/enough.md), or `out` cannot be written.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
-        run_directory.require_free(Path(out))  # before the work, not after it
+        out = run_directory.free_directory(Path(out))  # before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began, out)
@@ -165,8 +165,7 @@ def _fit_run(
 ) -> FitRun:
     """`run_fit` without its report; before intervals that take long, that of the fit alone."""
     with_findings = out is not None
-    # A reader shows how far it is by itself.
-    with stage("reading the log", name="reading", shown=False):
+    with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # One fit of it alone would look like the study's result.
         if config.config.study is not None:
@@ -404,19 +403,19 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
-    The directory appears whole or not at all. Returns the run with `directory` set.
+    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or where
+    that exists a numbered sibling, with a warning.
 
     Args:
         run: of `run_fit`.
         out: the directory.
 
     Raises:
-        InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
+        InputError: `out` cannot be written to, or the extra `bayes` is missing.
         TypeError: `run` is no FitRun.
     """
     require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
-    run_directory.require_free(Path(out))
-    return _write(run, Path(out))
+    return _write(run, run_directory.free_directory(Path(out)))
 
 
 def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
