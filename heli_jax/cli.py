@@ -24,7 +24,7 @@ from heli_jax.interrupts import resumable
 from heli_jax.stages import Note
 
 if TYPE_CHECKING:
-    from heli_jax.identification.result import Fit
+    pass
 
 # 2 is what argparse ends with.
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
@@ -278,22 +278,11 @@ def _fit(options: argparse.Namespace) -> int:
         output.print_fit(run)
     if failure is not None:
         raise failure
-    return _fit_code(run.fit)
+    return run.fit.exit_code
 
 
 def _status_code(status: str) -> int:
     return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(status, NOT_CONVERGED)
-
-
-def _fit_code(fitted: "Fit") -> int:
-    """The exit code of a fit."""
-    code = _status_code(fitted.status)
-    # Converged onto a model worse than a constant, or one that foretells no better: a script that
-    # looks at the code alone must not take these numbers.
-    if code == DONE and (fitted.adequacy.less_than_mean or fitted.held_out_worse):
-        return NOT_CONVERGED
-    # An optimum that gusts have made looks as determined as any other.
-    return NOT_DETERMINED if code == DONE and fitted.not_borne_out else code
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -329,10 +318,11 @@ def _windows(options: argparse.Namespace) -> int:
 
 
 def _compatibility(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import output
 
-    compatible = output.run_compatibility(options.config, options.out, options.set, options.say)
+    compatible = output.run_compatibility(options.config, out, options.set, options.say)
     return DONE if compatible else NOT_CONVERGED
 
 

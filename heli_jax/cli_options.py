@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
-    "asked; 4 an optimiser did not converge, the model is not adequate and explains less than the "
-    "mean of what was measured, or sensors are not compatible; 130 interrupted."
+    "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
+    "adequate, or sensors are not compatible; 130 interrupted."
 )
 """what `--help` ends with: of every command"""
 

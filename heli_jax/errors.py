@@ -25,6 +25,21 @@ class InputError(ValueError):
         super().__init__(shortened(text))
 
 
+class VehicleError(ValueError):
+    """A vehicle lacks a constant that its model reads, or has one that cannot be.
+
+    Its argument is the sentence without its place: a configuration knows the vehicle's file.
+    """
+
+    @property
+    def problem(self) -> str:
+        """What is wrong."""
+        return self.args[0]
+
+    def __str__(self) -> str:
+        return f"vehicle: {self.problem}"
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
     # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is

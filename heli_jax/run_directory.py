@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +22,25 @@ _finished: list[Path] = []
 def default_directory(config: Path) -> Path:
     """runs/NAME-DATE-TIME for a configuration NAME.yaml."""
     return Path("runs") / f"{config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def free_directory(path: Path) -> Path:
+    """`path`, or with a warning the first of path-2, path-3, ... that does not exist.
+
+    For functions: a notebook's cell runs twice. Commands refuse what exists (`require_free`).
+
+    Raises:
+        InputError: the parent cannot hold a new directory.
+    """
+    free = path
+    for number in itertools.count(2):
+        if not os.path.lexists(free):
+            break
+        free = path.with_name(f"{path.name}-{number}")
+    if free != path:
+        warnings.warn(f"{path} exists already: this run goes to {free}", stacklevel=3)
+    require_free(free)
+    return free
 
 
 def require_free(path: Path, otherwise: str = "") -> None:

@@ -19,6 +19,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, require_kind
+from heli_jax.finding import Finding, note
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -26,10 +27,8 @@ from heli_jax.identification.method_comparison import MethodComparison, compare_
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
-from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
@@ -114,17 +113,17 @@ def run_fit(
 
     Args:
         config: of `load_config`, or the path of a configuration.
-        out: a new directory for the report, as of `write_report`; none is written unless given.
+        out: directory for the report, as of `write_report`; none is written unless given.
         progress: called with what the log's reader assumed and what is going on, in words.
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
         InputError: a log or something of the configuration is wrong, a log is too slow for the
-            model at its start values (docs/enough.md), or `out` exists.
+            model at its start values (docs/enough.md), or `out` cannot be written.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
-        run_directory.require_free(Path(out))  # before the work, not after it
+        out = run_directory.free_directory(Path(out))  # before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began, out)
@@ -166,8 +165,7 @@ def _fit_run(
 ) -> FitRun:
     """`run_fit` without its report; before intervals that take long, that of the fit alone."""
     with_findings = out is not None
-    # A reader shows how far it is by itself.
-    with stage("reading the log", name="reading", shown=False):
+    with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # One fit of it alone would look like the study's result.
         if config.config.study is not None:
@@ -177,8 +175,8 @@ def _fit_run(
             )
         problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
     try:
@@ -194,14 +192,6 @@ def _fit_run(
             )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
-    with stage("beside another method", name="second method"):
-        fitted = with_second_method(
-            problem,
-            fitted,
-            undisturbed=lambda: configuration.by_method(config, problem, "frequency-error"),
-            max_steps=options.max_steps,
-            progress=progress,
-        )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     kept = None
@@ -244,7 +234,8 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
     returns its directory."""
     words = "The further intervals that were asked for are not in it: the run was interrupted."
     # Its own times: the run's go on.
-    fitted = replace(run.fit, notes=(*run.fit.notes, words), timing=dict(run.fit.timing))
+    findings = (*run.fit.findings, note("uncertainty.interrupted", words))
+    fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
     with stage("writing the fit", name="report before further intervals"):
         directory = _written(replace(run, fit=fitted), out, progress).directory
     progress(f"the fit is in {directory}; what else was asked for comes into it")
@@ -283,8 +274,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     """
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     try:
         with stage("what the log can determine"):
             return check(problem)
@@ -412,19 +403,19 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
-    The directory appears whole or not at all. Returns the run with `directory` set.
+    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or where
+    that exists a numbered sibling, with a warning.
 
     Args:
         run: of `run_fit`.
         out: the directory.
 
     Raises:
-        InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
+        InputError: `out` cannot be written to, or the extra `bayes` is missing.
         TypeError: `run` is no FitRun.
     """
     require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
-    run_directory.require_free(Path(out))
-    return _write(run, Path(out))
+    return _write(run, run_directory.free_directory(Path(out)))
 
 
 def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:

@@ -83,6 +83,13 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     assert out.read_text() == before
 
 
+def test_a_model_of_one_s_own_beside_the_configuration(tmp_path: Path) -> None:
+    assert cli.main(["new-model", "pendulum", "--out", str(tmp_path / "own")]) == 0
+    log, out = write(tmp_path / "run.csv", table("theta_deg")), tmp_path / "own" / "mine.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "pendulum:model"]) == 0
+    assert yaml_file.read_mapping(out)["model"] == "pendulum:model"
+
+
 def test_what_only_the_user_knows_is_refused_until_it_is_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

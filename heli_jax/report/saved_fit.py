@@ -44,21 +44,23 @@ class SavedFit(NamedTuple):
     validation: dict[str, Metrics]
     """of the simulation, over the flights held out, by output"""
     signals: tuple[Signals, ...]
-    notes: tuple[str, ...]
     content: dict[str, Any]
     """all of fit.json"""
 
     @property
     def adequacy(self) -> str:
-        """`yes`, `in size only (...)`, `no (...)` and so on, as the fit said it."""
+        """`yes`, `no (...)` or `not judged`, as the fit had it."""
         return adequacy_of(self.content)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences of the findings."""
+        return tuple(f["sentence"] for f in self.content.get("findings", ()))
+
+    @property
     def distrust(self) -> str:
-        """`Not to be trusted: ...`, as the fit said it; empty where nothing speaks against it."""
-        names = ", ".join(self.content.get("untrusted") or ())
-        # Fits of earlier versions have the names alone.
-        return self.content.get("distrust") or (f"Not to be trusted: {names}." if names else "")
+        """`Not trusted: ...`, as the fit had it; empty where nothing speaks against it."""
+        return self.content.get("distrust") or ""
 
     @property
     def overconfident(self) -> bool:
@@ -121,7 +123,6 @@ def load_fit(directory: str | Path) -> SavedFit:
             metrics={n: _metrics(m) for n, m in content["metrics"].items()},
             validation={n: _metrics(m) for n, m in content["validation"].items()},
             signals=_signals(directory / "signals.csv", content),
-            notes=tuple(content["notes"]),
             content=content,
         )
     except InputError:

@@ -14,6 +14,7 @@ import sys
 import threading
 from typing import IO
 
+from heli_jax import import_path
 from heli_jax.studies.point import Outcome, Task, fit_point
 
 SCRATCH = "HELI_JAX_STUDY_SCRATCH"

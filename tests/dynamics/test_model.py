@@ -151,6 +151,8 @@ def test_own_model_by_import_path(tmp_path):
     [
         ("rol", "unknown model 'rol'; did you mean 'roll'"),
         ("roll_on_stand", "did you mean 'roll-on-stand'"),
+        ("roll-flybarless", "did you mean '{linear: roll-flybarless}'"),
+        ("mine.yaml", "did you mean '{linear: mine.yaml}'"),
         ("", "unknown model ''"),
         ("no_such_module:model", "cannot import 'no_such_module'"),
         ("tests.dynamics.test_model:nothing", "expected a heli_jax.Model at .*, got nothing"),

@@ -4,8 +4,6 @@ import gzip
 import hashlib
 import io
 import struct
-import sys
-import time
 import zlib
 
 import h5py
@@ -17,9 +15,9 @@ import pyarrow.parquet
 import pytest
 import scipy.io
 
-from heli_jax import reading_progress
+from heli_jax import stages
 from heli_jax.errors import InputError
-from heli_jax.flights import csv_on_disk, csv_table, csv_text, parquet_table, progress
+from heli_jax.flights import csv_on_disk, csv_table, csv_text, parquet_table
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.open_log import open_log, open_table
 from tests.flights import log_writers as writers
@@ -147,50 +145,29 @@ def test_columns_that_are_not_plain_are_found_among_those_that_are(tmp_path):
 
 class Heard:
     def __init__(self):
-        self.calls = []
+        self.stages = []
 
-    def begin(self, path, size):
-        self.calls.append(("begin", path, size))
+    def begin(self, stage):
+        self.stages.append(stage)
 
-    def advance(self, done):
-        self.calls.append(("advance", done))
-
-    def end(self):
-        self.calls.append(("end",))
+    def end(self, stage):
+        pass
 
 
 def test_an_observer_hears_of_a_file(tmp_path):
     messages = {"ATT": (129, "Qc", "TimeUS,Roll")}
     data = writers.dataflash(messages, [("ATT", (1000 * i, i)) for i in range(50)])
-    path = tmp_path / "log.bin"
+    path = tmp_path / "a\x1b[2Jlog.bin"
     path.write_bytes(data)
     heard = Heard()
-    with progress.observed_by(heard):
+    with stages.observed_by(heard):
         open_log(path)
         with pytest.raises(InputError):
             open_log(tmp_path / "none.bin")
     open_log(path)
-    assert heard.calls == [("begin", str(path), len(data)), ("advance", 0), ("end",)]
-
-
-def test_a_bar_is_for_terminals_and_for_what_takes_long(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    shown = Terminal()
-    monkeypatch.setattr(sys, "stderr", shown)
-    monkeypatch.setattr(reading_progress, "_AFTER", 0.05)
-    monkeypatch.setenv("TERM", "xterm")
-    with reading_progress.on_terminal(), progress.reading("logs/a\x1b[2Jflight.bin", 10**8):
-        progress.advance(5 * 10**7)
-        time.sleep(0.4)
-    assert "reading a?[2Jflight.bin (100 MB)" in shown.getvalue()
-    piped = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", piped)
-    with reading_progress.on_terminal(), progress.reading("flight.bin", 10**8):
-        time.sleep(0.1)
-    assert not piped.getvalue()
+    [stage] = heard.stages
+    assert (stage.total, stage.first is not None) == (len(data), True)
+    assert stage.words.isprintable()
 
 
 LARGE = "t,x [deg],note\ns,deg,-\n" + "".join(f"{i / 64},{i * i / 7:.17g},-\n" for i in range(3000))
