@@ -1,12 +1,11 @@
 """What the commands print and write."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heli_jax import run_directory
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
 from heli_jax.identification.equation_error.baseline import Baseline
@@ -31,9 +30,7 @@ def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     _print_outcome(fit)
-    # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
-    # stand in fit.json and the report.
-    shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
+    shown = {**fit.estimates, **_shown_nuisances(fit.nuisance)}
     stopped = fit.status == "not-converged"
     rows = [_row(name, e, stopped=stopped) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
@@ -94,6 +91,22 @@ def print_fit(run: FitRun) -> None:
         tell(f"report: {run.directory / 'report.html'}")
 
 
+def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Those of all flights, and offsets of inputs that are not zero, the most significant ones."""
+    # Others of a single flight ('flight/bias') are many and of interest to few: they stand in
+    # fit.json and the report. An offset says that a stick's zero is not the log's.
+    common = {n: e for n, e in nuisance.items() if "/" not in n}
+    offsets = {
+        n: abs(e.value) / e.sd
+        for n, e in nuisance.items()
+        if "/offset " in n and e.sd and e.lower95 is not None and e.upper95 is not None
+        # The interval is without zero.
+        if e.lower95 * e.upper95 > 0
+    }
+    most = sorted(offsets, key=lambda n: -offsets[n])[:_MOST_OFFSETS]
+    return common | {n: nuisance[n] for n in most}
+
+
 def _print_outcome(fit: Fit) -> None:
     """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
     text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
@@ -124,13 +137,13 @@ def _print_handling(run: FitRun) -> None:
 
 
 def run_compatibility(
-    config: str, out: str | None, overrides: list[str], say: Callable[[str], None]
+    config: str, out: Path, overrides: list[str], say: Callable[[str], None]
 ) -> bool:
     """Compare a log's sensors and print what was found; whether they agree.
 
     Args:
         config: the configuration.
-        out: a new directory; runs/NAME-DATE-TIME unless given.
+        out: a new directory.
         overrides: of `--set`.
         say: for words as the work goes on.
 
@@ -140,8 +153,7 @@ def run_compatibility(
     # Here: of all commands only this one needs it.
     from heli_jax import compatibility
 
-    place = run_directory.default_directory(Path(config)) if out is None else Path(out)
-    result = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
+    result = compatibility.run_compatibility(config, out, overrides=overrides, progress=say)
     tell(result.verdict)
     for line in result.doubts:
         tell(f"! {line}")
@@ -151,8 +163,9 @@ def run_compatibility(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
     )
-    tell(f"corrections: {place / compatibility.FILE}")
-    tell(f"report: {place / 'report.html'}")
+    assert result.run.directory is not None
+    tell(f"corrections: {result.run.directory / compatibility.FILE}")
+    tell(f"report: {result.run.directory / 'report.html'}")
     return result.compatible
 
 
@@ -189,6 +202,8 @@ def _range(estimate: Estimate | Combination) -> str:
     return f"{shown[0]} to {shown[1]}"
 
 
+_MOST_OFFSETS = 4
+"""offsets of inputs that the terminal shows"""
 _GATES = 5
 """failed gates that the terminal names; the report has all"""
 _NEAR = 10.0

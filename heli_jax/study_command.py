@@ -71,7 +71,7 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
         # Without a scheduler --workers are processes of our own, for which dask is not needed.
         dask = None
         if options.scheduler:
-            dask = s.enter_context(cli_options.dask_client(options, study.path))
+            dask = s.enter_context(cli_options.dask_client(options))
         carrying = studies.Options(options.resume, workers, dask, options.reports, progress, say)
         result = studies.run(study, out, carrying)
     print_study(result)

@@ -38,13 +38,16 @@ ALLOWED = {
     "summaries": {"naming", "numbers"},
     "exports": {"naming", "summaries"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
-    "flights": {"numbers", "errors", "regular_file", "units", "summaries", "yaml_file"},
+    "flights": {
+        "stages", "numbers", "errors", "regular_file", "units", "summaries", "yaml_file",
+        "import_path",
+    },
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors", "pickled"},
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
-    "models": {"dynamics", *BASE},
+    "models": {"linear_models", "dynamics", *BASE},
     "fused": {"numerics"},
     "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
     "report": {
@@ -55,7 +58,7 @@ ALLOWED = {
 # Entry points may import everything below them, never the command line.
 ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
-    "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
+    "log_output", "log_windows", "log_responses", "cli_options", "interrupts",
     "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
     "file_commands", "run_commands", "stage_display", "terminal", "studies", "study_command",
     "sweep_workflow",

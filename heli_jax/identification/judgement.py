@@ -99,7 +99,7 @@ def end_of(problem: Problem, search: Search, optimum: RelaxedOptimum, e: Evaluat
         Solution(search.layout, search.data, optimum.noise, optimum.best.z),
         e,
         signals,
-        whiteness_of(signals, e, problem.training),
+        whiteness_of(signals, e, problem.training, search.layout),
         correlated_residuals(signals),
         absent_names(search.layout, optimum),
     )

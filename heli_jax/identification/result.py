@@ -38,7 +38,7 @@ class Estimate(NamedTuple):
     start: float
     """the initial guess"""
     prior_share: float
-    """share of the prior in the posterior precision, 0 to 1"""
+    """share of the posterior variance that the priors explain, 0 to 1"""
     at_bound: bool
     sd_white: float | None = None
     """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""

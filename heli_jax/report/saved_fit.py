@@ -125,10 +125,13 @@ def load_fit(directory: str | Path) -> SavedFit:
             signals=_signals(directory / "signals.csv", content),
             content=content,
         )
-    except (KeyError, TypeError, AttributeError) as e:  # a key is missing, or holds another kind
+    except InputError:
+        raise
+    # A key is missing or holds another kind, a row is cut off, a cell is no number.
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, csv.Error) as e:
         raise InputError(
-            f"{directory / 'fit.json'}: expected what heli-jax fit writes, got a file without a "
-            f"usable {e}"
+            f"{directory}: expected fit.json and signals.csv as heli-jax fit writes them, got "
+            f"other content ({type(e).__name__}: {e})"
         ) from e
 
 
@@ -136,7 +139,7 @@ def _content(path: Path) -> dict[str, Any]:
     data = read_regular(path, "the fit.json of a run directory", _LIMIT_BYTES)
     try:
         content = json.loads(data)
-    except ValueError as e:  # no JSON, or no text
+    except (ValueError, RecursionError) as e:  # no JSON, or no text
         raise InputError(f"{path}: expected JSON, got {str(e)[:80]}") from e
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object, got a {type(content).__name__}")
@@ -147,7 +150,14 @@ def _estimate(saved: Mapping[str, Any]) -> Estimate:
     # By name and these alone: a file may have keys that a later version added.
     fields = {name: saved[name] for name in Estimate._fields}
     # What the data do not determine has no number in the file.
-    return Estimate(**{**fields, "value": _number(fields["value"])})
+    numbers = {n: v if v is None else float(v) for n, v in fields.items() if n in _NUMBERS}
+    unit = str.join("", (fields["unit"],))  # a text
+    return Estimate(**{**fields, **numbers, "unit": unit, "value": _number(fields["value"])})
+
+
+_NUMBERS = tuple(
+    name for name, kind in Estimate.__annotations__.items() if kind in (float, float | None)
+)
 
 
 def _metrics(saved: Mapping[str, float | None]) -> Metrics:

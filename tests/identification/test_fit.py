@@ -95,6 +95,13 @@ def test_prior_on_a_makes_it_well_posed(bench_run):
     assert found.status == "converged"
     a = found.estimates["a"]
     assert a.prior_share > 0.95
+    # Ixx and If have no prior, and are known by that of a: their variances are its, but for those
+    # of a/Ixx and a/If.
+    for name in ("Ixx", "If"):
+        relative = found.estimates[name].sd / found.estimates[name].value
+        wanted = a.prior_share * (a.sd / a.value / relative) ** 2
+        assert found.estimates[name].prior_share == pytest.approx(wanted, rel=0.05)
+        assert 0.5 < wanted < 1.0
     assert 0.25 < a.sd < 0.35
     for name in ("Ixx", "If"):
         assert abs(found.estimates[name].value - BENCH[name]) < 4.0 * found.estimates[name].sd

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heli_jax import cli, compare_runs
+from heli_jax import cli, compare_runs, load_fit
 from heli_jax.errors import InputError
 from heli_jax.report import compared_page
 
@@ -205,6 +205,41 @@ def test_wrong_runs_end_in_a_sentence(
     assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(InputError, match="two runs"):
         compare_runs([tmp_path / "a"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"parameters": {"Ixx": 3}},
+        {"parameters": {"Ixx": {"value": "1e"}}},
+        {"metrics": {"p": {"vaf": []}}},
+        {"data": [{"flight": "flight 1", "sha256": "a", "window": 3}, 7]},
+        {"data": 7},
+        {"verdict": "all"},
+        {"notes": None},
+        {"untrusted": 5},
+        {"determined_combinations": [3]},
+        {"residuals": [1]},
+    ],
+)
+def test_a_damaged_run_ends_in_a_sentence(tmp_path: Path, change: dict[str, object]) -> None:
+    good = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
+    bad = write_run(tmp_path / "b", {"Ixx": (0.02, 0.001)}, **change)
+    with pytest.raises(InputError):
+        compare_runs([good, bad])
+    with pytest.raises(InputError):
+        compare_runs([bad, good])
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [b"", b"flight,time\n\n", b"flight,time,p\na,1\n", b"flight,time,p\na,x,y\n", b"\xff"],
+)
+def test_damaged_signals_end_in_a_sentence(tmp_path: Path, signals: bytes) -> None:
+    run = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
+    (run / "signals.csv").write_bytes(signals)
+    with pytest.raises(InputError):
+        load_fit(run)
 
 
 def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None:

@@ -42,9 +42,11 @@ def prior_note(problem: Problem, fit: Fit) -> str:
     ]
     if not names:
         return ""
+    others = [n for n, free in problem.free.items() if free.prior is not None]
+    of = f"the prior of {' and '.join(others)} and " if others else ""
     return (
-        f"{', '.join(names)}: the prior share is that of the weak priors of biases, initial states "
-        "and input offsets (ten times the signal), since no prior was given."
+        f"{', '.join(names)}: the prior share is that of {of}the weak priors of biases, initial "
+        "states and input offsets (ten times the signal)."
     )
 
 
