@@ -73,6 +73,7 @@ from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
     RATE_AGAINST_ANGLE,
+    RATE_SCALE,
     against_start,
     sticks_of,
 )
@@ -302,12 +303,15 @@ def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -
     doubts = doubtful_inputs(*at_start)
     if not estimate.adequate:
         doubts += against_start(*at_start)
-    findings = [
-        f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
-        if f.code == UNIT_IN_DOUBT and not f.denies and estimate.status != "not-converged"
-        else f
-        for f in (*doubts, *estimate.findings)
-    ]
+    findings = []
+    for f in (*doubts, *estimate.findings):
+        if estimate.status != "not-converged" and not f.denies:
+            if f.code == UNIT_IN_DOUBT:
+                f = f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
+            elif f.code == RATE_SCALE:
+                # A scale, a unit or the clock is off: each parameter depends on one of them.
+                f = f._replace(distrusts=tuple(estimate.estimates))
+        findings.append(f)
     return dataclasses.replace(estimate, findings=tuple(findings))
 
 
