@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,31 +143,41 @@ def rounded(value: Any) -> Any:
     return value
 
 
-def run_group(names: Sequence[str], shared: str, within: Any = None) -> list[tuple[str, Result]]:
+Entry = tuple[str, str]
+"""a case, and the way in which it runs: `` as it is, others as `corpus_matrix.way` has them"""
+
+
+def run_group(
+    entries: Sequence[Entry], shared: str, way: Callable[[str], Any] | None = None
+) -> list[tuple[Entry, Result]]:
     """Cases of one process, one after another: they share what was compiled.
 
     Args:
-        names: of the cases.
+        entries: which, and in which way.
         shared: the folder of records that are no part of the project.
-        within: called with a case, makes the context in which it runs; nothing unless given.
+        way: of a way's name, makes the context of a case, which yields what its result has too.
     """
-    # 64 bit before anything is traced: cases of Problems do not pass the command line.
     import jax
     from corpus_cases import cases
 
     from heli_jax import cli
 
+    # 64 bit before anything is traced: cases of Problems do not pass the command line.
     cli._prepare_jax()
     known, done = {c.name: c for c in cases(Path(shared))}, []
-    for name in names:
-        with within(known[name]) if within else contextlib.nullcontext():
+    for name, how in entries:
+        with way(how) if way and how else contextlib.nullcontext({}) as added:
             try:
                 result = run(known[name])
             except Exception:
                 # A fault of ours is a result too: it differs from what was stored.
                 result = {"failed": traceback.format_exc().strip().splitlines()[-1]}
-        done.append((name, result))
-        print(f"{name}: {in_words(result)}", file=sys.stderr, flush=True)
+        done.append(((name, how), {**result, **added}))
+        print(
+            f"{' without '.join(filter(None, (name, how)))}: {in_words(result)}",
+            file=sys.stderr,
+            flush=True,
+        )
         maps = Path("/proc/self/maps")
         if maps.exists() and maps.read_bytes().count(b"\n") > MAPPED:
             jax.clear_caches()
@@ -185,19 +195,29 @@ def in_words(result: Result) -> str:
 
 
 def run_all(chosen: Sequence[Any], shared: Path, jobs: int) -> dict[str, Result]:
-    """All cases, in the order of the list; groups of them in processes of their own."""
-    groups: dict[str, list[str]] = {}
-    for case in chosen:
-        groups.setdefault(case.group, []).append(case.name)
+    """All cases as they are, in the order of the list."""
+    results = run_entries([(case, "") for case in chosen], shared, jobs)
+    return {case.name: results[case.name, ""] for case in chosen}
+
+
+def run_entries(
+    entries: Sequence[tuple[Any, str]],
+    shared: Path,
+    jobs: int,
+    way: Callable[[str], Any] | None = None,
+) -> dict[Entry, Result]:
+    """Cases in ways; groups of them in processes of their own."""
+    groups: dict[str, list[Entry]] = {}
+    for case, how in entries:
+        groups.setdefault(case.group, []).append((case.name, how))
+    arguments = [(group, str(shared), way) for group in groups.values()]
     if jobs == 1:
-        done = [run_group(names, str(shared)) for names in groups.values()]
+        done = [run_group(*each) for each in arguments]
     else:
-        arguments = [(names, str(shared)) for names in groups.values()]
         # A process a group: memory and compiled programs go with it.
         with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=1) as pool:
             done = pool.starmap(run_group, arguments, chunksize=1)
-    results = dict(one for group in done for one in group)
-    return {case.name: results[case.name] for case in chosen}
+    return dict(one for group in done for one in group)
 
 
 def differences(before: Result, after: Result) -> Iterator[str]:

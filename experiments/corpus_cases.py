@@ -4,8 +4,7 @@ import contextlib
 import functools
 import io
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ import numpy as np
 import yaml
 import zoo
 from corpus import ROOT, Result, code_of, coded, of_fit
+from corpus_records import RIGS, Rig, roll, written
 
 CONFIGS = ROOT / "configs"
 
@@ -126,7 +126,7 @@ def frf_config(config: Path, *more: str) -> Result:
     if not found:
         return refused(ended, names)
     numbers: dict[str, Any] = {}
-    with xr.open_dataset(found[0], engine="h5netcdf") as data:
+    with xr.open_dataset(found[0]) as data:
         for variable in data.data_vars:
             values = np.asarray(data[variable].values)
             if values.dtype.kind != "f" or not values.size:
@@ -204,7 +204,7 @@ def shipped_cases(shared: Path) -> Iterator[Case]:
                 f"shipped {config.stem} {do}",
                 f"shipped-{config.stem.partition('-')[0]}",
                 functools.partial(_shipped, config, do, shared),
-                quick=config.stem == "bench-roll" and do != "frf",
+                quick=config.stem == "bench-roll" and do == "check",
             )
 
 
@@ -281,56 +281,108 @@ def public_cases(shared: Path) -> Iterator[Case]:
 # Logs.
 
 
-def read_log(path: Path, folder: Path) -> Result:
+def read_log(path: Path, folder: Path, *more: str) -> Result:
     """`info`, `new` and `convert` of one log."""
     if not path.exists():
         raise LookupError(f"{path} is absent")
-    info = command("info", path, "--json")
+    info = command("info", path, "--json", *more)
     numbers: dict[str, Any] = {}
-    if not info.code:
-        for i, flight in enumerate(_listed(json.loads(info.out))):
-            numbers |= {f"{i} {k}": v for k, v in _flat(flight) if not isinstance(v, str)}
+    names: set[str] = set()
+    for flight in json.loads(info.out)["flights"] if not info.code else ():
+        at = f"flight {flight['number']}"
+        numbers |= {f"{at} duration": flight["duration"], f"{at} topics": len(flight["topics"])}
+        for topic in flight["topics"][:6]:
+            numbers[f"{at} {topic['name']} rows"] = topic["rows"]
+            numbers[f"{at} {topic['name']} rate"] = (topic["time"] or {}).get("rate")
+        for topic in flight["topics"]:
+            names |= {topic["name"] or "", *(c["name"] for c in topic["channels"])}
     new = command("new", path, "--out", folder / "new.yaml")
-    made = folder / "new.yaml"
-    if made.exists():
-        content = yaml.safe_load(made.read_text(encoding="utf-8"))
-        numbers |= {f"new {k}": v for k, v in _flat({k: content[k] for k in content})}
-    converted = command("convert", path, folder / "out.csv", "--rate", "50")
+    if (folder / "new.yaml").exists():
+        made = yaml.safe_load((folder / "new.yaml").read_text(encoding="utf-8"))
+        numbers["new model"] = str(made.get("model"))
+        signals = made["flights"][0].get("signals", {})
+        for kind in ("inputs", "outputs"):
+            numbers[f"new {kind}"] = " ".join(signals.get(kind, {}))
+        numbers["new free"] = " ".join((made.get("fit") or {}).get("free", {}))
     table = folder / "out.csv"
+    converted = command("convert", path, table, "--rate", "50")
     if table.exists():
         rows = np.genfromtxt(table, delimiter=",", names=True, dtype=float)
         numbers["rows"] = len(rows)
         for name in (rows.dtype.names or ())[:12]:
             numbers[f"mean {name}"] = float(np.nanmean(rows[name]))
             numbers[f"sd {name}"] = float(np.nanstd(rows[name]))
-    said = [f"{do} {code_of(n)}" for do, e in _named(info, new, converted) for n in e.notes]
-    kept = {k: v for k, v in numbers.items() if str(folder) not in str(v)}
-    codes = {f"exit {do}": e.code for do, e in _named(info, new, converted)}
-    return {"exit": max(codes.values()), "codes": coded([], [], said), "numbers": kept | codes}
+    done = {"info": info, "new": new, "convert": converted}
+    # Where a signal is named in part, `ekf...`, its beginning is all that a sentence has.
+    said = [f"{do} {code_of(n, names)}" for do, e in done.items() for n in e.notes]
+    codes = {f"exit {do}": e.code for do, e in done.items()}
+    return {"exit": max(codes.values()), "codes": coded([], [], said), "numbers": numbers | codes}
 
 
-def _named(info: Ended, new: Ended, converted: Ended) -> Iterator[tuple[str, Ended]]:
-    yield from (("info", info), ("new", new), ("convert", converted))
+def _written(path: Path, x: Mapping[str, np.ndarray]) -> None:
+    """Columns in the format of a file's name."""
+    import h5py
+    import pyarrow as pa
+    import pyarrow.feather
+    import pyarrow.parquet
+    import scipy.io
+    import xarray as xr
+
+    from tests.flights import log_writers as writers
+
+    us = np.round(1e6 * (x["t"] + 10.0)).astype(int)
+    names = [n for n in x if n != "t"]
+    table = np.stack(list(x.values()), axis=1).tolist()
+    stamped = [[int(at), *row[1:]] for at, row in zip(us, table, strict=True)]
+    match path.suffix:
+        case ".csv":
+            rows = [",".join(x), *(",".join(f"{v:.9g}" for v in row) for row in table)]
+            path.write_text("\n".join(rows) + "\n")
+        case ".parquet":
+            pyarrow.parquet.write_table(pa.table(dict(x)), path)
+        case ".feather":
+            pyarrow.feather.write_feather(pa.table(dict(x)), path)
+        case ".jsonl":
+            rows = [json.dumps(dict(zip(x, row, strict=True))) for row in table]
+            path.write_text("\n".join(rows) + "\n")
+        case ".mat":
+            scipy.io.savemat(path, {n: v[:, None] for n, v in x.items()})
+        case ".nc":
+            xr.Dataset({n: ("t", x[n]) for n in names}, {"t": x["t"]}).to_netcdf(path)
+        case ".h5":
+            with h5py.File(path, "w") as file:
+                for n, v in x.items():
+                    file[n] = v
+        case ".npz":
+            np.savez(path, **x)
+        case ".ulg":
+            fields = [("uint64_t", "timestamp"), *(("float", n) for n in names)]
+            path.write_bytes(writers.ulog([("rig", 0, fields, stamped)]))
+        case ".bin" | ".log":
+            messages = {"RIG": (210, "Q" + "f" * len(names), ",".join(["TimeUS", *names]))}
+            rows = [("RIG", row) for row in stamped]
+            binary = path.suffix == ".bin"
+            write = writers.dataflash if binary else writers.dataflash_text
+            path.write_bytes(write(messages, rows))
+        case ".bbl":
+            scaled = [np.round(1e4 * x[n]).astype(int) for n in names]
+            values = np.stack([np.arange(us.size), us, *scaled], axis=1)
+            count = [1] * len(names), [0] * len(names)
+            path.write_bytes(writers.blackbox(names, values, *count))
 
 
-def _listed(content: Any) -> list[Any]:
-    return content if isinstance(content, list) else [content]
+def _format(suffix: str, folder: Path) -> Result:
+    made = roll(1)
+    x = {"t": made["t"], "lat": made["da"], "p": made["p"], "phi": made["phi"]}
+    path = folder / f"flight{suffix}"
+    _written(path, x)
+    return read_log(path, folder)
 
 
-def _flat(content: Any, at: str = "", most: int = 40) -> Iterator[tuple[str, Any]]:
-    """Leaves of plain data by their path; of long lists the first."""
-    if isinstance(content, Mapping):
-        for key, value in content.items():
-            yield from _flat(value, f"{at}.{key}" if at else str(key))
-    elif isinstance(content, Sequence) and not isinstance(content, str):
-        for i, value in enumerate(content[:most]):
-            yield from _flat(value, f"{at}.{i}")
-    elif isinstance(content, bool | int | str) or (
-        isinstance(content, float) and math.isfinite(content)
-    ):
-        yield at, content
-
-
+FORMATS = (
+    ".csv", ".parquet", ".feather", ".jsonl", ".mat", ".nc", ".h5", ".npz", ".ulg", ".bin", ".log",
+    ".bbl",
+)  # fmt: skip
 _LOGS = (
     "data/trex550/Pitchtest.csv", "data/trex550/Hovertest.csv", "data/ulog/sample_log_small.ulg",
     "data/dataflash/test.BIN", "data/rotorflight/LOG246.TXT", "data/new-user.csv",
@@ -338,14 +390,135 @@ _LOGS = (
 
 
 def log_cases(shared: Path) -> Iterator[Case]:
-    """The records of ../shared/data."""
+    """One log a format, and the records of ../shared/data."""
+    for suffix in FORMATS:
+        yield Case(
+            f"format {suffix[1:]}",
+            "logs",
+            functools.partial(_format, suffix),
+            quick=suffix in (".csv", ".ulg"),
+        )
     for log in _LOGS:
         yield Case(f"log {log}", "logs", functools.partial(read_log, shared / log))
 
 
+# Records of our own.
+
+
+def _rig(rig: Rig, do: str, folder: Path) -> Result:
+    result = ASKED[do](written(rig, folder))
+    if do != "fit":
+        return result
+    sound = rig.ought is None
+    said = wrong_of(result, sound, rig.truth)
+    if not (sound or rig.truth) and not result["exit"]:
+        said = "silent: exit 0"
+    return {**result, "wrong": said}
+
+
+def rig_cases() -> Iterator[Case]:
+    """The records of corpus_records.py."""
+    quick = {"loop frequency error by instrument fit", "missing samples fit", "p clipped fit"}
+    for i, (name, rig) in enumerate(RIGS.items()):
+        for do in rig.do:
+            yield Case(
+                f"rig {name} {do}",
+                f"rig-{i % 3}",
+                functools.partial(_rig, rig, do),
+                rig.ought is None if do == "fit" else None,
+                rig.ought or (),
+                quick=f"{name} {do}" in quick,
+            )
+
+
+def _own_model(folder: Path) -> Result:
+    """By import path: what `heli-jax new-model` writes."""
+    command("new-model", "swing", "--out", "swing")
+    config = folder / "swing" / "swing.yaml"
+    command("simulate", config, "--out", folder / "swing" / "swing.csv")
+    result = fit_config(config)
+    return {**result, "wrong": wrong_of(result, True, {})}
+
+
+def _study(folder: Path) -> Result:
+    """Eight fits of one record, of windows and starts."""
+    import xarray as xr
+
+    config = written(RIGS["plain"], folder)
+    over = ("--over", "flights.0.window=[0, 15],[15, 30]", "--over")
+    starts = "fit.free.Lp.start=-1,-2,-6,-9"
+    ended = command("fit", config, "--out", "study", *over, starts)
+    with xr.open_zarr("study/study.zarr", consolidated=False, chunks=None) as data:
+        values = {n: np.asarray(data[n].values).reshape(8, -1) for n in ("estimate", "sd")}
+        statuses = sorted({str(v) for v in np.ravel(data["status"].values)})
+    numbers = {
+        f"{n} {i} {k}": float(v[i, k]) for n, v in values.items() for i, k in np.ndindex(8, 2)
+    }
+    return {"exit": ended.code, "status": " ".join(statuses), "numbers": numbers}
+
+
+def _sweep(folder: Path) -> Result:
+    """256 vehicles on the stand."""
+    import xarray as xr
+
+    more = ("--set", "sweep.n=256", "--set", "simulate.duration=20", "--no-figures")
+    ended = command("sweep", CONFIGS / "bench-sweep.yaml", "--out", "sweep", *more)
+    store = next(Path("sweep").glob("*.zarr"))
+    numbers = {}
+    with xr.open_zarr(store, consolidated=False, chunks=None) as data:
+        for name in data.data_vars:
+            values = np.asarray(data[name].values)
+            if values.dtype.kind in "fc":
+                numbers[f"mean {name}"] = float(np.nanmean(np.abs(values)))
+                numbers[f"last {name}"] = float(np.abs(np.ravel(values)[-1]))
+    return {"exit": ended.code, "numbers": numbers}
+
+
+R50 = ("Lb", "Alat", "Blat", "Lu", "Lv")
+"""of the R-50, free where a fit of all 33 would take minutes"""
+
+
+def _r50(method: str, folder: Path) -> Result:
+    """The R-50 that a pilot holds in gusts on six axes."""
+    from r50_record import problem, record, truth
+
+    from heli_jax import Free, Nuisance, Problem, linear_model, naming
+
+    flight = record(1, 30.0)
+    values = {n: float(v) for n, v in naming.asdict(truth()).items()}
+    if method == "filter-error":
+        fixed = tuple(n for n in values if n not in R50)
+        factors = dict.fromkeys(R50, 1.2)
+        result = fit_of(problem([flight], factors, taus=False, fixed=fixed))[1]
+    else:
+        shipped = linear_model("r50-hover")
+        free = {n: Free(1.2 * values[n]) for n in R50}
+        params, nuisance = shipped.vehicle().params, Nuisance(initial_state=False, bias=False)
+        given = Problem(shipped.model, params, [flight], free, nuisance, method=method)
+        result = fit_of(given)[1]
+    sound = method == "filter-error"
+    return {**result, "wrong": wrong_of(result, sound, {n: values[n] for n in R50})}
+
+
+def other_cases() -> Iterator[Case]:
+    """What is no single fit of a configuration, and the R-50."""
+    yield Case("own model by import path", "other", _own_model, True)
+    yield Case("study of 8 fits", "other", _study)
+    yield Case("sweep of 256", "other", _sweep)
+    for method in ("filter-error", "frequency-error", "frequency-response"):
+        yield Case(
+            f"r50 {method}",
+            "r50",
+            functools.partial(_r50, method),
+            method == "filter-error",
+            () if method == "filter-error" else ("follow", "trusted"),
+        )
+
+
 def cases(shared: Path) -> list[Case]:
     """All of them; nothing is computed yet."""
-    made = [*zoo_cases(), *shipped_cases(shared), *public_cases(shared), *log_cases(shared)]
+    made = [*zoo_cases(), *shipped_cases(shared), *public_cases(shared), *rig_cases()]
+    made += [*other_cases(), *log_cases(shared)]
     names = [c.name for c in made]
     assert len(set(names)) == len(names)
     return made
