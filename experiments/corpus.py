@@ -91,6 +91,7 @@ def of_fit(content: Mapping[str, Any], code: int, names: Iterable[str] = ()) -> 
     doubts += ["not trusted"] if content["untrusted"] else []
     doubts += [code_of(f, names) for f in findings if f["severity"] in ("doubt", "refuse")]
     notes = [code_of(n, names) for n in content["notes"]]
+    further = (content["intervals"] or {}).get("by_parameter", {})
     notes += [code_of(f, names) for f in findings if f["severity"] == "note"]
     return {
         "exit": code,
@@ -104,6 +105,12 @@ def of_fit(content: Mapping[str, Any], code: int, names: Iterable[str] = ()) -> 
             if not e["fixed"]
         },
         "log_likelihood": content["log_likelihood"],
+        "numbers": {
+            f"{name} {method} {i}": end
+            for name, by in further.items()
+            for method, ends in by.items()
+            for i, end in enumerate(ends or ())
+        },
         "codes": coded(exits, doubts, notes),
     }
 
@@ -174,7 +181,7 @@ def run_group(
                 result = {"failed": traceback.format_exc().strip().splitlines()[-1]}
         done.append(((name, how), {**result, **added}))
         print(
-            f"{' without '.join(filter(None, (name, how)))}: {in_words(result)}",
+            f"{name} {how}: {in_words(result)}",
             file=sys.stderr,
             flush=True,
         )

@@ -391,9 +391,11 @@ RIGS: dict[str, Rig] = {
         lambda: late(roll(1)), truth=TRUTH, asks=_fit(nuisance={"time_shift": True})
     ),
     "windows": Rig(roll, truth=TRUTH, asks=_fit(shooting={"window": 3.0})),
-    "profile": Rig(roll, truth=TRUTH, asks=_fit(intervals={"profile": ["Lp"]})),
-    "bootstrap": Rig(roll, truth=TRUTH, asks=_fit(intervals={"bootstrap": 30})),
-    "NUTS": Rig(roll, truth=TRUTH, asks=_fit(intervals={"nuts": 50})),
+    "intervals by profile, bootstrap and NUTS": Rig(
+        roll,
+        truth=TRUTH,
+        asks=_fit(intervals={"profile": ["Lp"], "bootstrap": 30, "nuts": 50}),
+    ),
     "start by equation error": Rig(roll, truth=TRUTH, asks=_fit(start="equation-error")),
     "also frequency error": Rig(roll, truth=TRUTH, asks=_fit(also=["frequency-error"])),
     "other models": Rig(

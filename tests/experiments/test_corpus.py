@@ -1,10 +1,13 @@
 """Ten cases of the corpus say what was stored; what counts as a difference."""
 
+import importlib
 import json
 import sys
 from pathlib import Path
 
 import pytest
+
+from heli_jax import workflow
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -13,19 +16,16 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 def corpus():
     before = list(sys.path)
     sys.path.insert(0, str(EXPERIMENTS))
-    import corpus
-
-    yield corpus
+    yield importlib.import_module("corpus")
     sys.path[:] = before
 
 
 def test_ten_cases_are_as_they_were_stored(corpus):
     if not corpus.STORED.exists():
         pytest.skip("tests/reference/corpus.json is not stored yet")
-    from corpus_cases import cases
-
     shared = corpus.shared_folder(None)
-    chosen = [c for c in cases(shared) if c.quick]
+    cases = importlib.import_module("corpus_cases").cases(shared)
+    chosen = [c for c in cases if c.quick]
     assert len(chosen) == 10
     stored = json.loads(corpus.STORED.read_text(encoding="utf-8"))
     assert corpus.compare(stored, corpus.run_all(chosen, shared, 1)) == []
@@ -60,12 +60,9 @@ def test_a_key_of_a_sentence_has_no_numbers_and_no_names(corpus):
 
 
 def test_a_candidate_is_replaced_everywhere(corpus):
-    from corpus_matrix import ABLATIONS, replaced
-
-    from heli_jax import workflow
-
+    matrix = importlib.import_module("corpus_matrix")
     original = workflow.with_second_method
-    for one in ABLATIONS:
-        with replaced(one.entry, lambda _: None):
+    for one in matrix.ABLATIONS:
+        with matrix.replaced(one.entry, lambda _: None):
             assert (workflow.with_second_method is None) == (one.name == "second_method")
     assert workflow.with_second_method is original
