@@ -93,24 +93,23 @@ def of_fit(content: Mapping[str, Any], code: int, names: Iterable[str] = ()) -> 
     notes = [code_of(n, names) for n in content["notes"]]
     further = (content["intervals"] or {}).get("by_parameter", {})
     notes += [code_of(f, names) for f in findings if f["severity"] == "note"]
+    estimates = {
+        n: [e["value"], e["sd"], e["lower95"], e["upper95"]]
+        for n, e in content["parameters"].items()
+        if not e["fixed"]
+    }
+    for name, by in further.items():
+        # Of a normal distribution with these ends, so that one rule compares all intervals.
+        for method, (low, high) in by.items():
+            estimates[f"{name} by {method}"] = [(low + high) / 2, (high - low) / 3.92, low, high]
     return {
         "exit": code,
         "status": content["status"],
         "adequate": content["adequate"],
         "plain": adequacy["summary"] == "yes",
         "untrusted": list(content["untrusted"]),
-        "estimates": {
-            n: [e["value"], e["sd"], e["lower95"], e["upper95"]]
-            for n, e in content["parameters"].items()
-            if not e["fixed"]
-        },
+        "estimates": estimates,
         "log_likelihood": content["log_likelihood"],
-        "numbers": {
-            f"{name} {method} {i}": end
-            for name, by in further.items()
-            for method, ends in by.items()
-            for i, end in enumerate(ends or ())
-        },
         "codes": coded(exits, doubts, notes),
     }
 

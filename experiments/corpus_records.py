@@ -394,7 +394,8 @@ RIGS: dict[str, Rig] = {
     "intervals by profile, bootstrap and NUTS": Rig(
         roll,
         truth=TRUTH,
-        asks=_fit(intervals={"profile": ["Lp"], "bootstrap": 30, "nuts": 50}),
+        asks=_fit(intervals={"profile": ["Lp"], "bootstrap": 24, "nuts": 30}),
+        flights=({"window": [0, 8]},),
     ),
     "start by equation error": Rig(roll, truth=TRUTH, asks=_fit(start="equation-error")),
     "also frequency error": Rig(roll, truth=TRUTH, asks=_fit(also=["frequency-error"])),
