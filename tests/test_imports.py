@@ -37,7 +37,9 @@ ALLOWED = {
     "summaries": {"naming", "numbers"},
     "exports": {"naming", "summaries"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
-    "flights": {"numbers", "errors", "regular_file", "units", "summaries", "yaml_file"},
+    "flights": {
+        "numbers", "errors", "regular_file", "units", "summaries", "yaml_file", "numerics",
+    },
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors", "pickled"},
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},

@@ -22,6 +22,7 @@ from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.finding import Finding, Severity
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
+from heli_jax.numerics.jumps import split
 
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
@@ -152,7 +153,7 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
             f"answers up to {fastest.hz:.3g} Hz (a mode at the {where})"
         )
         finding = _judged(begun, ratio, fastest.hz)
-        if finding.severity != "ok" and flight.hold[name] != "linear":
+        if finding.severity != "ok" and flight.hold[name] == "zero-order":
             # All stairs of one length are a clock's, and so is a test signal with a clock.
             finding = finding._replace(
                 sentence=f"{finding.sentence} Where {name} was commanded in steps of that length, "
@@ -209,8 +210,8 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     """
     if np.ptp(u) == 0:
         return None
-    if flight.hold[name] == "linear":
-        return _corner_rate(flight.dt, u)
+    if flight.hold[name] != "zero-order":
+        return _corner_rate(flight.dt, split(u)[1] if flight.hold[name] == "mixed" else u)
     # Held because somebody said so: then it is known at all times.
     if name not in flight.hold_reason:
         return None

@@ -161,6 +161,7 @@ def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]
         for n in naming.names(problem.model.Inputs)
         # What stays constant is the same under either hold.
         if np.ptp(flight.inputs[n]) > 0
+        and flight.hold[n] != "mixed"
         and not is_low_passed(flight.hold_reason.get(n, ""))
         and (not in_doubt or (flight.hold[n] == "linear" and n in flight.hold_reason))
     }
