@@ -22,8 +22,8 @@ class Signal:
         unit: the unit, such as `deg`.
         si: the SI unit of the model, such as `rad`.
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
-        hold: what an input does between samples: "zero-order", "linear", "mixed" (held until it jumps,
-            else linear), or "auto", by what the log shows of it.
+        hold: what an input does between samples: "zero-order", "linear", "mixed" (held
+            until it jumps, else linear), or "auto", by what the log shows of it.
         repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
             table), "keep", or "auto", missing where that is unmistakable.
         scale: `unit` per number in the log.

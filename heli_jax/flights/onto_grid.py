@@ -15,8 +15,8 @@ from heli_jax.flights.request import Request
 from heli_jax.flights.resample import (
     goes_down,
     held_low_passed,
-    held_until_jumps,
     held_mean,
+    held_until_jumps,
     hold,
     in_gaps,
     longest_gap,
@@ -175,16 +175,12 @@ def at_times(
 ) -> OnGrid:
     """The signals on a grid.
 
-    A held input has the mean of what it was until the grid's next instant; a mixed one jumps at
-    the instant nearest to its jump. Other inputs and the outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
-    than the grid stand at the instants nearest to their own. A held input that a low-passed output
-    follows within a sample is low-passed too, and is linear between samples then.
-
-    Args:
-        request: names them.
-        signals: by key, SI, each on its own clock.
-        holds: by input.
-        times: of the grid (M,) [s].
+    A held input has the mean of what it was until the grid's next instant; a mixed one jumps at the
+    instant nearest to its jump. Other inputs and the outputs are interpolated, or low-pass filtered
+    where the rate goes down; outputs that are slower than the grid stand at the instants nearest to
+    their own. A held input that a low-passed output follows within a sample is low-passed too, and
+    is linear between samples then. Args: request: names them. signals: by key, SI, each on its own
+    clock. holds: by input. times: of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)

@@ -119,7 +119,10 @@ def _merged(model: Model, inputs: Record) -> Record:
     """Return the model's Inputs from those with staircases."""
     of = naming.asdict(inputs)
     return model.Inputs(
-        **{n: of[n] + of[_stairs(n)] if _stairs(n) in of else of[n] for n in naming.names(model.Inputs)}
+        **{
+            n: of[n] + of[_stairs(n)] if _stairs(n) in of else of[n]
+            for n in naming.names(model.Inputs)
+        }
     )
 
 

@@ -89,7 +89,10 @@ class Plan(NamedTuple):
         return SimulationOptions(
             solver=solver_named(self.solver),
             substeps=self.substeps,
-            hold={**dict.fromkeys(naming.names(self.model.Inputs), "zero-order"), **dict(self.moving)},
+            hold={
+                **dict.fromkeys(naming.names(self.model.Inputs), "zero-order"),
+                **dict(self.moving),
+            },
             **numbers,
         )
 

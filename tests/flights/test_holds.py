@@ -82,6 +82,7 @@ STEPS = {
     "smooth stick read at 50 Hz, logged at 250": pilot()[(np.arange(N) * 0.2).astype(int)],
 }
 
+
 def card(dt=DT, n=N):
     """Doublets of the stick, then a chirp of it, in one record."""
     u, t = np.zeros(n), dt * np.arange(n)
