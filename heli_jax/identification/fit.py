@@ -50,6 +50,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
+    Layout,
     Noise,
     Solution,
     layout_of,
@@ -67,6 +68,7 @@ from heli_jax.identification.validation.expected_accuracy import (
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.input_units import doubtful_inputs
+from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
@@ -272,13 +274,22 @@ def fit(
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
     doubts = record_doubts(problem)
-    said = (*cautions(problem), *(f.sentence for f in doubts.findings))
+    late = [f.sentence for f in _late_inputs(problem, guess.layout)]
+    said = (*late, *cautions(problem), *(f.sentence for f in doubts.findings))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
         estimate = assemble(problem, search, optimum, run)
         return _with_doubtful_signals(problem, guess, estimate, doubts.unsure)
+
+
+def _late_inputs(problem: Problem, layout: Layout) -> list[Finding]:
+    """Return the inputs that are logged late where no delay and no shift is free to say so."""
+    if layout.shift or set(problem.model.delay_parameters) & set(problem.free):
+        return []
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    return late_inputs(flights, feedback_of(problem))
 
 
 def _with_doubtful_signals(

@@ -159,8 +159,7 @@ def judge(
         adequacy = with_late_stick(adequacy, late)
     if arrived and not (ahead or instruments):
         adequacy = with_noisy_inputs(adequacy, noisy_inputs(problem, at, end.e, named))
-    estimates = {k: numbers.of_interest[k] for k in layout.free}
-    adequacy = adequacy.doubted(delay_doubts(problem, estimates))
+    adequacy = adequacy.only_if(delay_doubts(problem, numbers.of_interest))
     held = held and WRONG_OPTIMUM not in adequacy.advice
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.

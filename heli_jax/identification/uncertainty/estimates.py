@@ -175,24 +175,23 @@ def _remedy(name: str) -> str:
 
 
 def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
-    """Where a delay may be none, or is negative.
+    """Where a delay may be none, or an input is logged late: a delay or the shift is negative.
 
     Args:
         problem: its model says which parameters are delays.
-        estimates: of the free parameters.
+        estimates: of the parameters of interest.
     """
     notes = []
-    for name in problem.model.delay_parameters:
-        estimate = estimates.get(name)
-        if estimate is None or estimate.lower95 is None or estimate.upper95 is None:
+    for name, estimate in _delays(problem, estimates).items():
+        if estimate.lower95 is None or estimate.upper95 is None:
             continue
         if estimate.upper95 < 0:
             notes.append(
-                f"{name} is negative: its signal acts before the log has it. The clocks of inputs "
-                "and outputs differ (two logs on one clock: also.align), or the input does "
+                f"{name} is {1e3 * estimate.value:.3g} ms: the input is logged late. The clocks of "
+                "inputs and outputs differ (two logs on one clock: also.align), or the input does "
                 "something else between samples than was stated (hold)."
             )
-        elif estimate.lower95 <= 0:
+        elif estimate.lower95 <= 0 and name != "time_shift":
             notes.append(
                 f"{name} cannot be told from zero: with 95 % probability it is below "
                 f"{estimate.upper95:.3g} s."
@@ -201,23 +200,27 @@ def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
 
 
 def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
-    """Delays by which the model answers before its input, by more than a sample of every flight.
+    """Delays and shifts by which an input is logged late, by more than a sample of every flight.
 
-    Within a sample that may be how the input was held; beyond it no machine does so, but two logs
-    whose clocks differ look like it.
+    Within a sample that may be how the input was held. Beyond it no vehicle answers so early, but
+    the estimate makes up for a log that is late, whichever parameter takes it.
 
     Args:
         problem: its model says which parameters are delays.
-        estimates: of the free parameters.
+        estimates: of the parameters of interest.
     """
     sample = max(f.dt for f in problem.training)
-    delays = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
     return [
-        f"by {n} = {1e3 * e.value:.3g} ms it answers before its input, unless the clocks of stick "
-        "and response differ"
-        for n, e in delays
+        f"the input is logged late, {n} = {1e3 * e.value:.3g} ms"
+        for n, e in _delays(problem, estimates).items()
         if e.upper95 is not None and e.upper95 < -sample
     ]
+
+
+def _delays(problem: Problem, estimates: dict[str, Estimate]) -> dict[str, Estimate]:
+    """The estimated delays of the model, and the shift of all inputs."""
+    names = (*problem.model.delay_parameters, "time_shift")
+    return {n: estimates[n] for n in names if n in estimates}
 
 
 FAR = 3.0
