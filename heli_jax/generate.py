@@ -323,7 +323,7 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[s
         return []
     signals = first_signals(experiment).inputs
     auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
-    moving = [n for n in auto if decide(logged[n]).hold == "linear"]
+    moving = [n for n in auto if decide(logged[n]).hold != "zero-order"]
     if not moving:
         return []
     return [

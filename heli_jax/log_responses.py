@@ -24,7 +24,11 @@ from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
-_HOLDS = {"linear": "taken to move in straight lines", "zero-order": "held"}
+_HOLDS = {
+    "linear": "taken to move in straight lines",
+    "zero-order": "held",
+    "mixed": "held until they jump",
+}
 
 
 def responses_of_log(

@@ -20,6 +20,7 @@ from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_tran
 from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
 
 _LONGEST = 30.0
@@ -123,6 +124,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
             no output has a part that is long enough.
     """
     dt = _one_rate(flights)
+    flights = [without_jumps(f) for f in flights]
     longest = max(f.duration for f in flights)
     window = settings.window or min(longest / 5.0, _LONGEST)
     require_window(window, longest + dt)

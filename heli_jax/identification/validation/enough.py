@@ -15,7 +15,7 @@ from heli_jax.identification.validation.feedback import feedback_notes, untested
 from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Feedback
 from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_angles import late_angles
-from heli_jax.identification.validation.late_inputs import late_inputs
+from heli_jax.identification.validation.late_inputs import LATE, late_inputs
 from heli_jax.identification.validation.logging_rate import (
     LOGGING_RATE,
     logging_rate,
@@ -42,6 +42,11 @@ from heli_jax.numbers import p_value
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2, "note": 2}
+
+
+def _rank(finding: Finding) -> tuple[int, bool]:
+    """Rank findings: the worst first, and of those a late input, which makes modes look fast."""
+    return _ORDER[finding.severity], finding.code != LATE
 
 
 def is_it_enough(
@@ -85,7 +90,7 @@ def is_it_enough(
     else:
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
         findings.append(Finding("excitation.next-flight", "note", words))
-    return tuple(sorted(findings, key=lambda f: _ORDER[f.severity]))
+    return tuple(sorted(findings, key=_rank))
 
 
 def judged_again(
@@ -102,7 +107,7 @@ def judged_again(
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
     kept = [f for f in findings if f.code != LOGGING_RATE]
-    return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
+    return tuple(sorted([*again, *kept], key=_rank))
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:

@@ -23,6 +23,7 @@ from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
+from heli_jax.numerics.jumps import split
 
 LOGGING_RATE = "timing.logging-rate"
 HOPELESS, ENOUGH = 2.0, 5.0
@@ -211,7 +212,7 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
             f"answers up to {fastest.hz:.3g} Hz (a mode at the {where})"
         )
         finding = _judged(begun, ratio, fastest.hz)
-        if finding.severity != "ok" and flight.hold[name] != "linear":
+        if finding.severity != "ok" and flight.hold[name] == "zero-order":
             # All stairs of one length are a clock's, and so is a test signal with a clock.
             finding = finding._replace(
                 sentence=f"{finding.sentence} Where {name} was commanded in steps of that length, "
@@ -268,8 +269,8 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     """
     if np.ptp(u) == 0:
         return None
-    if flight.hold[name] == "linear":
-        return _corner_rate(flight.dt, u)
+    if flight.hold[name] != "zero-order":
+        return _corner_rate(flight.dt, split(u)[1] if flight.hold[name] == "mixed" else u)
     # Held because somebody said so: then it is known at all times.
     if name not in flight.hold_reason:
         return None
