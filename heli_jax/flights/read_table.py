@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.clock_faults import require_increasing, unit_notes
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
@@ -49,6 +50,7 @@ from heli_jax.flights.resample import new_clock
 from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.slower import Timed
+from heli_jax.flights.stacked import NUMBER
 from heli_jax.flights.table import Table, column, sample_count, wrong
 from heli_jax.flights.table_view import first_of_copies, seen_once
 from heli_jax.flights.time_units import require_likely
@@ -77,6 +79,12 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     if request.time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
+    file = table.table if isinstance(table, DerivedTable) else table
+    of_stack = isinstance(file, ArrayTable) and NUMBER in file.names
+    if of_stack and request.time.name == ROWS and not request.options.runs:
+        problem = f"its rows are of several runs, which {NUMBER!r} numbers"
+        remedy = f"expected time: {{rate: HZ, runs: {NUMBER}}}, which makes a flight of each"
+        raise wrong(table.path, f"{problem}; {remedy}")
     if isinstance(table, DerivedTable):
         if request.time.name == ROWS:
             table = DerivedTable(counted(table.table, request.time), table.swashplate)
