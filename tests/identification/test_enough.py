@@ -9,7 +9,9 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem
+from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
+from heli_jax.flights import Signal, read_flight
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, next_flight, signal_quality
 from heli_jax.identification.validation.expected_accuracy import too_good
@@ -203,6 +205,30 @@ def test_the_rate_of_an_input_that_moved_between_its_samples():
         )
         rates.append(input_rate(f, "u", u))
     assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
+
+
+@pytest.mark.parametrize("rate", [9.8, 24.7, 49.9, 80.0])
+def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
+    rng = np.random.default_rng(1)
+    t, fast = np.cumsum(1 / rate + 0.002 / rate * rng.standard_normal(int(40 * rate))), 250.0
+    gyro = np.arange(int(39 * fast)) / fast
+    u = np.sin(4.4 * t) + 0.5 * np.sin(10.7 * t + 1) + 0.2 * rng.standard_normal(t.size)
+    p = np.interp(gyro, t, u) + 0.1 * rng.standard_normal(gyro.size)
+    np.savez(tmp_path / "a.npz", **{"rc.t": t, "rc.u": u, "imu.t": gyro, "imu.p": p})
+    f = read_flight(
+        tmp_path / "a.npz",
+        inputs={"u": Signal("rc.u", "1", "1")},
+        outputs={"p": Signal("imu.p", "rad/s", "rad/s")},
+        rate=100.0,
+    )
+    assert input_rate(f, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
+    # Interpolated onto the grid before it came here, only slow straight lines show.
+    if rate < 40:
+        alone = replace(f, source=None)
+        assert input_rate(alone, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
+    found = flight_responses([f], Settings(band=(0.5, 45.0)))
+    hz, H = found.omega / (2 * np.pi), found.outputs["p"].pairs["u"].H
+    assert hz[np.isfinite(H)].max() == pytest.approx(min(rate / 2, 45.0), rel=0.05)
 
 
 def test_of_a_stick_that_stays_for_equal_times_it_is_said_how_to_state_a_test_signal_s_clock():
