@@ -128,7 +128,10 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     require_window(window, longest + dt)
     inputs = [n for n in flights[0].inputs if any(np.std(f.inputs[n]) > 0 for f in flights)]
     if not inputs:
-        raise ValueError("no input moves, expected one that does")
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
     step = {n: max(f.logged_step(n, "input") for f in flights) for n in inputs}
     omega = _frequencies(settings, window, dt, max(dt, min(step.values())))
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))

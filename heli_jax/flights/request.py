@@ -58,8 +58,6 @@ class ReadOptions:
     """whether the run serves for validation alone"""
     name: str = ""
     """what to call the run"""
-    moving_inputs: bool = True
-    """whether a run in which no input ever moves is refused"""
     number: int | None = None
     """which flight of a file that holds several, from 1"""
     also: tuple[Also, ...] = ()

@@ -18,6 +18,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -50,6 +51,9 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
     Solution,
     layout_of,
     scales_of,
@@ -111,11 +115,27 @@ def first_guess(problem: Problem) -> FirstGuess:
     z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, begun)
+
+
+def _in_free_motion(
+    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
+) -> tuple[Array, Evaluation]:
+    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    from rest at zero no parameter would have any effect."""
+    own = slice(layout.first_nuisance, layout.size)
+    if not (layout.initial_state and np.isfinite(e.J).all()):
+        return z, e
+    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
+    moved = z.at[own].add(step)
+    after = evaluate(layout, data, noise, moved)
+    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:

@@ -190,7 +190,6 @@ def test_any_uniform_log_comes_back(tmp_path_factory, data, rate, start, ending)
         time="t",
         inputs={"x_roll": Signal("stick", "1", "1")},
         outputs={"roll": Signal("phi", "1", "1")},
-        moving_inputs=False,
     )
     assert np.array_equal(flight.inputs["x_roll"], data[:, 0])
     assert np.array_equal(flight.outputs["roll"], data[:, 1])

@@ -36,6 +36,8 @@ _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
+_NOISE = 0.5
+"""of what white noise has, in steps from sample to sample: above it an output shows no motion"""
 NOTHING_FOLLOWS = (
     "no output follows any input coherently over a band of frequencies: noise, disturbances or "
     "something else moves the machine more than the sticks do."
@@ -69,8 +71,7 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
     if not moving:
-        words = "no input moves: nothing is excited."
-        return [Finding("excited band", "refuse", words, 0.0, "inputs that move, 1")]
+        return [_free_motion(alike)]
     seen = seen_parts(alike)
     barely = hardly_moving(alike, moving)
     pooled = _pooled(seen, moving, alike[0].dt)
@@ -79,6 +80,32 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
         return [*barely, *coherent, *together]
     together = _short_together(alike, moving)
     return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
+
+
+def _free_motion(flights: Sequence[Flight]) -> Finding:
+    """What can be learnt where no input moves: a free decay, or nothing from noise alone."""
+    turns = {
+        n: min(_roughness(f.outputs[n]) for f in flights if n in f.outputs)
+        for f in flights
+        for n in f.outputs
+    }
+    name = min(turns, key=lambda n: turns[n])
+    criterion = f"mean squared step of an output over that of white noise, {_NOISE:g}"
+    if turns[name] > _NOISE:
+        words = "no input moves, and the outputs show noise alone: nothing is excited."
+        return Finding("excited band", "refuse", words, turns[name], criterion)
+    words = (
+        f"no input moves: {name} shows how the machine moves freely from its first state, or under "
+        "constant inputs; what inputs do beyond that is not in the record."
+    )
+    return Finding("excited band", "note", words, turns[name], criterion)
+
+
+def _roughness(y: Float[np.ndarray, " N"]) -> float:
+    """Mean squared step of a signal over that of white noise of its variance (von Neumann)."""
+    y = y[np.isfinite(y)]
+    spread = float(np.var(y)) if y.size > 2 else 0.0
+    return float(np.mean(np.diff(y) ** 2)) / (2.0 * spread) if spread > 0 else 1.0
 
 
 def _why_not(seen: SeenParts) -> str:
