@@ -231,7 +231,7 @@ def _clock(time: TimeConfig | None) -> Signal | None:
         return None
     if time.rate is not None:
         return by_rate(time.rate, time.signal)
-    return Signal(time.signal or "", time.unit, "s")
+    return Signal(time.signal or "", time.unit, "s", assumed="unit" not in time.model_fields_set)
 
 
 def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:

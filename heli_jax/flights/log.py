@@ -57,6 +57,7 @@ class ChannelLog:
         parameters: the firmware's settings, by name.
         notes: what was lost or assumed when it was read, in sentences.
         flight: which flight of the file it is, from 1, and of how many.
+        cautions: what speaks against its times, which every fit repeats.
         start: when the logger began [s], in the log's own count, where the log says so.
     """
 
@@ -70,6 +71,7 @@ class ChannelLog:
     notes: tuple[str, ...] = ()
     flight: tuple[int, int] = (1, 1)
     start: float | None = None
+    cautions: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ from heli_jax.flights.onto_grid import (
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
-from heli_jax.flights.row_clock import ROWS, counted
+from heli_jax.flights.row_clock import ROWS, contradicted_rate, counted
 from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.slower import Timed
 from heli_jax.flights.stacked import NUMBER
@@ -160,7 +160,13 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
     notes = (*table.notes, *clock.notes, *other_units(request), *notes)
     notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
-    source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
+    source = Source(
+        table.path,
+        table.sha256,
+        notes,
+        cautions=clock.cautions,
+        first_time=loaded.first_time,
+    )
     source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
@@ -209,6 +215,8 @@ class _Clock:
     notes: tuple[str, ...] = ()
     unit_notes: tuple[str, ...] = ()
     """where the file or a name says another unit"""
+    cautions: tuple[str, ...] = ()
+    """what speaks against the times"""
 
     @contextlib.contextmanager
     def hinting(self) -> Iterator[None]:
@@ -257,9 +265,11 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         raise wrong(table.path, problem, table.place(row), place)
     stamps, notes = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    if said and not stated:
-        require_likely(table.path, time.name, time.unit, stamps)
-    return _Clock(stamps, scale, (*notes, *said), said)
+    step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
+    cautions = contradicted_rate(table, time.name, 1.0 / step)
+    if not stated and time.scale == 1.0:
+        cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
+    return _Clock(stamps, scale, (*notes, *said), said, cautions)
 
 
 def _rows(

@@ -32,6 +32,8 @@ _PART = 0.1
 guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
+_SLOW = 2.0
+"""Hz, at which no flight is logged: 500 Hz or more in ms, read as seconds"""
 _SLOWER = 1.05
 """steps of the grid, from which on a topic's own is longer"""
 _MOST_BENDS = 8
@@ -191,7 +193,8 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
         ending = (
             f": {number(ratio, 2)} samples in a period cannot show it, so this log cannot be "
             f"fitted with this model; log at {hopeless * hz:.3g} Hz at least, "
-            f"better {ENOUGH * hz:.3g} Hz."
+            f"better {ENOUGH * hz:.3g} Hz"
+            f"{'; or its times are in ms (time.unit)' if ratio * hz <= _SLOW else ''}."
         )
     elif ratio < ENOUGH:
         severity = "doubt"
