@@ -43,6 +43,7 @@ from heli_jax.identification.further_starts import (
 )
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
@@ -61,7 +62,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.expected_accuracy import (
     guessed_gusts,
     starting_at_zero,
@@ -190,6 +191,10 @@ def check(problem: Problem) -> Check:
     )
     sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
+    # Sensitivities are those of the model, whatever moved what was measured.
+    if any(f.sentence == NOTHING_FOLLOWS and f.severity == "refuse" for f in findings):
+        names = listed(verdict.names, "or")
+        verdict = verdict.nothing(f"The data do not determine {names}: {NOTHING_FOLLOWS}")
     slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
     findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
     return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))

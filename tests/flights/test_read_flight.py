@@ -324,5 +324,5 @@ def test_only_the_window_decides(tmp_path):
 def test_a_clock_in_milliseconds_without_its_unit_is_asked_for_by_it(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("t,stick,phi\n" + "".join(f"{20 * k},{k % 3},{k % 5}\n" for k in range(60)))
-    with pytest.raises(InputError, match=r"100 times as much; is its time in ms \(time.unit\)\?"):
+    with pytest.raises(InputError, match=r"\bms\b"):
         read_flight(path, **ASKED, options=ReadOptions(rate=50.0))

@@ -231,6 +231,34 @@ def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
     assert hz[np.isfinite(H)].max() == pytest.approx(min(rate / 2, 45.0), rel=0.05)
 
 
+def on_the_ground(seed, n=2000):
+    """A machine that spools up: noise, and a rate loop whose stick follows the gyro."""
+    rng = np.random.default_rng(seed)
+    p = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(n))
+    p = 0.05 * (p + 3.0 * rng.standard_normal(n))
+    heard = scipy.signal.lfilter([0.3], [1.0, -0.7], np.r_[0.0, 0.0, p[:-2]])
+    pilot = scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(n))
+    return pilot - 0.2 * heard, p
+
+
+def in_gusts(seed, n=2000, vaf=0.2):
+    """A machine that answers its stick, in gusts that move it more."""
+    rng = np.random.default_rng(seed)
+    u = steps(rng, n)
+    phi, _ = response(u, np.zeros(n))
+    gust, _ = response(rng.standard_normal(n), np.zeros(n))
+    return u, phi + gust * phi.std() / gust.std() * np.sqrt(1.0 / vaf - 1.0)
+
+
+@pytest.mark.parametrize(("made", "refused"), [(on_the_ground, True), (in_gusts, False)])
+def test_where_no_output_follows_any_input_nothing_is_determined(made, refused):
+    u, phi = made(2)
+    f = Flight(dt=DT, inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
+    found = check(problem(f))
+    assert (found.findings[0].severity == "refuse") == refused
+    assert (found.verdict.undetermined == tuple(FREE)) == refused
+
+
 def test_of_a_stick_that_stays_for_equal_times_it_is_said_how_to_state_a_test_signal_s_clock():
     # 1.2 values in a period of the swing at 0.95 Hz: a slow channel, or steps with a clock.
     u = np.repeat(np.random.default_rng(0).standard_normal(60), 40)

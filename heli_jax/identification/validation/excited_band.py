@@ -34,6 +34,10 @@ _WIDTH, _BINS = 0.25, 3
 vibration, or chance"""
 _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
+NOTHING = 0.2
+"""of the power of each output, below which inputs that no output follows over a band tell nothing,
+where they follow the response or none of it is beyond chance: a machine that is not flying had 0.11
+"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
 _NOISE = 0.5
@@ -191,8 +195,27 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
         findings.append(Finding("excited band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        findings.append(Finding("excited band", "doubt", NOTHING_FOLLOWS, None, criterion))
+        share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
+        criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
+        findings.insert(0, Finding("excited band", "doubt", NOTHING_FOLLOWS, share, criterion))
     return findings
+
+
+def _share(pooled: _Pooled, i: int) -> float:
+    """Of an output's power where inputs have some, the part that follows them, less what chance
+    makes of few segments."""
+    excited, (_, segments, m) = _excited(pooled), pooled.inputs.shape
+    y, u = pooled.outputs[excited, :, i], pooled.inputs[excited]
+    left = float(np.sum(np.abs(without(u, y)) ** 2))
+    whole, chance = float(np.sum(np.abs(y) ** 2)), min(m / (0.9 * segments), 0.99)
+    return max(1.0 - left / max(whole, 1e-300) / (1.0 - chance), 0.0)
+
+
+def _excited(pooled: _Pooled) -> Bool[np.ndarray, " k"]:
+    """The frequencies at which an input has power: beyond, what a filter or a window has left of
+    both signals is coherent as well."""
+    power = np.sum(np.abs(pooled.inputs) ** 2, axis=1)
+    return np.any(power >= _LEAST_POWER * np.max(power, axis=0), axis=1)
 
 
 def _follow_together(pooled: _Pooled) -> bool:
@@ -208,7 +231,7 @@ def _follow_together(pooled: _Pooled) -> bool:
         y = pooled.outputs[:, :, i]
         left = np.sum(np.abs(without(pooled.inputs, y)) ** 2, axis=1)
         multiple = 1.0 - left / np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
-        run = longest_band(pooled.hz, multiple >= max(COHERENT, chance))
+        run = longest_band(pooled.hz, (multiple >= max(COHERENT, chance)) & _excited(pooled))
         if run is not None and _is_band(run, step):
             return True
     return False
