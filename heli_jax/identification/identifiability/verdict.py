@@ -108,10 +108,11 @@ class Verdict:
     covariance: np.ndarray
     """(q, q) in relative coordinates; the undetermined directions are left out of it"""
     correlation: np.ndarray
-    # A key of fit.json: a prior's share in the posterior precision, 1 / variance.
+    # A key of fit.json.
     prior_share: dict[str, float]
-    """share of what is known of a parameter that came from priors: its own, and the weak ones of
-    the nuisances; 1 where the data said nothing"""
+    """share (P R P)_ii / P_ii of the posterior variance P that the priors with the information R
+    explain: its own, those of others, and the weak ones of the nuisances; 1 where the data say
+    nothing"""
     sentences: tuple[str, ...]
     resting: tuple[str, ...] = ()
     """parameters that are determined by priors, and not by the data alone"""

@@ -9,8 +9,8 @@ import scipy.special
 from jaxtyping import Bool, Complex, Float
 
 from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.hardly_moving import hardly_moving
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
@@ -42,7 +42,8 @@ _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
 _NOISE = 0.5
 """of what white noise has, in steps from sample to sample: above it an output shows no motion"""
-NOTHING_FOLLOWS = (
+NOTHING_FOLLOWS = "excitation.nothing-follows"
+_NOTHING = (
     "no output follows any input coherently over a band of frequencies: noise, disturbances or "
     "something else moves the machine more than the sticks do."
 )
@@ -97,12 +98,12 @@ def _free_motion(flights: Sequence[Flight]) -> Finding:
     criterion = f"mean squared step of an output over that of white noise, {_NOISE:g}"
     if turns[name] > _NOISE:
         words = "no input moves, and the outputs show noise alone: nothing is excited."
-        return Finding("excited band", "refuse", words, turns[name], criterion)
+        return Finding(NOTHING_FOLLOWS, "refuse", words, turns[name], criterion)
     words = (
         f"no input moves: {name} shows how the machine moves freely from its first state, or under "
         "constant inputs; what inputs do beyond that is not in the record."
     )
-    return Finding("excited band", "note", words, turns[name], criterion)
+    return Finding("excitation.free-motion", "note", words, turns[name], criterion, (name,))
 
 
 def _roughness(y: Float[np.ndarray, " N"]) -> float:
@@ -189,15 +190,15 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
                 f"{limit:.2f}.{left}"
             )
             # No pass: this input alone moves nothing, though several together may.
-            findings.append(Finding("excited band", "note", words, None, criterion))
+            findings.append(Finding("excitation.excited-band", "note", words, None, criterion))
             continue
         followed = True
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
-        findings.append(Finding("excited band", "ok", words, best.peak, criterion))
+        findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
         share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
         criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
-        findings.insert(0, Finding("excited band", "doubt", NOTHING_FOLLOWS, share, criterion))
+        findings.insert(0, Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
     return findings
 
 
@@ -332,12 +333,12 @@ def _pair_findings(
             f"{a} and {b} move together{where} (coherence {mean:.2f}, other inputs taken out): "
             f"their effects cannot be told apart there, and {wider}; move one at a time."
         )
-        findings.append(Finding("inputs together", "doubt", words, mean, criterion))
+        findings.append(Finding("excitation.inputs-together", "doubt", words, mean, criterion))
     if findings:
         return findings
     mean, a, b, _ = pairs[0]
     words = f"no two inputs move together (most {a} and {b}: coherence {mean:.2f})."
-    return [Finding("inputs together", "ok", words, mean, criterion)]
+    return [Finding("excitation.inputs-together", "ok", words, mean, criterion)]
 
 
 def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Finding]:
@@ -353,7 +354,7 @@ def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Fin
             f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; whether an output "
             f"follows it was not computed: {why}."
         )
-        findings.append(Finding("excited band", "doubt", words))
+        findings.append(Finding("excitation.excited-band", "doubt", words))
     return findings
 
 
