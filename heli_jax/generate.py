@@ -343,7 +343,7 @@ def follow(experiment: Experiment) -> Simulated:
     runs: dict[str, Trajectory] = {}
     notes: list[str] = []
     gain = experiment.config.fit is not None and experiment.config.fit.nuisance.input_gain
-    for flight in read_flights(experiment, gain=gain, moving_inputs=False):
+    for flight in read_flights(experiment, gain=gain):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
         run = simulate(model, naming.replace(experiment.vehicle.params, **known), flight)
         outputs = {n: np.asarray(v) for n, v in naming.asdict(run.outputs).items()}

@@ -230,6 +230,16 @@ class Flight:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)
 
+    def logged_step(self, name: str, kind: str) -> float:
+        """Usual time between a signal's samples as they were logged [s]; `dt` where none is known.
+
+        Args:
+            name: the model's.
+            kind: `input` or `output`.
+        """
+        facts = self.source.facts.get((name, kind)) if self.source else None
+        return facts.usual if facts is not None and facts.usual > 0 else self.dt
+
     # Imported within: `summaries` is for notebooks, and a flight is made without it.
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_flight

@@ -19,6 +19,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -43,6 +44,7 @@ from heli_jax.identification.further_starts import (
 )
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
@@ -51,6 +53,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
+    Data,
     Layout,
     Noise,
     Solution,
@@ -60,7 +63,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.expected_accuracy import (
     guessed_gusts,
     starting_at_zero,
@@ -115,11 +118,27 @@ def first_guess(problem: Problem) -> FirstGuess:
     z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, begun)
+
+
+def _in_free_motion(
+    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
+) -> tuple[Array, Evaluation]:
+    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    from rest at zero no parameter would have any effect."""
+    own = slice(layout.first_nuisance, layout.size)
+    if not (layout.initial_state and np.isfinite(e.J).all()):
+        return z, e
+    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
+    moved = z.at[own].add(step)
+    after = evaluate(layout, data, noise, moved)
+    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -174,6 +193,10 @@ def check(problem: Problem) -> Check:
     )
     sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
+    # Sensitivities are those of the model, whatever moved what was measured.
+    for nothing in [f for f in findings if f.code == NOTHING_FOLLOWS and f.severity == "refuse"]:
+        names = listed(verdict.names, "or")
+        verdict = verdict.nothing(f"The data do not determine {names}: {nothing.sentence}")
     slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
     findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
     return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))
