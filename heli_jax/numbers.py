@@ -237,6 +237,10 @@ def _signed(text: str) -> str:
     return text
 
 
+ADEQUATE = {True: "yes", False: "no", None: "not judged"}
+"""words for `adequate` of fit.json"""
+
+
 def adequacy_of(content: Mapping[str, Any]) -> str:
     """The verdict on adequacy in words; by yes and no alone of fits of earlier versions.
 
@@ -244,4 +248,4 @@ def adequacy_of(content: Mapping[str, Any]) -> str:
         content: of fit.json.
     """
     summary = (content.get("adequacy") or {}).get("summary")
-    return str(summary or {True: "yes", False: "no", None: "not judged"}[content["adequate"]])
+    return str(summary or ADEQUATE[content["adequate"]])

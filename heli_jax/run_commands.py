@@ -10,7 +10,7 @@ from typing import Any
 
 from heli_jax import run_directory
 from heli_jax.errors import InputError
-from heli_jax.numbers import adequacy_of
+from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
 from heli_jax.terminal_table import print_table, tell
 
@@ -47,7 +47,7 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
         try:
             content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST))
             # Without its reasons, for which a table has no room.
-            adequate = adequacy_of(content).partition(" (")[0]
+            adequate = ADEQUATE[content["adequate"]]
             row = {k: content[k] for k in ("model", "method", "status")}
             untrusted = ", ".join(map(str, content.get("untrusted") or ()))
             date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))

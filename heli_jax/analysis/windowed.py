@@ -65,8 +65,8 @@ class Windowed(NamedTuple):
     """(W, p) 1 where all samples of an output are there, else 0"""
     own: np.ndarray
     """(k, p, m) where an input and an output have more power than the window's sidelobes bring"""
-    notes: tuple[str, ...]
-    """outputs that are left out, and why"""
+    left_out: dict[str, str]
+    """by output that is left out, why"""
 
     @property
     def lines(self) -> np.ndarray:
@@ -179,7 +179,7 @@ def windowed(
         n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
     )
     starts = tuple(_starts(f, length) for f in flights)
-    outputs, seen, notes = _complete(flights, starts, length, (length * dt, len(inputs)))
+    outputs, seen, left_out = _complete(flights, starts, length, (length * dt, len(inputs)))
     cut = _Cut(starts, length, lines, dt)
     U, of_inputs = cut.transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
     Z = U
@@ -191,7 +191,7 @@ def windowed(
     own = of_inputs[:, None, :] & of_outputs[:, :, None]
     Y = Y * seen[:, None, :]
     names, numbers = (inputs, instruments, outputs), tuple(lines.tolist())
-    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, own, notes)
+    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, own, left_out)
 
 
 class _Cut(NamedTuple):
@@ -221,7 +221,7 @@ def _complete(
     starts: tuple[tuple[int, ...], ...],
     length: int,
     asked: tuple[float, int],
-) -> tuple[tuple[str, ...], np.ndarray, tuple[str, ...]]:
+) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:
     """The outputs that have windows enough, which windows (W, p), and why others have not.
 
     Args:
@@ -246,12 +246,8 @@ def _complete(
             "flights"
         )
     each = list(zip(outputs, averages, kept, strict=True))
-    notes = tuple(
-        f"{n}: its responses take no part, {need} {count:.2g} {windows}."
-        for n, count, fine in each
-        if not fine
-    )
-    return tuple(n for n, _, fine in each if fine), seen[:, kept], notes
+    left_out = {n: f"{need} {count:.2g} {windows}" for n, count, fine in each if not fine}
+    return tuple(n for n, _, fine in each if fine), seen[:, kept], left_out
 
 
 def _one_rate(flights: Sequence[Flight]) -> float:

@@ -225,8 +225,12 @@ class Fit:
         """`yes`, `not judged` (no optimum was reached), or `no (VAF of p is 20.0 %)`."""
         if self.status == "not-converged":
             return "not judged"
-        why = dict.fromkeys(f.brief for f in self.findings if f.denies)
-        return f"no ({'; '.join(why)})" if why else "yes"
+        return f"no ({'; '.join(self.denials)})" if self.denials else "yes"
+
+    @property
+    def denials(self) -> tuple[str, ...]:
+        """Why the model is not adequate, each in a few words."""
+        return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
 
     @property
     def disturbable(self) -> bool:

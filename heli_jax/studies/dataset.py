@@ -10,6 +10,7 @@ import xarray as xr
 
 from heli_jax.config.study import Study
 from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import ADEQUATE
 from heli_jax.yaml_file import as_yaml
 
 FAILED, NOT_RUN = "failed", "not run"
@@ -21,7 +22,6 @@ _ESTIMATE = {
     "high": ("upper95", "upper end of the 95 % interval"),
 }
 _NUMBERS = ("n_samples", "steps", "log_likelihood", "aic", "bic")
-_ADEQUATE = {True: "yes", False: "no", None: "not judged"}
 
 # Any below: what fit.json holds.
 Fits = Sequence[Mapping[str, Any] | None]
@@ -60,7 +60,7 @@ def dataset(
         "status": [_status(fit) for fit in fits],
         "verdict": [_verdict(fit) for fit in fits],
         "untrusted": [", ".join(f["untrusted"]) if _is_fit(f) else "" for f in fits],
-        "adequate": ["" if not _is_fit(f) else _ADEQUATE[f["adequate"]] for f in fits],
+        "adequate": ["" if not _is_fit(f) else ADEQUATE[f["adequate"]] for f in fits],
         "sentence": ["" if fit is None else str(fit.get("sentence", "")) for fit in fits],
         "run": [f"fits/{name}" for name in names],
     }

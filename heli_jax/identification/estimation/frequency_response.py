@@ -243,6 +243,7 @@ class FrequencyResponse(Estimator):
         pairs = pair_agreements(
             w, used, H, E, weights.variance(), weights.coherence, weights.simulated
         )
+        left_out = [f"{n}: its responses take no part, {why}." for n, why in w.left_out.items()]
         return ResponseAgreement(
             pairs,
             2.0 * float(np.sum(np.abs(white) ** 2)) / freedom,
@@ -252,7 +253,7 @@ class FrequencyResponse(Estimator):
             w.seconds,
             tuple(zip(w.outputs, w.averages.tolist(), strict=True)),
             w.instruments,
-            w.notes if w.together else (*w.notes, APART),
+            (*left_out, *(() if w.together else (APART,))),
         )
 
 

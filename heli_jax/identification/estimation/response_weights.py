@@ -210,8 +210,8 @@ def _require_lines(w: Windowed, options: ResponseOptions, asked: Bool[np.ndarray
         if pair.input not in w.inputs:
             raise ValueError(f"{place}: {pair.input} does not move, expected an input that does")
         if pair.output not in w.outputs:
-            why = [n for n in w.notes if n.startswith(f"{pair.output}:")] or ["it is not measured"]
-            raise ValueError(f"{place}: no response of {pair.output}; {why[0]}")
+            why = w.left_out.get(pair.output, "it is not measured")
+            raise ValueError(f"{place}: no response of {pair.output}; {why}")
         low, high = pair.band or (0.0, np.inf)
         if not np.any((w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))):
             raise ValueError(
