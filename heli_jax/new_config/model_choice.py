@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax import models
-from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
@@ -90,16 +90,17 @@ def other_vehicle(log: ChannelLog | None) -> str:
         return (
             f"a multirotor ({firmware[:40]})" if firmware.startswith(_OF_ROTORS) and motors else ""
         )
-    if (frame := has.get("CA_AIRFRAME")) is not None:
-        kind = _AIRFRAMES[int(frame)] if 0 <= frame < len(_AIRFRAMES) else ""
+    frame, mav = has.get("CA_AIRFRAME"), has.get("MAV_TYPE")
+    if isinstance(frame, int):
+        kind = _AIRFRAMES[frame] if 0 <= frame < len(_AIRFRAMES) else ""
         return f"{kind} (CA_AIRFRAME {frame})" if kind else ""
-    if (mav := has.get("MAV_TYPE")) in _MAV_TYPES:
-        return f"{_MAV_TYPES[int(mav)]} (MAV_TYPE {mav})"
+    if isinstance(mav, int) and mav in _MAV_TYPES:
+        return f"{_MAV_TYPES[mav]} (MAV_TYPE {mav})"
     for field, known in (("is_vtol", {1: "a VTOL aircraft"}), ("vehicle_type", _TYPES)):
         name = f"vehicle_status.{field}"
-        values = log.topic_of(name).columns[name] if name in log.names else ()
-        if len(values) and int(values[-1]) in known:
-            return f"{known[int(values[-1])]} ({name} {int(values[-1])})"
+        values = as_floats(log.topic_of(name).columns[name]) if name in log.names else np.zeros(0)
+        if values.size and values[-1] in known:
+            return f"{known[int(values[-1])]} ({name} {values[-1]:g})"
     return ""
 
 

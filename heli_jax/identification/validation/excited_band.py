@@ -198,7 +198,7 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
     if not followed and not _follow_together(pooled):
         share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
         criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
-        findings.insert(0, Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
+        findings.append(Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
     return findings
 
 
