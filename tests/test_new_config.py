@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from heli_jax import cli, load_config, units, yaml_file
 from heli_jax.config import read_flights
@@ -81,6 +82,28 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     assert cli.main(["new", str(log), "--out", str(out)]) == 2
     assert "is there already" in capsys.readouterr().err
     assert out.read_text() == before
+
+
+@pytest.mark.parametrize("seen", ["in time", "late", "late, in noise"])
+def test_a_stick_that_is_logged_late_gets_a_time_shift(tmp_path: Path, seen: str) -> None:
+    """100 Hz, 20 s of a chirp; a stick 0.15 s late is no feedback where it is smooth."""
+    t, late = 0.01 * np.arange(4000), 0.0 if seen == "in time" else 0.15
+    rng = np.random.default_rng(1)
+    fine = np.arange(0.0, 40.0, 0.001)
+    noise = rng.standard_normal(fine.size) * (seen == "late, in noise")
+    noise = scipy.signal.lfilter([0.01], [1.0, -0.99], noise)
+    stick = 0.3 * np.sin(2.0 * np.pi * (0.2 + 0.02 * fine) * fine) + noise
+    p = scipy.signal.lfilter([0.005], [1.0, -0.995], stick)
+    columns = np.c_[t, np.interp(t - late, fine, stick), np.interp(t, fine, p)]
+    columns[:, 1:] += 1e-3 * rng.standard_normal((t.size, 2))
+    log, out = tmp_path / "run.csv", tmp_path / "run.yaml"
+    np.savetxt(log, columns, delimiter=",", header="t,lat,p", comments="", fmt="%.6g")
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    assert made.fit is not None
+    assert made.fit.nuisance.time_shift is (seen == "late")
+    # Feedback looks like that too: then it is a comment.
+    assert ("(feedback)" in out.read_text()) is (seen == "late, in noise")
 
 
 def test_what_only_the_user_knows_is_refused_until_it_is_given(
