@@ -92,12 +92,14 @@ def of_problem(problem: Any) -> Summary:
 
 def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
     """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate."""
-    # prior share: of the posterior's precision (1/sd²), what the prior and not the data gives.
+    # prior share: of the estimate's variance, what the priors and not the data explain.
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
-        if e.sd is None or e.lower95 is None or e.upper95 is None:
+        if e.sd is None:
             cells = ("not determined", "", "")
+        elif e.lower95 is None or e.upper95 is None:
+            cells = (*measured(e.sd, e.value), "not trusted")
         else:
             # To the digits that the sd leaves, all four alike.
             value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)

@@ -14,6 +14,7 @@ from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.errors import InputError
 from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
+from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.new_config import scales, tables, write_config
 from heli_jax.new_config.guess import (
     Series,
@@ -25,6 +26,7 @@ from heli_jax.new_config.guess import (
     without_unit,
     words_of,
 )
+from heli_jax.new_config.model_choice import other_vehicle
 from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
@@ -84,26 +86,33 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     assert out.read_text() == before
 
 
-@pytest.mark.parametrize("seen", ["in time", "late", "late, in noise"])
-def test_a_stick_that_is_logged_late_gets_a_time_shift(tmp_path: Path, seen: str) -> None:
-    """100 Hz, 20 s of a chirp; a stick 0.15 s late is no feedback where it is smooth."""
-    t, late = 0.01 * np.arange(4000), 0.0 if seen == "in time" else 0.15
-    rng = np.random.default_rng(1)
-    fine = np.arange(0.0, 40.0, 0.001)
-    noise = rng.standard_normal(fine.size) * (seen == "late, in noise")
-    noise = scipy.signal.lfilter([0.01], [1.0, -0.99], noise)
-    stick = 0.3 * np.sin(2.0 * np.pi * (0.2 + 0.02 * fine) * fine) + noise
-    p = scipy.signal.lfilter([0.005], [1.0, -0.995], stick)
-    columns = np.c_[t, np.interp(t - late, fine, stick), np.interp(t, fine, p)]
-    columns[:, 1:] += 1e-3 * rng.standard_normal((t.size, 2))
+@pytest.mark.parametrize(("late", "feedback"), [(0, False), (15, True), (15, False)])
+def test_a_stick_that_is_logged_late_gets_a_time_shift(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: int, feedback: bool
+) -> None:
+    """100 Hz; the roll rate answers a stick 20 ms after it. Feedback looks like lateness too."""
+    rng, n = np.random.default_rng(1), 4000
+    stick = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(n))
+    p = scipy.signal.lfilter([0.0, 0.0, 0.08], [1.0, -0.92], stick)
+    p += 0.01 * rng.standard_normal(n)
+    columns = np.c_[0.01 * np.arange(n), np.r_[np.zeros(late), stick[: n - late]], p]
     log, out = tmp_path / "run.csv", tmp_path / "run.yaml"
     np.savetxt(log, columns, delimiter=",", header="t,lat,p", comments="", fmt="%.6g")
+    if not feedback:
+        monkeypatch.setattr("heli_jax.new_config.feedback", lambda flight: ())
     assert cli.main(["new", str(log), "--out", str(out)]) == 0
     made = Config.model_validate(yaml_file.read_mapping(out))
     assert made.fit is not None
-    assert made.fit.nuisance.time_shift is (seen == "late")
-    # Feedback looks like that too: then it is a comment.
-    assert ("(feedback)" in out.read_text()) is (seen == "late, in noise")
+    assert made.fit.nuisance.time_shift is (late > 0 and not feedback)
+    (line,) = (line for line in out.read_text().splitlines() if "time_shift" in line)
+    assert ("GUESS" in line) is (late > 0)
+
+
+def test_a_model_of_one_s_own_beside_the_configuration(tmp_path: Path) -> None:
+    assert cli.main(["new-model", "pendulum", "--out", str(tmp_path / "own")]) == 0
+    log, out = write(tmp_path / "run.csv", table("theta_deg")), tmp_path / "own" / "mine.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "pendulum:model"]) == 0
+    assert yaml_file.read_mapping(out)["model"] == "pendulum:model"
 
 
 def test_what_only_the_user_knows_is_refused_until_it_is_given(
@@ -227,6 +236,19 @@ def test_names_of_a_log_cannot_leave_their_place(tmp_path: Path) -> None:
     assert made.flights[0].signals.outputs["p"].signal == "p"
 
 
+@pytest.mark.parametrize("mark", ["\x1b[2J", "\x7f", "\x9b", "\u202e", "\ufeff", "\U000e0001", "é"])
+def test_what_a_name_holds_is_read_back(
+    tmp_path: Path, mark: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write(tmp_path / f"run{mark}.csv", table(stick=f"aileron{mark} pwm"))
+    out = tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-flybarless"]) == 0
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    assert made.flights[0].log == log.name
+    printed = "".join(capsys.readouterr())
+    assert all(c.isprintable() for line in printed.split("\n") for c in line)
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -314,6 +336,50 @@ def test_units_by_the_size_of_numbers(
     found = scaled("x", Series(np.arange(50.0), values), si)
     assert (found.unit, found.scale) == (unit, scale)
     assert any(r.startswith("GUESS") for r in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("most", "unit", "scale"), [(0.3, "rad", 1.0), (5.0, "deg", 1.0), (95.0, "rad", "EDIT")]
+)
+def test_no_stick_tilts_a_blade_by_a_radian(most: float, unit: str, scale: float | str) -> None:
+    series = Series(np.arange(50.0), np.linspace(-most, most, 50))
+    found = scaled("aileron", series, "rad", is_input=True)
+    assert (found.unit, found.scale) == (unit, scale)
+
+
+@pytest.mark.parametrize(
+    ("kind", "firmware", "parameters", "is_other"),
+    [
+        ("dataflash", "ArduPlane V4.3", {"Q_ENABLE": 0.0}, True),
+        ("dataflash", "ArduPlane V4.3", {"Q_ENABLE": 1.0}, True),
+        ("dataflash", "ArduCopter V4.5.1", {"FRAME_CLASS": 1.0}, True),
+        ("dataflash", "ArduCopter V4.5.1", {"FRAME_CLASS": 6.0, "H_SW_TYPE": 3.0}, False),
+        ("dataflash", "ArduCopter V3.1 (heli)", {"FRAME": 0.0}, False),
+        ("dataflash", "ArduCopter V3.1", {"FRAME": 1.0, "RATE_RLL_P": 0.1}, True),
+        ("dataflash", "", {}, False),
+        ("ulog", "PX4 A", {"MAV_TYPE": 22}, True),
+        ("ulog", "PX4 A", {"MAV_TYPE": 2, "CA_AIRFRAME": 10}, False),
+        ("ulog", "PX4 A", {"MAV_TYPE": 4}, False),
+        ("ulog", "PX4 A", {"CA_AIRFRAME": 0}, True),
+        ("ulog", "PX4 A", {}, False),
+        ("blackbox", "Betaflight 4.4.0", {}, True),
+        ("blackbox", "Rotorflight 4.3.0", {}, False),
+    ],
+)
+def test_what_vehicle_a_log_is_of(kind: str, firmware: str, parameters, is_other: bool) -> None:
+    motors = {f"motor[{i}]": np.zeros(9) for i in range(4)}
+    topics = (Topic("main", np.arange(9.0), motors, {}, "time"),)
+    log = ChannelLog("a", kind, 1, "0", topics, firmware, parameters)
+    assert bool(other_vehicle(log)) == is_other
+
+
+@pytest.mark.parametrize(("name", "values", "is_other"), [
+    ("vehicle_type", (0, 2), True), ("is_vtol", (1, 1), True), ("vehicle_type", (0, 1), False),
+])  # fmt: skip
+def test_px4_says_what_vehicle_it_is(name: str, values, is_other: bool) -> None:
+    columns = {f"vehicle_status.{name}": np.array(values)}
+    topics = (Topic("vehicle_status", np.arange(2.0), columns, {}, "timestamp"),)
+    assert bool(other_vehicle(ChannelLog("a", "ulog", 1, "0", topics))) == is_other
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
-/* The full helicopter, with flapping, tail force and power, governor and inflow in any descent, in
-   double precision: what a careful programmer writes by hand. Vehicles lie side by side in blocks so that the compiler vectorises over them;
-   they differ in Ixx, all else is computed once before the run. */
+/* The full helicopter, with flapping, tail force and power and governor, in double precision: what a
+   careful programmer writes by hand. Vehicles lie side by side in blocks so that the compiler
+   vectorises over them; they differ in Ixx, all else is computed once before the run. */
 #include <math.h>
 #include <stddef.h>
 
@@ -65,13 +65,17 @@ static Factors factors(const Vehicle *p) {
   };
 }
 
-/* The root v of 2 v s = T0 - b v with the flow s of descent_inflow.py, Newton within a bracket. */
+/* The root v of 2 v s = T0 - b v with the flow s of inflow.py, by plain Newton steps from above. */
 static inline double induced_velocity(double V2, double W, double T0, double b) {
   double sign = T0 < 0 ? -1.0 : 1.0, c = sign * W, t = sign * T0, q = 2 * c + b;
   double root = sqrt(q * q + 8 * t) + REST;
   double axial = q > 0 ? 2 * t / (fabs(q) + root) : 0.25 * (root - q);
   double edgewise = t / (2 * sqrt(V2 + REST * REST) + b + REST);
-  double x = axial < edgewise ? axial : edgewise, low = 0, high = t / (b + REST);
+  double x = axial < edgewise ? axial : edgewise;
+  double back = b - 2 * c, inside = back * back - 8 * t;
+  int there = (back > 0) & (inside > 0);
+  double windmill = 2 * t / (fabs(back) + sqrt(there ? inside : 0) + REST);
+  x = there & (2.2 * windmill < -c) & (windmill < x) ? windmill : x;
 #pragma GCC unroll 8
   for (int i = 0; i < NEWTON; i++) {
     double below = -c - 0.5 * x, above = 2.2 * x + c, product = below * above;
@@ -79,10 +83,7 @@ static inline double induced_velocity(double V2, double W, double T0, double b) 
     double ratio = in / (x * x + 5.8 * V2 + REST * REST), w = c + x;
     double s2 = V2 + w * w + 0.37 * ratio * in + REST * REST, s = sqrt(s2);
     double ds2 = 2 * w + 0.74 * ratio * (din - x * ratio);
-    double surplus = 2 * x * s + b * x - t;
-    low = surplus > 0 ? low : x, high = surplus > 0 ? x : high;
-    double step = x - s * surplus / (2 * s2 + x * ds2 + b * s);
-    x = (step >= low) & (step <= high) ? step : 0.5 * (low + high);
+    x -= s * (2 * x * s + b * x - t) / (2 * s2 + x * ds2 + b * s);
   }
   return sign * x;
 }

@@ -1,7 +1,7 @@
 """Speed of the variant `full` against the same equations in C, as `helicopter.py` has the other.
 
-Flapping, tail force and power, governor and inflow in any descent: from hover, 10 s at 50 Hz, RK4
-with 4 steps a sample, small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
+Flapping, tail force and power, and governor: from hover, 10 s at 50 Hz, RK4 with 4 steps a
+sample, small steps of all sticks, 1024 vehicles that differ in Ixx, on one core.
 """
 
 import sys

@@ -8,7 +8,7 @@
 #define LANES 16 /* vehicles in flight at once: -DLANES=8 */
 #endif
 #define STATES 15
-#define NEWTON 5
+#define NEWTON 7
 #define REST 1e-8
 
 enum { X, Y, Z, PHI, THETA, PSI, DX, DY, DZ, DPHI, DTHETA, DPSI, BETA_ROLL, BETA_PITCH, OMEGA };
@@ -55,20 +55,25 @@ static Factors factors(const Vehicle *p) {
   };
 }
 
-/* The root v of 2 v sqrt(V2 + (W + v)^2) = T0 - b v: one root and one division a Newton step. */
+/* The root v of 2 v s = T0 - b v with the flow s of inflow.py, by plain Newton steps from above. */
 static inline double induced_velocity(double V2, double W, double T0, double b) {
   double sign = T0 < 0 ? -1.0 : 1.0, c = sign * W, t = sign * T0, q = 2 * c + b;
   double root = sqrt(q * q + 8 * t) + REST;
   double axial = q > 0 ? 2 * t / (fabs(q) + root) : 0.25 * (root - q);
-  double edgewise = t / (2 * sqrt(V2 + REST * REST) + b);
+  double edgewise = t / (2 * sqrt(V2 + REST * REST) + b + REST);
   double x = axial < edgewise ? axial : edgewise;
+  double back = b - 2 * c, inside = back * back - 8 * t;
+  int there = (back > 0) & (inside > 0);
+  double windmill = 2 * t / (fabs(back) + sqrt(there ? inside : 0) + REST);
+  x = there & (2.2 * windmill < -c) & (windmill < x) ? windmill : x;
 #pragma GCC unroll 8
   for (int i = 0; i < NEWTON; i++) {
-    double w = c + x, s2 = V2 + w * w + REST * REST, s = sqrt(s2);
-    double slope = 2 * (s2 + x * w) + b * s;
-    double other = 2 * s2 + b * s;
-    x -= s * (2 * x * s + b * x - t) / (slope > 0 ? slope : other);
-    x = x > 0 ? x : 0;
+    double below = -c - 0.5 * x, above = 2.2 * x + c, product = below * above;
+    double in = product > 0 ? product : 0, din = product > 0 ? 2.2 * below - 0.5 * above : 0;
+    double ratio = in / (x * x + 5.8 * V2 + REST * REST), w = c + x;
+    double s2 = V2 + w * w + 0.37 * ratio * in + REST * REST, s = sqrt(s2);
+    double ds2 = 2 * w + 0.74 * ratio * (din - x * ratio);
+    x -= s * (2 * x * s + b * x - t) / (2 * s2 + x * ds2 + b * s);
   }
   return sign * x;
 }

@@ -225,14 +225,20 @@ def induced_velocity(V2: Any, W: Any, T0: Any, b: Any, sqrt: Any) -> Any:
     q = 2 * c + b
     root = sqrt(q * q + 8 * t) + 1e-8
     axial = 2 * t / (q + root) if q > 0 else 0.25 * (root - q)
-    x = min(axial, t / (2 * sqrt(V2 + 1e-16) + b))
-    for _ in range(5):
-        w = c + x
-        s2 = V2 + w * w + 1e-16
+    x = min(axial, t / (2 * sqrt(V2 + 1e-16) + b + 1e-8))
+    q = b - 2 * c
+    if q > 0 and (inside := q * q - 8 * t) > 0:
+        windmill = 2 * t / (q + sqrt(inside) + 1e-8)
+        x = min(windmill, x) if 2.2 * windmill < -c else x
+    for _ in range(7):
+        below, above, w = -c - 0.5 * x, 2.2 * x + c, c + x
+        q = max(below * above, 0.0)
+        dq = 2.2 * below - 0.5 * above if q > 0 else 0.0
+        ratio = q / (x * x + 5.8 * V2 + 1e-16)
+        s2 = V2 + w * w + 0.37 * ratio * q + 1e-16
         s = sqrt(s2)
-        slope = 2 * (s2 + x * w) + b * s
-        x -= s * (2 * x * s + b * x - t) / (slope if slope > 0 else 2 * s2 + b * s)
-        x = max(x, 0.0)
+        ds2 = 2 * w + 0.74 * ratio * (dq - x * ratio)
+        x -= s * (2 * x * s + b * x - t) / (2 * s2 + x * ds2 + b * s)
     return sign * x
 
 

@@ -5,15 +5,11 @@ then divided by the rotor's speed, and a rotor at rest is an ordinary point.
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 from heli_jax.dynamics.inflow import induced_velocity
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
-
-type Inflow = Callable[[Scalar, Scalar, Scalar, Scalar], Scalar]
-"""The induced velocity by V2, W, T0 and b, as `inflow.induced_velocity` has them."""
 
 
 class Flow(NamedTuple):
@@ -88,7 +84,6 @@ def thrust(
     theta0: Scalar,
     flow: Flow,
     vi: Scalar | None = None,
-    solve: Inflow = induced_velocity,
 ) -> RotorForce:
     r"""Thrust of the main rotor, eq. 13, with the inflow of momentum theory.
 
@@ -105,7 +100,6 @@ def thrust(
         theta0: collective pitch [rad], eq. 18.
         flow: the air that the rotor meets.
         vi: induced velocity [m/s]; solved for unless given, as by dynamic inflow.
-        solve: how it is solved for.
     """
     # Blade-element theory has B/2 mu^2 theta0 in the bracket beside these three; the paper drops
     # it, and the tests' quadrature agrees with eq. 13 up to that term alone.
@@ -116,7 +110,7 @@ def thrust(
     lifting = (half * p.B**3 / 3.0 * p.R**2) * Omega**2 * theta0 + b * flow.edgewise
     T0 = lifting - b * flow.W
     if vi is None:
-        vi = solve(flow.V2, flow.W, T0, b)
+        vi = induced_velocity(flow.V2, flow.W, T0, b)
     return RotorForce((p.rho * math.pi * p.R**2) * (T0 - b * vi), flow.W + vi, vi, T0)
 
 
@@ -166,7 +160,6 @@ def tail_thrust(
     theta0T: Scalar,
     V2: Scalar,
     W: Scalar,
-    solve: Inflow = induced_velocity,
 ) -> RotorForce:
     r"""Thrust of the tail rotor with inflow, in place of eq. 16's.
 
@@ -179,14 +172,13 @@ def tail_thrust(
         theta0T: pitch of the tail rotor's blades [rad], eq. 17.
         V2: square of the speed in the tail rotor's plane [m^2/s^2].
         W: speed against its thrust [m/s].
-        solve: how the induced velocity follows.
     """
     # Two terms where the main rotor has three: without cyclic pitch no blade angle meets the
     # edgewise flow by direction. The speed V2 acts through the induced velocity alone.
     half = 0.5 * p.a_T * solidity(p.R_T, p.c_T)
     b = (half * 0.5 * p.B**2 * p.R_T * p.K_Omega) * Omega
     T0 = (half * p.B**3 / 3.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2 * theta0T - b * W
-    vi = solve(V2, W, T0, b)
+    vi = induced_velocity(V2, W, T0, b)
     return RotorForce((p.rho * math.pi * p.R_T**2) * (T0 - b * vi), W + vi, vi, T0)
 
 

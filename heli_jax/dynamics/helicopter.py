@@ -8,7 +8,7 @@ clockwise seen from above.
 
 `helicopter("paper")` is the paper to the letter; `helicopter("consistent")` has its equations with
 all corrections, and `helicopter()`, the variant "full", a rotor that flaps, a tail rotor with side
-force and power, a governor, and inflow in any descent as well. `helicopter("paper", tail=True)` has
+force and power, and a governor as well. `helicopter("paper", tail=True)` has
 one of them. `Corrections` says what each is. Drag is a disturbance in the paper, so the paper
 variant has none.
 """
@@ -21,14 +21,12 @@ import jax.numpy as jnp
 
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
-from heli_jax.dynamics import descent_inflow, flybar
-from heli_jax.dynamics import inflow as momentum_theory
+from heli_jax.dynamics import flybar
 from heli_jax.dynamics.helicopter_equations import (
     accelerations,
     angular_accelerations,
     body_rates,
     flow,
-    inflow_of,
     main_rotor,
     motion,
     once,
@@ -46,6 +44,7 @@ from heli_jax.dynamics.helicopter_records import (
     Moments,
     Motion,
 )
+from heli_jax.dynamics.inflow import mass_flow
 from heli_jax.dynamics.loads import Rotors, drive, flapping, moments, rigid_hub_moments
 from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
 from heli_jax.dynamics.tail_rotor import tail_rotor
@@ -54,7 +53,7 @@ from heli_jax.naming import Record, Scalar
 from heli_jax.pickled import by_value
 from heli_jax.vehicle import Helicopter
 
-_BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power", "windmill")
+_BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power")
 _OWN_MOTOR = ("collective", "governor")
 # Dynamic inflow has a variant of its own: eqs 8-10 have inflow in equilibrium, and a state more
 # makes a record harder to fit. A bar and a measured rotor speed a machine has or has not.
@@ -239,8 +238,8 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
     # The flow is that of the body's motion alone, without the rotor's own induced velocity: this
     # comes with the thrust, which depends on it.
     air = once(flow(corrections, p, s, u, m))
-    force = main_rotor(corrections, p, s, u, air)
-    tail = tail_rotor(corrections, p, u, m, s.Omega, inflow_of(corrections))
+    force = main_rotor(p, s, u, air)
+    tail = tail_rotor(corrections, p, u, m, s.Omega)
     rotors = Rotors(force, tail)
     shaft = drive(corrections, p, s, u, air, rotors)
     hub, aside = _hub(corrections, p, s, u, m, rotors)
@@ -259,8 +258,7 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
     if corrections.flapping:
         rates |= flapping(corrections, p, s, u, m, force)._asdict()
     if corrections.dynamic_inflow:
-        theory = descent_inflow if corrections.windmill else momentum_theory
-        rates["vi"] = aero.inflow_rate(p, force, theory.mass_flow(force.vi, air.V2, air.W))
+        rates["vi"] = aero.inflow_rate(p, force, mass_flow(force.vi, air.V2, air.W))
     return State(**{n: rates[n] for n in naming.names(State)})
 
 
@@ -322,11 +320,7 @@ def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> di
     """Where the model's range ends, by name; True where it has been left."""
     s = _turning(corrections, s, u)
     air = flow(corrections, p, s, u, motion(corrections, s, u))
-    force = main_rotor(corrections, p, s, u, air)
-    ring = momentum_theory.vortex_ring(air.V2, air.W, force.T0, force.vi)
     outside = {
-        # Momentum theory alone ends there.
-        **({} if corrections.windmill else {"vortex ring": ring}),
         # Limits are told and not enforced: a solver that steps across one goes on smoothly, and the
         # run is marked from there.
         "slow rotor": s.Omega < _SLOWEST * p.Omega,

@@ -1,7 +1,7 @@
 r"""The equations of the whole helicopter, one after another: eqs 2-9, 11 and 18 with corrections.
 
 What the rotors and the motor do to the body is in `loads`, and what goes beyond the paper has files
-of its own: `tip_path_plane`, `tail_rotor`, `governor`, `descent_inflow`.
+of its own: `tip_path_plane`, `tail_rotor`, `governor`, `inflow`.
 
 Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right.
 Body axes are forward, right and down. `helicopter` puts the equations together.
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from heli_jax.dynamics import aerodynamics as aero
-from heli_jax.dynamics import descent_inflow, flybar, inflow
+from heli_jax.dynamics import flybar
 from heli_jax.dynamics.helicopter_records import Attitude, Corrections, Moments, Motion
 from heli_jax.naming import Record, Scalar
 from heli_jax.numerics.sincos import sincos
@@ -189,26 +189,16 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
     return aero.Flow(speed**2, W, speed * (tilt.roll + tilt.pitch))
 
 
-def main_rotor(
-    corrections: Corrections, p: Helicopter, s: Record, u: Record, air: aero.Flow
-) -> aero.RotorForce:
+def main_rotor(p: Helicopter, s: Record, u: Record, air: aero.Flow) -> aero.RotorForce:
     """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state.
 
     Args:
-        corrections: the switches of the variant.
         p: vehicle, SI.
         s: state, with the names of HelicopterState.
         u: inputs, with the names of HelicopterInputs.
         air: the `flow` at the hub.
     """
-    vi = getattr(s, "vi", None)
-    solve = inflow_of(corrections)
-    return once(aero.thrust(p, s.Omega, collective(p, u), air, vi, solve))
-
-
-def inflow_of(corrections: Corrections) -> aero.Inflow:
-    """How the induced velocity follows: momentum theory, or with the windmill branch."""
-    return descent_inflow.induced_velocity if corrections.windmill else inflow.induced_velocity
+    return once(aero.thrust(p, s.Omega, collective(p, u), air, getattr(s, "vi", None)))
 
 
 def accelerations(

@@ -106,8 +106,6 @@ class Corrections(NamedTuple):
     """eqs 2-3, 5: the tail rotor's thrust is a force at its place, not a moment alone"""
     tail_power: bool = False
     """eqs 7, 10: the tail rotor takes its power from the main rotor's shaft"""
-    windmill: bool = False
-    """descents through the rotor's own wake by the measured curve, and the windmill beyond"""
     collective: bool = False
     """eqs 18-19: an input x_collective for the pitch; x_throttle is left with the motor"""
     governor: bool = False

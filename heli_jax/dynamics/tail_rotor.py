@@ -20,7 +20,7 @@ class TailRotor(NamedTuple):
 
 
 def tail_rotor(
-    corrections: Corrections, p: Helicopter, u: Record, m: Motion, Omega: Scalar, solve: aero.Inflow
+    corrections: Corrections, p: Helicopter, u: Record, m: Motion, Omega: Scalar
 ) -> TailRotor:
     """Thrust and torque of the tail rotor.
 
@@ -30,11 +30,10 @@ def tail_rotor(
         u: inputs, with the names of HelicopterInputs.
         m: the `Motion` of the body.
         Omega: main rotor speed [rad/s].
-        solve: how its induced velocity follows.
     """
     theta0T = p.K_theta0T * u.x_yaw
     if corrections.tail:
-        force = tail_force(corrections, p, m, Omega, theta0T, solve)
+        force = tail_force(corrections, p, m, Omega, theta0T)
         T, inflow = force.T, force.inflow
     else:
         # Eq. 16 gives a moment alone. Divided by its arm it is the force that makes it, so that in
@@ -54,7 +53,6 @@ def tail_force(
     m: Motion,
     Omega: Scalar,
     theta0T: Scalar,
-    solve: aero.Inflow,
 ) -> aero.RotorForce:
     """Thrust and inflow of the tail rotor; a positive thrust turns the nose to the right.
 
@@ -64,7 +62,6 @@ def tail_force(
         m: the `Motion` of the body.
         Omega: main rotor speed [rad/s].
         theta0T: pitch of its blades [rad].
-        solve: how the induced velocity follows.
     """
     # Its place is (-L_T, 0, -h_T) and its thrust points to the left: V2 is in its plane, forward
     # and down. W grows with the yaw rate that the thrust makes, which is where yaw damping comes
@@ -76,4 +73,4 @@ def tail_force(
         # would be a coupling in one direction.
         forward, W = forward - p.h_T * m.q, W - p.h_T * m.p
     V2 = forward**2 + (m.w + p.L_T * m.q) ** 2
-    return aero.tail_thrust(p, Omega, theta0T, V2, W, solve)
+    return aero.tail_thrust(p, Omega, theta0T, V2, W)

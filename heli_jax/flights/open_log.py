@@ -21,7 +21,7 @@ from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.gzipped import inner_ending, is_gzipped
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import Table, require_short_names, shown, wrong
 from heli_jax.flights.table_view import with_joined_clock
 from heli_jax.regular_file import open_regular, require_regular
 
@@ -119,6 +119,8 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
             opened = reader(path)
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
+    for log in opened if isinstance(opened, tuple) else (opened,):
+        require_short_names(log.path, log.names)
     # Arrays may have lengths of their own, of which no row is made.
     if isinstance(opened, tuple | array_table.ArrayTable):
         return opened
@@ -130,6 +132,9 @@ _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
 
 def _reader(path: Path) -> _Reader:
     ending = path.suffix.lower()
+    with open_regular(path, "a log", sys.maxsize) as file:
+        head = file.read(_SNIFFED)
+    foreign_files.refuse(path, head)
     # By the ending first where it says enough, so that a damaged Parquet file is called so and not
     # read as text.
     if ending == ".parquet":
@@ -139,9 +144,6 @@ def _reader(path: Path) -> _Reader:
             problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
             raise wrong(str(path), f"{problem}; expected it unpacked")
         return open_csv
-    with open_regular(path, "a log", sys.maxsize) as file:
-        head = file.read(_SNIFFED)
-    foreign_files.refuse(path, head)
     marked = _by_content(head)
     # What such a file begins with is the user's own text, which may look like the mark of any
     # other; but an autopilot's log may have been given the name of a table.

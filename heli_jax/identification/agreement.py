@@ -4,7 +4,9 @@ import numpy as np
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import directions
 from heli_jax.identification.result import Signals
+from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.decimated import (
     is_decimated,
@@ -54,10 +56,12 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
 
 
 def whiteness_of(
-    signals: tuple[Signals, ...], e: Evaluation, flights: tuple[Flight, ...]
+    signals: tuple[Signals, ...], e: Evaluation, flights: tuple[Flight, ...], layout: Layout
 ) -> dict[str, Whiteness]:
-    """Of the innovations where there are some, else of the residuals, whose colour intervals allow
-    for; innovations of an output that was logged at a higher rate may have its low-pass's."""
+    """Whiteness by 'flight/output' of the innovations where there are some, else of the residuals,
+    whose colour intervals allow for; innovations of an output that was logged at a higher rate may
+    have its low-pass's."""
+    fitted: dict[str, np.ndarray] = {}
     if e.innovations:
         # Their variance falls while the filter learns the initial state: only over it are they one
         # sequence of equal variance.
@@ -70,6 +74,12 @@ def whiteness_of(
             }
     else:
         errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+        if layout.estimator.rows_are_samples and np.isfinite(e.J).all():
+            U, at = directions(e.J), 0
+            for s, outputs in zip(signals, layout.outputs, strict=True):
+                for n in outputs:
+                    fitted[f"{s.flight}/{n}"] = U[at : at + s.times.size]
+                    at += s.times.size
     low_passed = {
         f"{s.flight}/{n}"
         for s, f in zip(signals, flights, strict=True)
@@ -78,7 +88,9 @@ def whiteness_of(
     }
     # Of many signals one looks coloured by chance: the level is shared by all.
     return {
-        name: (whiteness_in_band if name in low_passed else whiteness)(error, len(errors))
+        name: whiteness_in_band(error, len(errors))
+        if name in low_passed
+        else whiteness(error, len(errors), fitted.get(name))
         for name, error in errors.items()
     }
 

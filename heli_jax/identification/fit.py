@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, note, sentences
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
@@ -18,6 +19,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -30,7 +32,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.same_responses import better_of_same_responses
-from heli_jax.identification.estimation.shooting_start import SAID, by_windows
+from heli_jax.identification.estimation.shooting_start import BY_WINDOWS, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
 from heli_jax.identification.further_starts import (
@@ -42,14 +44,16 @@ from heli_jax.identification.further_starts import (
 )
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
+from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
+    Data,
     Layout,
     Noise,
     Solution,
@@ -59,15 +63,14 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.expected_accuracy import (
     guessed_gusts,
     starting_at_zero,
     unstated_gusts,
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
-from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.input_units import doubtful_inputs
+from heli_jax.identification.validation.input_units import doubtful_inputs, scaled_by
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -75,8 +78,9 @@ from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
+    RATE_AGAINST_ANGLE,
+    RATE_SCALE,
     against_start,
-    contradictions,
     sticks_of,
 )
 from heli_jax.stages import stage
@@ -114,11 +118,27 @@ def first_guess(problem: Problem) -> FirstGuess:
     z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, begun)
+
+
+def _in_free_motion(
+    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
+) -> tuple[Array, Evaluation]:
+    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    from rest at zero no parameter would have any effect."""
+    own = slice(layout.first_nuisance, layout.size)
+    if not (layout.initial_state and np.isfinite(e.J).all()):
+        return z, e
+    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
+    moved = z.at[own].add(step)
+    after = evaluate(layout, data, noise, moved)
+    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -162,9 +182,9 @@ def check(problem: Problem) -> Check:
     notes += feedback_notes(problem, feedback)
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
-    notes += tuple(of_disturbances(guess.layout, guess.e))
+    notes += of_disturbances(guess.layout, guess.e)
     notes += other_hold(problem, at, guess.e, skip=not_identifiable)
-    notes += [gusts] if (gusts := guessed_gusts(problem, at)) else []
+    notes += guessed_gusts(problem, at)
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
@@ -173,6 +193,10 @@ def check(problem: Problem) -> Check:
     )
     sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
+    # Sensitivities are those of the model, whatever moved what was measured.
+    for nothing in [f for f in findings if f.code == NOTHING_FOLLOWS and f.severity == "refuse"]:
+        names = listed(verdict.names, "or")
+        verdict = verdict.nothing(f"The data do not determine {names}: {nothing.sentence}")
     slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
     findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
     return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))
@@ -223,8 +247,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    gusts = guessed_gusts(problem, at)
-    notes = (*ranking.notes, gusts) if gusts else ranking.notes
+    notes = (*ranking.notes, *sentences(guessed_gusts(problem, at)))
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 
@@ -273,15 +296,14 @@ def fit(
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
-    doubts = record_doubts(problem)
-    late = [f.sentence for f in _late_inputs(problem, guess.layout)]
-    said = (*late, *cautions(problem), *(f.sentence for f in doubts.findings))
-    optimum = optimum._replace(notes=(*said, *optimum.notes))
+    late = _late_inputs(problem, guess.layout)
+    about_record = (*late, *cautions(problem), *record_doubts(problem))
+    optimum = optimum._replace(notes=(*about_record, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
+        run = OptimizationRun(before, points, optima, seed, timing)
         estimate = assemble(problem, search, optimum, run)
-        return _with_doubtful_signals(problem, guess, estimate, doubts.unsure)
+        return concluded(_with_doubtful_signals(problem, guess, estimate))
 
 
 def _late_inputs(problem: Problem, layout: Layout) -> list[Finding]:
@@ -292,25 +314,27 @@ def _late_inputs(problem: Problem, layout: Layout) -> list[Finding]:
     return late_inputs(flights, feedback_of(problem))
 
 
-def _with_doubtful_signals(
-    problem: Problem, guess: FirstGuess, estimate: Fit, unsure: list[str]
-) -> Fit:
-    """No plain yes where a unit is in doubt, since a fit follows numbers in any unit; with what
-    moved too far or not far enough at the start values, and where the model did not follow from
-    there what moved the wrong way, first of all notes."""
+def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
+    """With the parameters that a signal in a doubtful unit moves, and where the model did not
+    follow from the start values what moved the wrong way there, first of all findings."""
     # Of an angle that is in other units than its rate that is said already, and is surer.
-    if contradictions(problem):
-        return dataclasses.replace(estimate, adequacy=estimate.adequacy.only_if(unsure))
+    if any(f.code == RATE_AGAINST_ANGLE and f.denies for f in estimate.findings):
+        return estimate
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     at_start = (flights, guess.e.simulated, sticks_of(problem.model))
-    inputs = doubtful_inputs(*at_start)
-    doubts = [finding for _, finding in inputs]
-    names = dict.fromkeys(f"the unit of {name} is in doubt" for name, _ in inputs)
-    adequacy = estimate.adequacy.only_if([*unsure, *names])
-    if not estimate.adequacy.adequate:
+    doubts = doubtful_inputs(*at_start)
+    if not estimate.adequate:
         doubts += against_start(*at_start)
-    notes = (*(f.sentence for f in doubts), *estimate.notes)
-    return dataclasses.replace(estimate, adequacy=adequacy, notes=notes)
+    findings = []
+    for f in (*doubts, *estimate.findings):
+        if estimate.status != "not-converged" and not f.denies:
+            if f.code == UNIT_IN_DOUBT:
+                f = f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
+            elif f.code == RATE_SCALE:
+                # A scale, a unit or the clock is off: each parameter depends on one of them.
+                f = f._replace(distrusts=tuple(estimate.estimates))
+        findings.append(f)
+    return dataclasses.replace(estimate, findings=tuple(findings))
 
 
 def _search(
@@ -343,7 +367,7 @@ def _search(
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
     if shooting is not None:
-        best, notes = shooting, (SAID,)
+        best, notes = shooting, (BY_WINDOWS,)
     if starts is None and explains_little(first, quick, best):
         report(SAID_FURTHER)
         more = further_starts(layout, problem, guess.z, seed)
@@ -370,7 +394,7 @@ def _search(
     return search, points, optima, optimum
 
 
-def cautions(problem: Problem) -> tuple[str, ...]:
+def cautions(problem: Problem) -> tuple[Finding, ...]:
     """What the logs say of their signals that biases a fit to them; once where flights agree."""
     flights, said = tuple(problem.flights), {}
     for label, flight in zip(labels(flights), flights, strict=True):
@@ -379,18 +403,19 @@ def cautions(problem: Problem) -> tuple[str, ...]:
     own = own_instruments(problem.training, naming.names(problem.model.Inputs))
     own = own if problem.instrument is None else ()
     return (
-        *(f"{label}: {caution}" for caution, label in said.items()),
-        *((f"{own_said(own)}; it is not used.",) if own else ()),
+        *(note("quality.caution", f"{label}: {c}", label) for c, label in said.items()),
+        *((note("loop.instrument-unused", f"{own_said(own)}; it is not used."),) if own else ()),
         *_whole_band(problem),
     )
 
 
-def _whole_band(problem: Problem) -> tuple[str, ...]:
+def _whole_band(problem: Problem) -> tuple[Finding, ...]:
     """That a band which is stated is none of the fit's."""
     estimator, band = estimator_of(problem.method), problem.frequency.band
     if band is None or not estimator.noise_spectrum or estimator.fits_responses:
         return ()
-    return (
+    words = (
         f"frequency.band ({band[0]:g} to {band[1]:g} Hz) is that of the report's responses alone: "
-        "frequency error uses all frequencies of a record. frequency-response fits within a band.",
+        "frequency error uses all frequencies of a record. frequency-response fits within a band."
     )
+    return (note("frequency.band-unused", words),)

@@ -17,7 +17,7 @@ from heli_jax.new_config import tables, text
 from heli_jax.new_config.filtered import filter_settings, filtered_outputs
 from heli_jax.new_config.guess import Series
 from heli_jax.new_config.logs import Log, read_log
-from heli_jax.new_config.model_choice import chosen_model, other_models
+from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.signals import (
     names_of_input,
@@ -66,7 +66,7 @@ def write_config(
         raise InputError(f"{out}: is there already; expected another place, --out FILE")
     require_place(out, str(out))
     read = read_log(Path(log), flight, time_rate)
-    chosen = text.Chosen(*chosen_model(model, read, str(log)))
+    chosen = text.Chosen(*chosen_model(model, read, str(log), out.absolute().parent))
     preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
     signals = None if preset else signals_of(chosen.model, read)
     known = {} if signals is None else signals.known
@@ -121,6 +121,8 @@ def write_config(
         absent = [n for n in absent if n not in signals.wandering]
         called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
         notes += unread_notes((*lacking, *absent), called, read.unread)
+    if vehicle_of_log := other_vehicle(read.autopilot):
+        notes.append(f"the log's vehicle is {vehicle_of_log}: see that the model is one of it")
     if others:
         assert isinstance(chosen.name, dict)
         notes.append(

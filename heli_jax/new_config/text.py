@@ -22,6 +22,9 @@ _GUSTS = (
     "  # With a disturbance, since gusts move real machines too; where none do, output-error",
     "  # and no section disturbance.",
 )
+_NO_AXIS = (
+    "  # output-error: the model names no axis on which gusts could act (axes in its file).",
+)
 _SMOOTH = (
     "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
     "  # simulated, and filter-error needs the noise as the sensors gave it.",
@@ -125,17 +128,16 @@ def configuration(
         axes = ()
     lines += [
         "fit:",
-        *(_SMOOTH if smooth else _GUSTS),
+        *(_SMOOTH if smooth else _GUSTS if axes else _NO_AXIS),
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
     lines += [_free(name, start) for name, start in free.items()]
     lines += [_held(name, value) for name, value in held.items()]
+    guess, sure = late
+    why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
-        f"  {'' if late[1] else '# '}nuisance: {{time_shift: true}} # "
-        + (
-            f"GUESS: {_comment(late[0])}" if late[0] else "where the stick was logged late or early"
-        ),
+        f"  {'' if sure else '# '}nuisance: {{time_shift: true}} # {why}",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]
@@ -386,7 +388,11 @@ def _value(value: Any) -> str:
         return "{" + ", ".join(f"{k}: {_value(v)}" for k, v in value.items()) + "}"
     # What YAML might read as something else stands in quotes, which are those of JSON too.
     text = str(value)
-    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+    if _PLAIN.fullmatch(text):
+        return text
+    quoted = json.dumps(text, ensure_ascii=False)
+    # YAML takes such characters as their numbers alone.
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
 
 
 def _comment(text: str) -> str:

@@ -32,6 +32,8 @@ THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
 # Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
+_RESTS = 0.5
+"""share of a variance that priors explain, from which on the card names the parameter"""
 _VAF = "VAF"
 _CORRELATED = "largest correlation"
 _BIAS_PART = "Theil bias part"
@@ -145,9 +147,11 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
 def _of_verdicts(fit: Fit) -> list[Gate]:
     """What the first line says: the reason for its `no` need not show in any number of the card."""
     determined = "determined" if fit.verdict.identifiable else "not determined"
-    # `no: p looks like ...` instead of `no (p looks like ...)`, since a summary has it in brackets.
-    verdict, _, why = fit.adequacy.summary.partition(" (")
-    adequate = f"{verdict}: {why[:-1]}" if why.endswith(")") else fit.adequacy.summary
+    shares = {n: s for n, s in fit.verdict.prior_share.items() if s > _RESTS}
+    if fit.verdict.identifiable and shares:
+        named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
+        determined = f"determined, by priors: {named}"
+    adequate = fit.adequate_in_words.replace(" (", ": ", 1).removesuffix(")")
     return [
         Gate(
             "identifiability",
@@ -186,9 +190,9 @@ def _of_parameter(name: str, estimate: Estimate, *, own_prior: bool) -> list[Gat
         # are not, and a tick beside what is not determined would be read as one for it.
         lines[1] = lines[1]._replace(value=math.nan, passed=False)
     if estimate.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
-        remark = "share of the priors in the posterior precision"
+        remark = "share of the posterior variance that priors explain"
         if not own_prior:
-            remark += "; it has none itself, biases and initial states have weak ones"
+            remark += "; it has none itself: others' priors, weak ones of biases and initial states"
         lines.append(Gate("prior share", name, 100 * estimate.prior_share, "%", "", None, remark))
     return lines
 

@@ -67,6 +67,7 @@ def stopped(
 
     Returns:
         The states, and the time [s] and the index of the event (`NO_END` where there was none).
+        Their derivatives, of any order and in both modes, count that the moment moves.
     """
 
     def values(state: Record, u: Record) -> Array:
@@ -87,20 +88,29 @@ def stopped(
     one = jnp.ones((), times.dtype)
     end = _Interval(x0, x1, f0, f1, u, u1, h, bool(linear))
 
-    # Bisection, not Newton: an event is anyone's function, with corners (`rotor_speed` has one).
-    def halve(_: Array | int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        after = jnp.any(values(end.state(middle), end.inputs(middle)) <= 0)
-        return jnp.where(after, low, middle), jnp.where(after, middle, high)
+    came = jnp.any(over)
+    # A run that begins beyond an event ends where it begins; one without an event has no moment,
+    # and a slope of 1 keeps its derivatives finite.
+    found = came & ~over[0]
 
-    _, s = jax.lax.fori_loop(0, _BISECTIONS, halve, (0.0 * one, one))
-    # A run that begins beyond an event ends where it begins.
-    s = jnp.where(over[0], 0.0, s)
+    def left(s: Array) -> Array:
+        return jnp.where(found, jnp.min(values(end.state(s), end.inputs(s))), s)
+
+    # Bisection, not Newton: an event is anyone's function, with corners (`rotor_speed` has one).
+    def bisected(left: Callable[[Array], Array], start: Array) -> Array:
+        def halve(_: Array | int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+            middle = 0.5 * (ends[0] + ends[1])
+            after = left(middle) <= 0
+            return jnp.where(after, ends[0], middle), jnp.where(after, middle, ends[1])
+
+        _, s = jax.lax.fori_loop(0, _BISECTIONS, halve, (start, one))
+        return jnp.where(found, s, start)
+
+    # The derivatives are those of the implicit function: bisection itself has none.
+    s = jax.lax.custom_root(left, 0.0 * one, bisected, lambda slope, y: y / slope(one))
     # At that moment the one that has come is the smallest; the others are still above zero.
     which = jnp.argmin(values(end.state(s), end.inputs(s)))
     # argmax of no event is 0, so k and s are numbers of no meaning there: `came` chooses.
-    came = jnp.any(over)
     moment = jnp.where(over[0], times[0], times[k] + s * h)
     rest = jnp.where(came, jnp.arange(n) >= last, False)
     frozen = jax.tree.map(lambda v, e: jnp.where(rest, e, v), states, end.state(s))

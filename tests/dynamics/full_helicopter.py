@@ -5,7 +5,6 @@ Newton's and Euler's equations move the body. States, inputs and vehicles are ma
 """
 
 import numpy as np
-from scipy.optimize import brentq
 
 from tests.dynamics.whole_helicopter import (
     XCELL,
@@ -13,27 +12,13 @@ from tests.dynamics.whole_helicopter import (
     blade_cyclic,
     body_to_earth,
     euler_to_body,
+    induced_velocity,
 )
 
 FULL = XCELL | {
     "I_beta": 0.038, "k_beta": 54.0, "K_mu": 1.0, "h_T": 0.08, "K_P": 0.01, "K_I": 0.02,
     "Omega": 157.1,
 }  # fmt: skip
-
-
-def flow_through(vi, V2, W):
-    """The flow through the rotor [m/s] of the module's text, for a positive induced velocity."""
-    q = max(0.0, (-W - 0.5 * vi) * (2.2 * vi + W))
-    return np.sqrt(V2 + (W + vi) ** 2 + 0.37 * q**2 / (vi**2 + 5.8 * V2))
-
-
-def induced_velocity(V2, W, T0, b):
-    if T0 < 0:
-        return -induced_velocity(V2, -W, -T0, b)
-    top = T0 / b
-    return brentq(
-        lambda v: 2 * v * flow_through(v, V2, W) + b * v - T0, 1e-12, top, xtol=1e-15, rtol=1e-15
-    )
 
 
 def rotor(v, R, c, a, speed, theta0, V2, W, edge):

@@ -58,7 +58,6 @@ MOVED = {
     "tip_loss": {"dphi", "dtheta", "dpsi"},
     "tail_force": {"dx", "dy", "dz", "dphi", "dtheta", "dpsi"},
     "tail_power": {"Omega", "dphi", "dtheta", "dpsi"},
-    "windmill": {"dx", "dy", "dz", "Omega", "dphi", "dtheta", "dpsi"},
     "collective": {"dx", "dy", "dz", "Omega", "dphi", "dtheta", "dpsi"},
     "governor": {"Omega", "dphi", "dtheta", "dpsi"},
     "measured_speed": {"dphi", "dtheta", "dpsi"},

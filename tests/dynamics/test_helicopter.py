@@ -46,19 +46,13 @@ def rates(model, v, s, u):
 def test_every_derivative_is_the_second_program_s(variant):
     rng = np.random.default_rng(1)
     model = helicopter(variant)
-    ring = 0
     for _ in range(60):
         v, s, u = scattered(rng)
         wanted = oracle.RATES[variant](v, s, u)
         found = naming.asdict(rates(model, v, s, u))
-        state = model.State(**{n: s[n] for n in naming.names(model.State)})
-        if bool(model.limits(params_of(v), state, model.Inputs(**u))["vortex ring"]):
-            ring += 1
-            continue
         assert set(found) == set(wanted)
         for name, value in wanted.items():
             assert float(found[name]) == pytest.approx(value, rel=1e-9, abs=1e-9), name
-    assert ring < 20
 
 
 @pytest.mark.slow
@@ -166,8 +160,7 @@ def test_leaving_the_range_is_told():
 
     assert limits() == set()
     assert limits(dz=-2.0) == set()
-    assert "vortex ring" in limits(dz=-5.0)
-    assert limits(dz=-5.0, dx=15.0) == set()
+    assert limits(dz=-5.0) == set()
     assert "slow rotor" in limits(Omega=10.0)
     assert "fast flight" in limits(dx=60.0)
     assert limits(theta=1.5) >= {"nose up or down"}

@@ -55,33 +55,26 @@ STATES = {
 INPUTS = ("x_roll", "x_pitch", "x_yaw", "x_throttle")
 
 
-def induced_velocity_roots(thrust, inplane, axial, rho, R):
-    """Every vi [m/s] with 2 rho pi R^2 vi sqrt(inplane^2 + (axial + vi)^2) = thrust(vi), ascending.
-
-    `thrust` falls linearly with vi and accepts arrays, `axial` is the disk's speed in the direction
-    of positive thrust. All roots have the sign of thrust(0) and end where thrust vanishes. A pair
-    closer together than 1/4000 of that range is missed.
-    """
-
-    def surplus(vi):
-        return thrust(vi) - 2 * rho * np.pi * R**2 * vi * np.hypot(inplane, axial + vi)
-
-    end = thrust(0.0) / (thrust(0.0) - thrust(1.0))
-    if end == 0.0:
-        return [0.0]
-    grid = np.linspace(0.0, end, 4001)
-    if 0.0 < -axial / end < 1.0:  # where 'axial + vi' changes sign, a crest that may be sharp
-        grid = np.sort(np.append(grid, -axial) * np.sign(end)) * np.sign(end)
-    f = surplus(grid)
-    found = [float(x) for x, y in zip(grid, f, strict=True) if y == 0.0]
-    brackets = ((grid[i], grid[i + 1]) for i in np.flatnonzero(f[:-1] * f[1:] < 0.0))
-    found += [brentq(surplus, *ends, xtol=1e-15 * abs(end), rtol=1e-15) for ends in brackets]
-    return sorted(found)
+def flow_through(vi, V2, W):
+    """The flow through a rotor [m/s] as `heli_jax.dynamics.inflow` has it, vi above zero."""
+    q = max(0.0, (-W - 0.5 * vi) * (2.2 * vi + W))
+    return np.sqrt(V2 + (W + vi) ** 2 + 0.37 * q**2 / (vi**2 + 5.8 * V2))
 
 
-def induced_velocity(thrust, inplane, axial, rho, R):
-    """The root of largest magnitude, the one continuous with hover; arguments as for the roots."""
-    return max(induced_velocity_roots(thrust, inplane, axial, rho, R), key=abs)
+def induced_velocity(V2, W, T0, b):
+    """The root of 2 v s(v) = T0 - b v; T0 and b are a thrust's over rho pi R^2."""
+    if T0 < 0:
+        return -induced_velocity(V2, -W, -T0, b)
+    return brentq(
+        lambda v: 2 * v * flow_through(v, V2, W) + b * v - T0, 1e-12, T0 / b, xtol=1e-15, rtol=1e-15
+    )
+
+
+def by_thrust(thrust, inplane, axial, rho, R):
+    """The same by the thrust [N] as a function of vi, which falls linearly with it."""
+    area = rho * np.pi * R**2
+    slope = (thrust(0.0) - thrust(1.0)) / area
+    return induced_velocity(inplane**2, axial, thrust(0.0) / area, slope)
 
 
 def rotor(v, Omega, x_throttle, inplane, nu, tilt):
@@ -95,7 +88,7 @@ def rotor(v, Omega, x_throttle, inplane, nu, tilt):
         lam = -nu + vi / (R * Omega)
         return scale * a * sigma / 2 * (B**3 / 3 * th0 - B**2 / 2 * lam + B**2 / 2 * tilt)
 
-    vi = induced_velocity(thrust, inplane, -nu * R * Omega, rho, R)
+    vi = by_thrust(thrust, inplane, -nu * R * Omega, rho, R)
     lam = -nu + vi / (R * Omega)
     induced = lam * (B**3 / 3 * th0 - B**2 / 2 * lam + B**2 / 4 * tilt)
     torque = scale * R * (sigma * v["Cd0"] / 8 + a * sigma / 2 * induced)
@@ -206,7 +199,7 @@ def consistent_tail(v, s, u, wind=(0.0, 0.0, 0.0)):
         scale = v["rho"] * np.pi / 2 * R_T**4 * Om_T**2 * v["a_T"] * sigma_T
         return scale * (B**3 / 3 * th0T - B**2 / 2 * (axial + vi) / (R_T * Om_T))
 
-    vi = induced_velocity(thrust, inplane, axial, v["rho"], R_T)
+    vi = by_thrust(thrust, inplane, axial, v["rho"], R_T)
     return {"T": thrust(vi), "vi": vi, "lam": (axial + vi) / (R_T * Om_T)}
 
 

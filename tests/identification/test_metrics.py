@@ -82,3 +82,22 @@ def test_a_constant_signal_has_no_motion_to_explain():
     assert np.isnan(m.vaf)
     assert np.isnan(m.nrmse_fit_percent)
     assert m.rmse == pytest.approx(0.1)
+
+
+def test_free_initial_states_of_short_windows_do_not_colour_residuals_of_a_right_model():
+    """Windows of 25 samples of an oscillator with two free states each, projected out by QR."""
+    n, window, rng = 1500, 25, np.random.default_rng(6)
+    t = 0.02 * np.arange(window)
+    free = np.exp(-0.4 * t) * np.stack([np.cos(4.5 * t), np.sin(4.5 * t)])
+    U = np.linalg.qr(np.kron(np.eye(n // window), free.T))[0]
+    alarms, plain, found = 0, 0, 0
+    for _ in range(100):
+        noise = rng.standard_normal(n)
+        slow = np.convolve(noise, 0.3 ** np.arange(8))[:n]
+        left, coloured = (e - U @ (U.T @ e) for e in (noise, slow))
+        plain += not whiteness(left).white
+        alarms += not whiteness(left, fitted=U).white
+        found += not whiteness(coloured, fitted=U).white
+    assert alarms <= 2
+    assert plain > 50
+    assert found > 95

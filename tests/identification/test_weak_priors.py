@@ -185,6 +185,24 @@ def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
         assert verdict.prior_share["L0"] == pytest.approx(1.0 if hold > 10 else 0.75)
 
 
+def test_the_prior_share_is_the_variance_that_all_priors_explain():
+    """By redrawing the priors' means and the data, of unknowns that only one prior tells apart."""
+    rng = np.random.default_rng(4)
+    B = rng.standard_normal((40, 3)) @ np.array([[1, 0, -1], [0, 1, -1], [0.1, 0, 0.1]])
+    B = np.column_stack([B, rng.standard_normal(40)])
+    own = np.array([0.0, 0.0, 2.0, 1.0])
+    unknowns = tuple(Unknown(n, 1.0, True, 1.0, w) for n, w in zip("abcd", own, strict=True))
+    P = np.linalg.inv(B.T @ B + np.diag(own**2))
+    by_priors = (P @ np.diag(own)) @ rng.standard_normal((4, 200_000))
+    by_data = (P @ B.T) @ rng.standard_normal((40, 200_000))
+    np.testing.assert_allclose(np.cov(by_priors + by_data), P, atol=0.02 * P.max())
+    share = analyse(B, unknowns).prior_share
+    wanted = by_priors.var(axis=1) / (by_priors + by_data).var(axis=1)
+    np.testing.assert_allclose([share[n] for n in "abcd"], wanted, atol=0.01)
+    assert min(share[n] for n in "ab") > 0.3
+    assert share["d"] < 0.1
+
+
 def test_autocorrelated_residuals_and_a_state_that_no_output_shows():
     """No warning on the way, and no remedy that there is not: the model has no axis to disturb."""
     one = problem(BOUNDED, Nuisance(bias=False))

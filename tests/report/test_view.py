@@ -37,7 +37,7 @@ def flown(n=300, dt=0.02, **states):
         x.phi, x.theta, x.psi, x.dphi, x.dtheta, x.dpsi, x.x, x.y, x.z, x.dx, x.dy, x.dz, x.Omega
     )
     ok = dfx.RESULTS.successful
-    outside = {"vortex ring": out, "slow rotor": zero > 0}
+    outside = {"fast flight": out, "slow rotor": zero > 0}
     return Trajectory(times, x, outputs, inputs, ok, np.asarray(True), outside, np.inf, -1)
 
 

@@ -1,5 +1,6 @@
 """The whole helicopter in flight: invariants, order of the steps, feedback, events, status."""
 
+import functools
 from typing import NamedTuple
 
 import diffrax as dfx
@@ -11,7 +12,7 @@ import scipy.integrate
 
 from heli_jax import Model, load_vehicle, models, naming, simulate, trim
 from heli_jax.dynamics import helicopter as whole
-from heli_jax.simulation.events import ground, rotor_speed
+from heli_jax.simulation.events import ground, rotor_speed, stopped
 from heli_jax.simulation.trajectory import STATUS
 from tests.dynamics import whole_helicopter as oracle
 
@@ -233,15 +234,17 @@ def falling(g, s, u):
     return Stone(s.dx, s.dz, 0.0 * u.u, -g.g + 0.0 * u.u)
 
 
+STONE = Model("stone", falling, lambda g, s, u: s, Gravity, Stone, Nothing, Stone)
+
+
 def test_the_ground_ends_a_run_at_its_moment():
     """A stone is enough: what the event does has nothing of a helicopter."""
-    model = Model("stone", falling, lambda g, s, u: s, Gravity, Stone, Nothing, Stone)
     p, u = Gravity(9.80665), Nothing(jnp.zeros(60))
     fall = Stone(x=0.0, z=2.0, dx=3.0, dz=0.0)
 
     def land(z, **how):
         start = naming.replace(fall, z=z)
-        return simulate(model, p, u, dt=DT, initial_state=start, events={"ground": ground(0.3)},
+        return simulate(STONE, p, u, dt=DT, initial_state=start, events={"ground": ground(0.3)},
                         **how)  # fmt: skip
 
     fixed = jax.jit(land)
@@ -253,12 +256,55 @@ def test_the_ground_ends_a_run_at_its_moment():
         after = np.asarray(run.times) > moment
         np.testing.assert_allclose(np.asarray(run.states.z)[after], 0.3, atol=1e-9)
         np.testing.assert_allclose(np.asarray(run.states.x)[after], 3.0 * moment, rtol=1e-9)
-    slope = jax.jacfwd(lambda z: land(z).ended)(2.0)
     assert float(fixed(0.2).ended) == 0.0  # it began below
     aloft = fixed(200.0)
     assert int(aloft.event) == -1
     assert float(aloft.ended) == np.inf
-    assert np.isfinite(float(slope))
+
+
+def fallen(g, h):
+    """A free fall from the height h in samples, without an end."""
+    t = DT * jnp.arange(60.0)
+    return Stone(3.0 * t, h - 0.5 * g * t**2, 3.0 + 0.0 * t, -g * t)
+
+
+def landed(g_and_h, states=None):
+    """Moment and state of a stone that comes down to 0.3 m; the moment 0 if it stays up."""
+    (g, h), events, u = g_and_h, {"ground": ground(0.3)}, Nothing(jnp.zeros(60))
+    if states:
+        at, (ended, event) = stopped(
+            STONE, Gravity(g), events, DT * jnp.arange(60.0), states(g, h), u
+        )
+    else:
+        start = Stone(x=0.0, z=h, dx=3.0, dz=0.0)
+        run = simulate(STONE, Gravity(g), u, dt=DT, initial_state=start, events=events)
+        at, ended, event = run.outputs, run.ended, run.event
+    return jnp.stack([jnp.where(event < 0, 0.0, ended), at.x[-1], at.z[-1], at.dz[-1]])
+
+
+@pytest.mark.parametrize(
+    ("mode", "states"), [(jax.jacrev, None), (jax.jacfwd, fallen), (jax.jacrev, fallen)]
+)
+def test_the_moment_of_an_event_has_the_derivatives_of_a_free_fall(mode, states):
+    g, drop = 9.80665, 1.7
+    t = np.sqrt(2 * drop / g)
+    by_g, by_h = -t / (2 * g), 1 / (g * t)
+    slopes = jax.jit(mode(functools.partial(landed, states=states)))
+    # x = 3 t and dz = -g t there, and z stays.
+    wanted = [
+        [by_g, by_h], [3 * by_g, 3 * by_h], [0.0, 0.0], [-t - g * by_g, -g * by_h]
+    ]  # fmt: skip
+    np.testing.assert_allclose(slopes(jnp.array([g, 0.3 + drop])), wanted, rtol=1e-9, atol=1e-9)
+    # Without an event, or where one has come already, nothing hangs on its moment.
+    for h in (200.0, 0.2):
+        found = np.asarray(slopes(jnp.array([g, h])))
+        np.testing.assert_array_equal(found[0], 0.0)
+        assert np.isfinite(found).all()
+    if states:
+        second = jax.jit(mode(mode(lambda z: landed(z, states)[0])))(jnp.array([g, 0.3 + drop]))
+        mixed = -by_h / (2 * g)
+        wanted = [[3 * t / (4 * g**2), mixed], [mixed, -by_h / (2 * drop)]]
+        np.testing.assert_allclose(second, wanted, rtol=1e-7)
 
 
 @pytest.mark.slow

@@ -112,6 +112,16 @@ def combined_deviations(
     return np.where(lost.any(axis=1), np.inf, sds)
 
 
+def directions(J: np.ndarray) -> np.ndarray:
+    """Orthonormal directions (n, k) in which the unknowns move finite whitened rows (n, q)."""
+    norms = np.linalg.norm(J, axis=0)
+    J = np.asarray(J, np.float64) / np.where(norms > 0, norms, 1.0)
+    # Singular values of J's triangle are those of J, and it has q rows instead of n.
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
+    seen = sizes > 1e-10 * max(sizes[0], 1e-300)
+    return J @ (right[seen].T / sizes[seen])
+
+
 def least_share(part: np.ndarray, J: np.ndarray) -> float:
     """Of what whitened rows tell of any combination of coordinates, the least that others tell.
 

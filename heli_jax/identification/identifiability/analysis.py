@@ -152,6 +152,8 @@ class _Analysis(NamedTuple):
     unknowns: tuple[Unknown, ...]
     determined: _Determined
     data: _ByData
+    bare: np.ndarray
+    """(any, q) sensitivity without any prior"""
     without_effect: tuple[str, ...]
     groups: tuple[Inseparable, ...]
     """what is not determined"""
@@ -223,6 +225,7 @@ def analyse(
         unknowns,
         determined,
         data,
+        bare,
         dead,
         groups,
         resting,
@@ -238,7 +241,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
     names, known = tuple(u.name for u in a.unknowns), a.determined
     correlation = correlation_of(known.covariance)
     pairs = _pairs(correlation, names, a.undetermined)
-    share = _shares(known.covariance, known.without_weak, a.unknowns)
+    share = _shares(known.covariance, known.without_weak, a.bare, a.unknowns)
     nuisances_hold = [n for group in a.groups if group.nuisances for n in group.names]
     roughly, through_zero = _roughly(a), _through_zero(a)
     facts = Facts(
@@ -274,7 +277,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         correlation=correlation,
         # Where a nuisance is exchangeable with a parameter the data say nothing of it, whatever
         # interval the weak priors make.
-        prior_share=share.both | dict.fromkeys(nuisances_hold, 1.0),
+        prior_share=share.explained | dict.fromkeys(nuisances_hold, 1.0),
         sentences=sentences(facts),
         resting=tuple(n for group in a.resting for n in group.names),
         roughly=tuple(roughly),
@@ -318,26 +321,35 @@ def _through_zero(a: _Analysis) -> tuple[str, ...]:
 
 
 class _Shares(NamedTuple):
-    """By name, shares of the posterior precision (1 / variance) that come from priors."""
+    """What comes of priors, by name."""
 
     prior: dict[str, float]
-    """the unknown's own"""
+    """the share of the posterior precision (1 / variance) by the unknown's own"""
     weak: dict[str, float]
-    """the weak ones of nuisances"""
-    both: dict[str, float]
+    """the same by the weak ones of nuisances"""
+    explained: dict[str, float]
+    """the share of the posterior variance by all priors, those of other unknowns among them"""
 
 
 def _shares(
-    covariance: np.ndarray, without_weak: np.ndarray, unknowns: tuple[Unknown, ...]
+    covariance: np.ndarray,
+    without_weak: np.ndarray,
+    bare: np.ndarray,
+    unknowns: tuple[Unknown, ...],
 ) -> _Shares:
-    prior, weak, both = {}, {}, {}
+    prior, weak, explained = {}, {}, {}
+    # The estimates' variance P = P (B'B + R) P is that of the data, whose rows are B, and that of
+    # all priors R. An unknown without a prior rests on another's where only the two together show.
+    of_data = np.sum((bare @ covariance) ** 2, axis=0)
     for i, u in enumerate(unknowns):
         # Precisions add, so a prior's share is its precision times the variance that is left.
         prior[u.name] = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
         ratio = covariance[i, i] / without_weak[i, i] if without_weak[i, i] > 0 else 1.0
         weak[u.name] = float(np.clip(1.0 - ratio, 0.0, 1.0))
-        both[u.name] = 1.0 - (1.0 - prior[u.name]) * (1.0 - weak[u.name])
-    return _Shares(prior, weak, both)
+        variance = covariance[i, i]
+        rest = 1.0 - of_data[i] / variance if variance > 0 else 0.0
+        explained[u.name] = float(np.clip(rest, 0.0, 1.0))
+    return _Shares(prior, weak, explained)
 
 
 def _groups(

@@ -1,7 +1,7 @@
 """What the identifiability analysis says: plain data."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -108,10 +108,11 @@ class Verdict:
     covariance: np.ndarray
     """(q, q) in relative coordinates; the undetermined directions are left out of it"""
     correlation: np.ndarray
-    # A key of fit.json: a prior's share in the posterior precision, 1 / variance.
+    # A key of fit.json.
     prior_share: dict[str, float]
-    """share of what is known of a parameter that came from priors: its own, and the weak ones of
-    the nuisances; 1 where the data said nothing"""
+    """share (P R P)_ii / P_ii of the posterior variance P that the priors with the information R
+    explain: its own, those of others, and the weak ones of the nuisances; 1 where the data say
+    nothing"""
     sentences: tuple[str, ...]
     resting: tuple[str, ...] = ()
     """parameters that are determined by priors, and not by the data alone"""
@@ -125,6 +126,24 @@ class Verdict:
     """pairs of parameters whose values may be exchanged: the data do not tell which is which"""
     second: tuple[SecondSolution, ...] = ()
     """other values that the data do not tell from these"""
+
+    def nothing(self, sentence: str) -> "Verdict":
+        """No parameter determined, for a reason.
+
+        Args:
+            sentence: the reason.
+        """
+        return replace(
+            self,
+            identifiable=False,
+            combinations=(),
+            pairs=(),
+            undetermined=tuple(n for n in self.names if n not in self.without_effect),
+            sentences=(sentence,),
+            resting=(),
+            roughly=(),
+            through_zero=(),
+        )
 
     @property
     def text(self) -> str:

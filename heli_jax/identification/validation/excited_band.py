@@ -9,8 +9,8 @@ import scipy.special
 from jaxtyping import Bool, Complex, Float
 
 from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.hardly_moving import hardly_moving
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
@@ -34,9 +34,16 @@ _WIDTH, _BINS = 0.25, 3
 vibration, or chance"""
 _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
+NOTHING = 0.2
+"""of the power of each output, below which inputs that no output follows over a band tell nothing,
+where they follow the response or none of it is beyond chance: a machine that is not flying had 0.11
+"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
-NOTHING_FOLLOWS = (
+_NOISE = 0.5
+"""of what white noise has, in steps from sample to sample: above it an output shows no motion"""
+NOTHING_FOLLOWS = "excitation.nothing-follows"
+_NOTHING = (
     "no output follows any input coherently over a band of frequencies: noise, disturbances or "
     "something else moves the machine more than the sticks do."
 )
@@ -69,8 +76,7 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
     if not moving:
-        words = "no input moves: nothing is excited."
-        return [Finding("excited band", "refuse", words, 0.0, "inputs that move, 1")]
+        return [_free_motion(alike)]
     seen = seen_parts(alike)
     barely = hardly_moving(alike, moving)
     pooled = _pooled(seen, moving, alike[0].dt)
@@ -79,6 +85,32 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
         return [*barely, *coherent, *together]
     together = _short_together(alike, moving)
     return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
+
+
+def _free_motion(flights: Sequence[Flight]) -> Finding:
+    """What can be learnt where no input moves: a free decay, or nothing from noise alone."""
+    turns = {
+        n: min(_roughness(f.outputs[n]) for f in flights if n in f.outputs)
+        for f in flights
+        for n in f.outputs
+    }
+    name = min(turns, key=lambda n: turns[n])
+    criterion = f"mean squared step of an output over that of white noise, {_NOISE:g}"
+    if turns[name] > _NOISE:
+        words = "no input moves, and the outputs show noise alone: nothing is excited."
+        return Finding(NOTHING_FOLLOWS, "refuse", words, turns[name], criterion)
+    words = (
+        f"no input moves: {name} shows how the machine moves freely from its first state, or under "
+        "constant inputs; what inputs do beyond that is not in the record."
+    )
+    return Finding("excitation.free-motion", "note", words, turns[name], criterion, (name,))
+
+
+def _roughness(y: Float[np.ndarray, " N"]) -> float:
+    """Mean squared step of a signal over that of white noise of its variance (von Neumann)."""
+    y = y[np.isfinite(y)]
+    spread = float(np.var(y)) if y.size > 2 else 0.0
+    return float(np.mean(np.diff(y) ** 2)) / (2.0 * spread) if spread > 0 else 1.0
 
 
 def _why_not(seen: SeenParts) -> str:
@@ -158,14 +190,33 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
                 f"{limit:.2f}.{left}"
             )
             # No pass: this input alone moves nothing, though several together may.
-            findings.append(Finding("excited band", "note", words, None, criterion))
+            findings.append(Finding("excitation.excited-band", "note", words, None, criterion))
             continue
         followed = True
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
-        findings.append(Finding("excited band", "ok", words, best.peak, criterion))
+        findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        findings.append(Finding("excited band", "doubt", NOTHING_FOLLOWS, None, criterion))
+        share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
+        criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
+        findings.insert(0, Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
     return findings
+
+
+def _share(pooled: _Pooled, i: int) -> float:
+    """Of an output's power where inputs have some, the part that follows them, less what chance
+    makes of few segments."""
+    excited, (_, segments, m) = _excited(pooled), pooled.inputs.shape
+    y, u = pooled.outputs[excited, :, i], pooled.inputs[excited]
+    left = float(np.sum(np.abs(without(u, y)) ** 2))
+    whole, chance = float(np.sum(np.abs(y) ** 2)), min(m / (0.9 * segments), 0.99)
+    return max(1.0 - left / max(whole, 1e-300) / (1.0 - chance), 0.0)
+
+
+def _excited(pooled: _Pooled) -> Bool[np.ndarray, " k"]:
+    """The frequencies at which an input has power: beyond, what a filter or a window has left of
+    both signals is coherent as well."""
+    power = np.sum(np.abs(pooled.inputs) ** 2, axis=1)
+    return np.any(power >= _LEAST_POWER * np.max(power, axis=0), axis=1)
 
 
 def _follow_together(pooled: _Pooled) -> bool:
@@ -181,7 +232,7 @@ def _follow_together(pooled: _Pooled) -> bool:
         y = pooled.outputs[:, :, i]
         left = np.sum(np.abs(without(pooled.inputs, y)) ** 2, axis=1)
         multiple = 1.0 - left / np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
-        run = longest_band(pooled.hz, multiple >= max(COHERENT, chance))
+        run = longest_band(pooled.hz, (multiple >= max(COHERENT, chance)) & _excited(pooled))
         if run is not None and _is_band(run, step):
             return True
     return False
@@ -282,12 +333,12 @@ def _pair_findings(
             f"{a} and {b} move together{where} (coherence {mean:.2f}, other inputs taken out): "
             f"their effects cannot be told apart there, and {wider}; move one at a time."
         )
-        findings.append(Finding("inputs together", "doubt", words, mean, criterion))
+        findings.append(Finding("excitation.inputs-together", "doubt", words, mean, criterion))
     if findings:
         return findings
     mean, a, b, _ = pairs[0]
     words = f"no two inputs move together (most {a} and {b}: coherence {mean:.2f})."
-    return [Finding("inputs together", "ok", words, mean, criterion)]
+    return [Finding("excitation.inputs-together", "ok", words, mean, criterion)]
 
 
 def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Finding]:
@@ -303,7 +354,7 @@ def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Fin
             f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; whether an output "
             f"follows it was not computed: {why}."
         )
-        findings.append(Finding("excited band", "doubt", words))
+        findings.append(Finding("excitation.excited-band", "doubt", words))
     return findings
 
 

@@ -1,7 +1,5 @@
 """A fit whose model explains nothing of what was measured determines nothing of it either."""
 
-from dataclasses import replace
-
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.validation.adequacy import Adequacy
@@ -18,7 +16,7 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
     # A disturbance, or predictions ahead, let a good model's simulation be as poor.
     judged = [o for o in adequacy.judged if o.against_disturbance is None]
     worse = bool(judged) and all(o.vaf < 0 for o in adequacy.judged)
-    if adequacy.adequate or adequacy.ahead is not None or not worse:
+    if not adequacy.denied or adequacy.ahead is not None or not worse:
         return verdict
     outputs = listed([o.output for o in adequacy.judged])
     sentence = (
@@ -26,14 +24,4 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
         f"{outputs} at this optimum. Start nearer, from several points (fit.starts), or from what "
         "the data say (start: equation-error)."
     )
-    return replace(
-        verdict,
-        identifiable=False,
-        combinations=(),
-        pairs=(),
-        undetermined=tuple(n for n in verdict.names if n not in verdict.without_effect),
-        sentences=(sentence,),
-        resting=(),
-        roughly=(),
-        through_zero=(),
-    )
+    return verdict.nothing(sentence)

@@ -11,12 +11,12 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.numbers import percent
 
-LATE = "late input"
+LATE = "timing.late-input"
 """the topic of such a finding"""
 _RATE = 50.0
 """[Hz] to which logs are averaged, so that the verdict is the same at any rate of the log: samples

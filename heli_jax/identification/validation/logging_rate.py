@@ -16,14 +16,16 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.finding import Finding, Severity
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
-from heli_jax.identification.validation.finding import Finding, Severity
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
 from heli_jax.numerics.jumps import split
 
+LOGGING_RATE = "timing.logging-rate"
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
 _SETTLED = 1.0
@@ -33,6 +35,15 @@ _PART = 0.1
 guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
+_SLOW = 2.0
+"""Hz, at which no flight is logged: 500 Hz or more in ms, read as seconds"""
+_SLOWER = 1.05
+"""steps of the grid, from which on a topic's own is longer"""
+_MOST_BENDS = 8
+"""samples in a row at which straight lines bend: of more each is a sample of the signal's own"""
+_FAST_SHARE, _FALLS = 0.005, 0.5
+"""part of an input's power above a quarter of its rate, and its density there over that of the
+octave below: an input with more of both moves between its samples"""
 _LEVELS, _STEPS = 10, 20
 """distinct values and steps of a staircase at least: a commanded sequence of steps has fewer"""
 
@@ -81,6 +92,60 @@ def logging_rate(
     return findings if findings or not every else [min(every, key=_value)]
 
 
+def loop_between_samples(
+    flights: Sequence[tuple[str, Flight]], feedback: Sequence[Feedback]
+) -> list[Finding]:
+    """Doubts about inputs of a closed loop that act faster than they are logged.
+
+    A controller that runs faster than the log moves its input between the samples, by what it saw
+    of the response there. The power of such an input does not fall off before half of its rate.
+
+    Args:
+        flights: by what each is called.
+        feedback: whether inputs follow the response.
+    """
+    followed = {(one.flight, one.input) for one in feedback if one.present}
+    findings = []
+    for label, flight in flights:
+        for name, u in flight.inputs.items():
+            # Held because somebody said so: then it is known between its samples.
+            if (label, name) not in followed or name not in flight.hold_reason:
+                continue
+            rate = input_rate(flight, name, u)
+            if rate is None:
+                continue
+            v = u[:: max(round(1.0 / (rate * flight.dt)), 1)]
+            power = np.abs(np.fft.rfft(np.diff(v) * np.hanning(v.size - 1))) ** 2
+            # Differences take off what is slow; the power itself is that over their gain.
+            power = power[1:] / np.sin(0.5 * np.pi * np.arange(1, power.size) / power.size) ** 2
+            quarter, half = power.size // 4, power.size // 2
+            last, before = (float(np.mean(x)) for x in (power[half:], power[quarter:half]))
+            share = float(np.sum(power[half:]) / np.sum(power))
+            if not (share > _FAST_SHARE and last > _FALLS * before):
+                continue
+            words = (
+                f"{label}: {name} closes a loop, and its power does not fall off before half of "
+                f"its rate of {rate:.3g} Hz ({100 * share:.2g} % above a quarter): it moved "
+                "between samples by what it saw of the response there, which biases the estimates. "
+                "Log at the controller's rate and state hold: zero-order, or use an excitation "
+                "(signals.instruments)."
+            )
+            criterion = f"part of the power above a quarter of the rate, {_FAST_SHARE:g}"
+            brief = f"{name} moves between its samples in a closed loop"
+            findings.append(
+                Finding(
+                    "timing.loop-between-samples",
+                    "doubt",
+                    words,
+                    share,
+                    criterion,
+                    (name,),
+                    brief=brief,
+                )
+            )
+    return findings
+
+
 def _value(finding: Finding) -> float:
     assert finding.value is not None
     return finding.value
@@ -103,7 +168,7 @@ def _not_judged(label: str, hz: float) -> Finding:
         f"{label}: whether the rate is enough was not judged: at the start values no mode of the "
         f"model (the fastest has {hz:.3g} Hz) moves an output by {SHOWS:g} times its noise."
     )
-    return Finding("logging rate", "doubt", words)
+    return Finding(LOGGING_RATE, "doubt", words)
 
 
 def _modes_that_show(
@@ -188,7 +253,8 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
         ending = (
             f": {number(ratio, 2)} samples in a period cannot show it, so this log cannot be "
             f"fitted with this model; log at {hopeless * hz:.3g} Hz at least, "
-            f"better {ENOUGH * hz:.3g} Hz."
+            f"better {ENOUGH * hz:.3g} Hz"
+            f"{'; or its times are in ms (time.unit)' if ratio * hz <= _SLOW else ''}."
         )
     elif ratio < ENOUGH:
         severity = "doubt"
@@ -196,7 +262,7 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
             f": {number(ratio, 2)} samples in a period hardly show it, and what happened "
             f"between them biases the estimates; log at {ENOUGH * hz:.3g} Hz."
         )
-    return Finding("logging rate", severity, f"{begun}{ending}", ratio, criterion)
+    return Finding(LOGGING_RATE, severity, f"{begun}{ending}", ratio, criterion)
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
@@ -210,8 +276,12 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     """
     if np.ptp(u) == 0:
         return None
+    step = flight.logged_step(name, "input")
+    # A slower topic's own clock is known, and its straight lines are those of the grid.
+    slower = 1.0 / step if step > _SLOWER * flight.dt else None
     if flight.hold[name] != "zero-order":
-        return _corner_rate(flight.dt, split(u)[1] if flight.hold[name] == "mixed" else u)
+        moving = split(u)[1] if flight.hold[name] == "mixed" else u
+        return slower or _corner_rate(flight.dt, moving)
     # Held because somebody said so: then it is known at all times.
     if name not in flight.hold_reason:
         return None
@@ -225,7 +295,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     regular = np.mean(np.abs(stairs - usual) <= max(1.0, 0.05 * usual))
     if usual < 2 or regular < _REGULAR:
         return None
-    return 1.0 / (usual * flight.dt)
+    return min(1.0 / (usual * flight.dt), slower or np.inf)
 
 
 def _corner_rate(dt: float, u: np.ndarray) -> float:
@@ -236,16 +306,19 @@ def _corner_rate(dt: float, u: np.ndarray) -> float:
     corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
     if corners.size < _STEPS:
         return 1.0 / dt
-    usual = float(np.median(np.diff(corners)))
     # A corner between two samples of the new clock bends at both of them.
-    pairs = np.mean(np.diff(corners) == 1)
-    if usual <= 1 and pairs < 0.6:
-        usual = float(np.median(np.diff(corners)[np.diff(corners) > 1]))
-    return 1.0 / (max(usual, 1.0) * dt)
+    begins = np.flatnonzero(np.diff(corners, prepend=-2) > 1)
+    sizes = np.diff(begins, append=corners.size)
+    if np.median(np.repeat(sizes, sizes)) > _MOST_BENDS:
+        return 1.0 / dt
+    within = np.arange(corners.size) - np.repeat(begins, sizes)
+    steps = np.diff(corners[within % 2 == 0])
+    # Where it rests there are no corners.
+    return 1.0 / (float(np.mean(steps[steps <= 1.5 * np.median(steps)])) * dt)
 
 
 def output_rate(flight: Flight, name: str) -> float:
     """The rate [Hz] of the samples of an output that are there."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
     usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
-    return 1.0 / (usual * flight.dt)
+    return 1.0 / max(usual * flight.dt, flight.logged_step(name, "output"))

@@ -149,8 +149,13 @@ def sequence(signal: np.ndarray) -> np.ndarray:
     nearest instants of a fast grid, have no lag at which many pairs are seen: lags are then counted
     in its own samples.
     """
+    return signal[kept(signal)]
+
+
+def kept(signal: np.ndarray) -> np.ndarray:
+    """True (N,) for the samples that `sequence` keeps."""
     seen = ~np.isnan(signal)
-    return signal[seen] if seen.mean() < _MOSTLY_MISSING else signal
+    return seen if seen.mean() < _MOSTLY_MISSING else np.ones_like(seen)
 
 
 def lags_for(n: int) -> int:
@@ -159,15 +164,22 @@ def lags_for(n: int) -> int:
     return max(1, min(n // 4, 500))
 
 
-def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
+def whiteness(
+    residual: np.ndarray, together: int = 1, fitted: np.ndarray | None = None
+) -> Whiteness:
     """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured.
 
-    `together` is how many signals are judged side by side: the p value is multiplied by it
-    (Bonferroni), so that one in a hundred white records fails, not one in a hundred signals.
+    Args:
+        residual: (N,), any unit.
+        together: how many signals are judged side by side: the p value is multiplied by it
+            (Bonferroni), so that one in a hundred white records fails, not one in a hundred
+            signals.
+        fitted: (N, k) what of the signal the unknowns could follow, see `seen_autocorrelation`.
     """
+    fitted = None if fitted is None else fitted[kept(residual)]
     residual = sequence(residual)
     n = int(np.count_nonzero(~np.isnan(residual)))
-    _, r, pairs, whole = seen_autocorrelation(residual)
+    _, r, pairs, whole = seen_autocorrelation(residual, fitted)
     lags = r.size
     # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
@@ -188,11 +200,19 @@ def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def seen_autocorrelation(
-    residual: np.ndarray,
+    residual: np.ndarray, fitted: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Lags in samples, autocorrelation over the pairs of samples that are seen, the number of
     these, and the part of the record that a lag leaves, each (lags,), at the shortest lags at which
-    enough are seen; at all of them where nothing is missing."""
+    enough are seen; at all of them where nothing is missing.
+
+    Args:
+        residual: (N,), NaN where nothing is measured.
+        fitted: (N, k) rows of the orthonormal directions along which all unknowns moved the
+            signals. Least squares leaves nothing along them: white noise of variance s^2 ends with
+            the covariance s^2 (1 - U U'), whose autocovariance is taken off. Without it many free
+            initial states make the residuals of a right model look coloured.
+    """
     seen = ~np.isnan(residual)
     r = _centred(residual)
     n, count = r.size, int(seen.sum())
@@ -206,6 +226,9 @@ def seen_autocorrelation(
     # the rounding of the transform.
     all_seen = n - np.arange(at[-1] + 1.0)
     pairs, c = all_seen if count == n else np.round(products(seen.astype(float))), products(r)
+    if fitted is not None:
+        taken = sum((products(u) for u in fitted.T), np.zeros_like(c))
+        c = c + c[0] / max(count - taken[0], 1.0) * taken
     # With every second sample missing no pair is an odd lag apart; a lag of few pairs is noise that
     # the division by them would blow up.
     at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
