@@ -80,9 +80,10 @@ def test_a_sweep_follows_the_holds_of_its_flights():
     """Reduced while it goes on, kept whole, and delayed: each as simulate has it."""
     vehicle = load_vehicle(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     model, stick = models.roll_on_stand, 3e-6 * np.sin(2.0 * np.arange(60) ** 1.2)
+    stick[20:40] = np.repeat([1e-6, -2e-6], 10)
     flights = [
         Flight(dt=0.02, inputs={"x_roll": stick}, outputs={}, name=hold, hold={"x_roll": hold})
-        for hold in ("linear", "zero-order")
+        for hold in ("linear", "zero-order", "mixed")
     ]
     rms = {"rms": Reduce("rms", "roll")}
     streamed = sweep(model, vehicle, flights, grid({"Ixx": [0.02, 0.03]}), rms)

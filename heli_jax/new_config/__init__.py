@@ -157,21 +157,23 @@ def _seen(channel: Series) -> Series:
     return channel._replace(times=channel.times[seen], values=channel.values[seen])
 
 
-def _late(series: Mapping[str, Series], signals: text.Signals | None) -> str:
-    """Which input an output precedes and does not feed back to, in words; empty where none is."""
+def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[str, bool]:
+    """Which input an output precedes, in words, empty where none is; and whether it is no feedback
+    that looks like that."""
+    none = "", False
     if signals is None:
-        return ""
+        return none
     inputs, outputs = (
         {n: _seen(series[g.channel]) for n, g in of.items() if g is not None}
         for of in (signals.inputs, signals.outputs)
     )
     both = [*inputs.values(), *outputs.values()]
     if not (inputs and outputs and all(s.times.size > 1 for s in both)):
-        return ""
+        return none
     first, last = max(s.times[0] for s in both), min(s.times[-1] for s in both)
     dt = min(float(np.median(np.diff(s.times))) for s in outputs.values())
     if not (dt > 0 and last - first > 2.0 * dt):
-        return ""
+        return none
     times = np.arange(first, last, dt)
     on_grid = [
         {n: np.interp(times, s.times, s.values) for n, s in of.items()} for of in (inputs, outputs)
@@ -179,9 +181,12 @@ def _late(series: Mapping[str, Series], signals: text.Signals | None) -> str:
     followed = {f.input for f in feedback(Flight(dt, *on_grid)) if f.present}
     for output, y in on_grid[1].items():
         led = led_by(y, on_grid[0], dt)
-        if led is not None and led[2] not in followed:
-            return f"{led[2]} is logged late: {output} moves {led[1]:.2g} s or more before it"
-    return ""
+        if led is not None:
+            _, lead, name = led
+            follows = f" or follows {output} (feedback)" if name in followed else ""
+            words = f"{output} moves {lead:.2g} s or more before it"
+            return f"{name} is logged late{follows}: {words}", not follows
+    return none
 
 
 def _rate(log: Log, outputs: Sequence[str]) -> float | None:

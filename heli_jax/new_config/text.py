@@ -78,7 +78,7 @@ def configuration(
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
     filtered: Mapping[str, Filtered] = {},
-    late: str = "",
+    late: tuple[str, bool] = ("", False),
 ) -> str:
     """The configuration as text.
 
@@ -97,7 +97,8 @@ def configuration(
         others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
         filtered: those of the preset's outputs that the autopilot filtered.
-        late: which input is logged late, in words; empty where none is.
+        late: which input is logged late, in words, empty where none is; and whether nothing else
+            looks like that.
 
     """
     lines = [
@@ -133,10 +134,10 @@ def configuration(
     ]
     lines += [_free(name, start) for name, start in free.items()]
     lines += [_held(name, value) for name, value in held.items()]
+    guess, sure = late
+    why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
-        f"  nuisance: {{time_shift: true}}   # GUESS: {_comment(late)}"
-        if late
-        else "  # nuisance: {time_shift: true} # where the stick was logged late or early",
+        f"  {'' if sure else '# '}nuisance: {{time_shift: true}} # {why}",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]
