@@ -116,7 +116,7 @@ def fit_notes(
         *_correlation_notes(correlated),
         *delay_notes(problem, numbers.of_interest),
         *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
-        *(sign_notes(problem, numbers.of_interest) if bool(best.converged) else []),
+        *_sign_notes(turned_signs(problem, numbers.of_interest) if bool(best.converged) else {}),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),
     ]
 
@@ -136,15 +136,17 @@ def by_label(notes: Sequence[str], flights: Sequence[str]) -> list[str]:
     return [re.sub(r"^Flight (\d+)(?=:| was)", named, note) for note in notes]
 
 
-def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[str]:
-    """Which parameters surely have the other sign than they began with, where they began with a
-    value and not next to zero.
+def turned_signs(problem: Problem, estimates: Mapping[str, Estimate]) -> dict[str, str]:
+    """By name, in words, the parameters that surely have the other sign than they began with,
+    where they began with a value and not next to zero.
+
+    One whose sign is declared (`Model.positive`, `sign: keep`, bounds) cannot turn.
 
     Args:
         problem: with the starts.
         estimates: by name.
     """
-    turned = []
+    turned = {}
     for name, free in problem.free.items():
         e = estimates[name]
         # A delay says by itself what it means to be negative.
@@ -152,13 +154,17 @@ def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[str]
             continue
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
         if surely and abs(free.start) > _NEAR_ZERO * abs(e.value):
-            turned.append(f"{name} ({free.start:.3g} to {e.value:.3g})")
+            turned[name] = f"{name} ({free.start:.3g} to {e.value:.3g})"
+    return turned
+
+
+def _sign_notes(turned: Mapping[str, str]) -> list[str]:
     if not turned:
         return []
     return [
-        f"{listed(turned)} ended with the other sign than the start's: where that sign is known, "
-        "an input or an output has the wrong one in the log, or an axis points the other way "
-        "(`invert: true`)."
+        f"{listed(list(turned.values()))} ended with the other sign than the start's: where that "
+        "sign is known, an input or an output has the wrong one in the log, or an axis points the "
+        "other way (`invert: true`)."
     ]
 
 
