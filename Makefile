@@ -1,11 +1,11 @@
-# make demo   the main job on a bench log that the project makes itself; CONFIG=FILE fits yours
+# make demo   the main job on a bench log that the project makes itself; CONFIG=FILE fits yours,
+#             OUT=DIR says into which new directory (default: runs/NAME-DATE-TIME)
 # make test   all checks; where CI=true without the slowest tests
 # make docs   the documentation site, into site/
 # make bench  the benchmarks, side by side in one run
 .PHONY: demo test docs bench clean
 SHELL := /bin/bash
 CONFIG ?= configs/bench-roll.yaml
-OUT ?= runs/demo/fit
 BIN := .venv/bin
 
 .venv/.installed: pyproject.toml constraints.txt
@@ -22,8 +22,7 @@ demo: .venv/.installed
 ifeq ($(CONFIG),configs/bench-roll.yaml)
 	@$(BIN)/heli-jax simulate $(CONFIG) --out runs/demo/bench.csv
 endif
-	@rm -rf '$(OUT)'
-	@$(BIN)/heli-jax fit '$(CONFIG)' --out '$(OUT)'
+	@$(BIN)/heli-jax fit '$(CONFIG)' $(if $(OUT),--out '$(OUT)')
 
 # Types are checked beside the tests: pyright alone leaves a core idle for three minutes.
 # Compiled modules are kept: a dozen tests start processes of their own, which would compile all anew.
@@ -46,4 +45,4 @@ bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/filter.py
 
 clean:
-	rm -rf .venv runs site .pytest_cache .ruff_cache
+	rm -rf .venv site .pytest_cache .ruff_cache

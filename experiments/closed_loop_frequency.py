@@ -202,7 +202,6 @@ def one_fit(seed: int, method: str) -> dict[str, Any]:
         "tic": doublet_tic(values),
         "untrusted": list(found.untrusted),
         "adequate": found.adequate,
-        "moved": found.moved_by_feedback,
         "error": {n: values[n] - t for n, t in truths().items()},
         "z": {n: (values[n] - t) / (found.estimates[n].sd or np.nan) for n, t in truths().items()},
     }

@@ -5,6 +5,7 @@ import contextlib
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from heli_jax import (
     cli_options,
     file_commands,
+    import_path,
     interrupts,
     run_commands,
     run_directory,
@@ -22,7 +24,7 @@ from heli_jax.interrupts import resumable
 from heli_jax.stages import Note
 
 if TYPE_CHECKING:
-    from heli_jax.identification.result import Fit
+    pass
 
 # 2 is what argparse ends with.
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
@@ -38,7 +40,7 @@ class _Parser(argparse.ArgumentParser):
 def _refuse(prog: str, message: str) -> NoReturn:
     """End with one line, which names the help of the command (`heli-jax fit`) that was begun."""
     helps = "says what it takes" if " " in prog else "lists the commands"
-    print(f"heli-jax: {message} ({prog} --help {helps})", file=sys.stderr)
+    terminal.say(f"{message} ({prog} --help {helps})")
     raise SystemExit(WRONG_INPUT)
 
 
@@ -59,7 +61,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted.
     """
     # With arguments of their own tests and programs call it, which an interrupt must not end.
+    if arguments is None:
+        import_path.pass_over_style_of_folder()
+        # Of numbers that a log or a configuration holds: the sentence says what is wrong.
+        warnings.filterwarnings(
+            "ignore", category=RuntimeWarning, module=r"(heli_jax|numpy|scipy)\b"
+        )
     with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
+        for text in sys.argv[1:] if arguments is None else arguments:
+            if any("\ud800" <= c <= "\udfff" for c in text):
+                _refuse("heli-jax", f"expected arguments and names of files in UTF-8, got {text!r}")
         options, unknown = _parser().parse_known_args(arguments)
         if unknown:
             # Of which command, argparse has forgotten by then.
@@ -69,10 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             options.say = terminal.say_notes if options.quiet else terminal.say
             with terminal.progress_shown(options.quiet):
-                return options.run(options)
+                code = options.run(options)
+            # Now, where a full disk is told in words.
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            return code
         except KeyboardInterrupt:
             terminal.say(seen.words())
-            return INTERRUPTED
+            return 128 + seen.seen[0] if seen.seen else INTERRUPTED
         except BrokenPipeError:
             # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
             # once more at the end, and complain.
@@ -84,8 +99,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 terminal.say("interrupted")
                 return INTERRUPTED
             # Everything else is a fault of ours, and its traceback is what a report of it needs.
-            if not isinstance(e, InputError):
+            if not isinstance(e, InputError | OSError):
                 raise
+            if isinstance(e, OSError):
+                # What was to be printed is still there, and would be tried again at the end.
+                with contextlib.suppress(OSError, AttributeError, ValueError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
             terminal.say(" ".join(str(e).split()))
             return WRONG_INPUT
 
@@ -183,15 +203,9 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
     # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
     # add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(_cache()))
+        jax.config.update("jax_compilation_cache_dir", _private_cache())
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    from heli_jax.numerics import stored
-
-    # What was traced lies beside what was compiled of it, and is kept where that is.
-    compiled: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    if compiled and jax.config.jax_enable_compilation_cache:  # pyright: ignore
-        stored.keep_in(Path(compiled) / "heli_jax-traced")
     if cpu_devices is not None:
         # Once JAX is in use their number stays as it is.
         with contextlib.suppress(RuntimeError):
@@ -213,6 +227,17 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 def _cache() -> Path:
     """Where what was compiled and measured is kept from one command to the next."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
+
+
+def _private_cache() -> str | None:
+    """The cache folder, of this user alone; None where it is not: what was compiled is code."""
+    folder = _cache()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)  # refused where it is another user's
+    except OSError:
+        return None
+    return str(folder)
 
 
 def _new_directory(options: argparse.Namespace) -> Path:
@@ -240,27 +265,23 @@ def _fit(options: argparse.Namespace) -> int:
     from heli_jax import output, workflow
 
     experiment = workflow.load_config(options.config, options.set)
-    run = workflow.run_fit(experiment, out, progress=options.say, began=began)
-    if options.json:
-        print((out / "fit.json").read_text(encoding="utf-8"), end="")
+    failure = None
+    try:
+        run = workflow.run_fit(experiment, out, progress=options.say, began=began)
+    except workflow.NotWritten as e:
+        # A fit of hours is shown at least.
+        run, failure = e.run, e
+    if options.json and run.directory is not None:
+        print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
     else:
         output.print_fit(run)
-    return _fit_code(run.fit)
+    if failure is not None:
+        raise failure
+    return run.fit.exit_code
 
 
 def _status_code(status: str) -> int:
     return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(status, NOT_CONVERGED)
-
-
-def _fit_code(fitted: "Fit") -> int:
-    """The exit code of a fit."""
-    code = _status_code(fitted.status)
-    # Converged onto a model worse than a constant, or one that foretells no better: a script that
-    # looks at the code alone must not take these numbers.
-    if code == DONE and (fitted.adequacy.less_than_mean or fitted.held_out_worse):
-        return NOT_CONVERGED
-    # An optimum that gusts have made looks as determined as any other.
-    return NOT_DETERMINED if code == DONE and fitted.not_borne_out else code
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -296,10 +317,11 @@ def _windows(options: argparse.Namespace) -> int:
 
 
 def _compatibility(options: argparse.Namespace) -> int:
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import output
 
-    compatible = output.run_compatibility(options.config, options.out, options.set, options.say)
+    compatible = output.run_compatibility(options.config, out, options.set, options.say)
     return DONE if compatible else NOT_CONVERGED
 
 
@@ -374,7 +396,7 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with (
         simulation_output.sweep_progress(quiet=options.quiet) as progress,
-        cli_options.dask_client(options, config) as client,
+        cli_options.dask_client(options) as client,
     ):
         sweep_workflow.run_sweep(
             experiment,

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from heli_jax.errors import InputError
@@ -13,8 +12,8 @@ if TYPE_CHECKING:
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
-    "asked; 4 an optimiser did not converge, the model is not adequate and explains less than the "
-    "mean of what was measured, or sensors are not compatible; 130 interrupted."
+    "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
+    "adequate, or sensors are not compatible; 130 interrupted."
 )
 """what `--help` ends with: of every command"""
 
@@ -246,14 +245,11 @@ def seconds(text: str) -> float:
 
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
-def dask_client(
-    options: argparse.Namespace, config: Path
-) -> contextlib.AbstractContextManager[Any]:
+def dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
     """A dask client where one is asked for.
 
     Args:
         options: of a command with --workers and --scheduler.
-        config: the configuration.
 
     Raises:
         InputError: dask is not installed, or nothing answers.
@@ -268,5 +264,4 @@ def dask_client(
             f"{option}: dask.distributed is not installed, expected the extra distributed: "
             "pip install 'heli_jax[distributed]'"
         ) from e
-    # Workers import models and reducers of one's own from the configuration's folder.
-    return connected(options.scheduler, options.workers, config.absolute().parent)
+    return connected(options.scheduler, options.workers)

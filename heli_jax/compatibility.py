@@ -18,6 +18,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
+from heli_jax.finding import sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import FAR
 from heli_jax.numbers import with_sd
@@ -90,15 +91,16 @@ def run_compatibility(
 
     Args:
         config: a configuration with `model: kinematics`.
-        out: a new directory for the report and compatibility.yaml; none is written unless given.
+        out: directory for the report and compatibility.yaml, a numbered sibling where it exists;
+            none is written unless given.
         overrides: values in place of the file's, as of `load_config`.
         progress: called with what is going on, in words.
 
     Raises:
-        InputError: a log or something of the configuration is wrong, or `out` exists.
+        InputError: a log or something of the configuration is wrong, or `out` cannot be written.
     """
     if out is not None:
-        run_directory.require_free(Path(out))
+        out = run_directory.free_directory(Path(out))
     experiment = workflow.load_config(config, overrides)
     if not is_kinematic(experiment.model):
         raise InputError(
@@ -118,7 +120,8 @@ def run_compatibility(
     progress("writing the report")
     further = run.supplementary._replace(sensors=_agreement(compatibility))
     run = workflow.write_report(dataclasses.replace(run, supplementary=further), out)
-    place = Path(out) / FILE
+    assert run.directory is not None
+    place = run.directory / FILE
     with run_directory.whole_file(place, f"--out {place}") as part:
         part.write_text(as_yaml(compatibility.corrections), encoding="utf-8")
     return dataclasses.replace(compatibility, run=run)
@@ -276,7 +279,7 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
     """What a fit says of itself, and errors that no sensor has."""
     # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
-    notes = tuple(n for n in run.fit.notes if n not in run.fit.adequacy.sentences)
+    notes = tuple(sentences(f for f in run.fit.findings if f not in run.fit.adequacy.findings))
     scales = [
         e
         for e in errors

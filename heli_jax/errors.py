@@ -4,6 +4,15 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
+_END = 1000
+"""letters at the beginning and the end of a message that stay, as long as paths may be"""
+
+
+def shortened(text: str) -> str:
+    """A message without the middle of a long one, which is a value that it names."""
+    left = len(text) - 2 * _END
+    return text if left <= 0 else f"{text[:_END]} [{left} letters] {text[-_END:]}"
+
 
 class InputError(ValueError):
     """A file or a configuration is wrong.
@@ -11,6 +20,24 @@ class InputError(ValueError):
     Its text is one whole sentence that names the file, the place, what was expected and what was
     got. The command line prints it and ends with exit code 2.
     """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(shortened(text))
+
+
+class VehicleError(ValueError):
+    """A vehicle lacks a constant that its model reads, or has one that cannot be.
+
+    Its argument is the sentence without its place: a configuration knows the vehicle's file.
+    """
+
+    @property
+    def problem(self) -> str:
+        """What is wrong."""
+        return self.args[0]
+
+    def __str__(self) -> str:
+        return f"vehicle: {self.problem}"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

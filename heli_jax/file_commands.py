@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from heli_jax import run_directory
+from heli_jax.terminal_table import tell
 
 
 def new(options: argparse.Namespace, say: Callable[[str], None]) -> int:
@@ -43,7 +44,7 @@ def new_model(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     from heli_jax.new_model import write_skeleton
 
     written = write_skeleton(options.name, options.out)
-    print(*written, sep="\n")
+    tell("\n".join(map(str, written)))
     say(
         f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
         f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"

@@ -18,7 +18,7 @@ from heli_jax.config import (
     read_flights,
     signals,
 )
-from heli_jax.dynamics.model import Model, needed_but_missing, require_linear, zeros
+from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
@@ -166,16 +166,11 @@ def _run(
     """The run as NumPy arrays, without measurement noise; and its inputs as they were commanded, in
     arrays of as many samples."""
     # Said by name: what is missing is NaN, and the run would only be called not finite.
-    missing = needed_but_missing(experiment.model, experiment.vehicle.params)
-    if missing:
-        raise InputError(
-            f"{experiment.path}: vehicle: {', '.join(missing)} missing, model "
-            f"{experiment.model.name} needs {'it' if len(missing) == 1 else 'them'}"
-        )
     try:
+        require_constants(experiment.model, experiment.vehicle.params)
         require_linear(experiment.model, experiment.vehicle.params)
     except ValueError as e:
-        raise InputError(f"{experiment.path}: {e}") from e
+        raise experiment.wrong("", e) from e
     model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
     if is_full_nonlinear(experiment.model):

@@ -1,10 +1,13 @@
 """Anyone's own objects by import path, as a configuration names them."""
 
+import contextlib
 import importlib
 import importlib.util
+import os
 import re
 import sys
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,8 @@ from heli_jax.regular_file import require_regular
 
 _LARGEST = 10**7
 """bytes of a module's source"""
+_looked_in: list[str] = []
+"""folders of configurations that named a module"""
 _PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -36,9 +41,9 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     if not is_path(path):
         raise InputError(f"{where}: got {path!r:.60}, expected package.module:name")
     module_name, attribute = path.split(":")
-    # First in the path and left there: the module's own imports, also later ones, find its folder.
-    if folder is not None and str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
+    # Left there: the module's own imports, also later ones, find its folder.
+    if folder is not None:
+        search((str(folder),))
     try:
         _check_size(module_name, where)
         module = importlib.import_module(module_name)
@@ -50,6 +55,34 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     except (Exception, SystemExit) as e:  # whatever the module does while it is imported
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r}: {_words(e)}") from e
     return getattr(module, attribute, None)
+
+
+def search(folders: Iterable[str]) -> None:
+    """Look for modules in these folders as well, from now on.
+
+    They come last in the path: a file beside a configuration must not stand for an installed
+    package.
+    """
+    _looked_in.extend(f for f in folders if f not in _looked_in)
+    sys.path.extend(f for f in folders if f not in sys.path)
+
+
+def searched() -> tuple[str, ...]:
+    """Folders in which modules of configurations were looked for; none where none was named."""
+    return tuple(_looked_in)
+
+
+def pass_over_style_of_folder() -> None:
+    """Import Matplotlib now where the working folder holds a file that it would read as its
+    settings, whatever is in it."""
+    if os.path.lexists("matplotlibrc"):
+        with contextlib.chdir(os.sep):
+            importlib.import_module("matplotlib")
+
+
+def environment() -> dict[str, str]:
+    """The environment in which another Python finds the modules that this one does."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
 def _check_size(module_name: str, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command at once, with one sentence, whatever it is doing.
+"""Ctrl-C and SIGTERM end a command at once, with one sentence, whatever it is doing.
 
 Python raises KeyboardInterrupt wherever it happens to be. In a callback of a library or in a
 finaliser that is lost, and printed as a traceback; and while compiled code runs none is raised at
@@ -21,6 +21,7 @@ from heli_jax import run_directory
 
 INTERRUPTED = 130
 """what a shell reports of a program ended by SIGINT (128 + 2)"""
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 _AT_ONCE = 0.5
 """s: a main thread that runs Python has heard of a signal by then"""
 _UNWINDING = 20.0
@@ -65,9 +66,10 @@ class Interrupts:
             pipe: to which the system's own handler writes a signal's number, at any moment.
         """
         while numbers := os.read(pipe, 64):
-            if signal.SIGINT in numbers:
+            if heard := [n for n in _ENDING if n in numbers]:
                 if self._over.wait(_UNWINDING if self.unwinds else _AT_ONCE):
                     break
+                self.seen += heard
                 self.end()
         os.close(pipe)
 
@@ -86,7 +88,8 @@ class Interrupts:
         restored = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""
         with contextlib.suppress(OSError):
             os.write(2, f"{restored}heli-jax: {self.words()}\n".encode())
-        os._exit(INTERRUPTED)
+        # As a shell reports of a program that was ended by a signal.
+        os._exit(128 + (self.seen or [signal.SIGINT])[0])
 
 
 @contextlib.contextmanager
@@ -104,7 +107,8 @@ def as_program() -> Iterator[Interrupts]:
         return
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    signal.signal(signal.SIGINT, interrupts.heard)
+    for number in _ENDING:
+        signal.signal(number, interrupts.heard)
     before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     hook = sys.unraisablehook
     sys.unraisablehook = lambda lost: None if _is_interrupt(lost) else hook(lost)
@@ -114,6 +118,7 @@ def as_program() -> Iterator[Interrupts]:
         yield interrupts
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         interrupts.finish()
         signal.set_wakeup_fd(before)
         os.close(writing)

@@ -21,6 +21,7 @@ from heli_jax.flights.rotor_lines import LEAST, RotorLines
 from heli_jax.flights.row_clock import ROWS
 from heli_jax.flights.vibration import SMALLEST, line_words
 from heli_jax.numbers import terse
+from heli_jax.terminal_table import plain_text
 
 # The width of a terminal that nobody has widened, and one below which nothing is narrowed.
 _WIDTH, _NARROWEST = 80, 44
@@ -52,7 +53,7 @@ def print_flights(
     log = flights[0]
     rows = "" if log.topics else f", {log.n_rows} rows"
     words = f"{log.format}, {log.size} bytes{rows}"
-    name = _plain(log.path)
+    name = plain_text(log.path)
     width = min(_WIDTH, max(_NARROWEST, shutil.get_terminal_size((_WIDTH, 24)).columns))
     # A path has no end that could be left out, and a hash is copied whole.
     print(f"{name}: {words}" if len(name) + len(words) + 2 <= width else f"{name}\n{words}")
@@ -60,7 +61,7 @@ def print_flights(
     for flight in flights:
         count = flight.flight[1] if chosen else len(flights)
         for line in _flight_lines(flight, count, pattern, width):
-            print("\n".join(_lines(line, width)))
+            print("\n".join(map(plain_text, _lines(line, width))))
 
 
 def as_json(flights: Sequence[LogInfo]) -> str:
@@ -283,7 +284,7 @@ def _channel_lines(
     if left - len(words) * (_NUMBER + 1) < _ROOM:
         words.pop()
     name = left - len(words) * (_NUMBER + 1)
-    name = min(name, max(7, *(len(_plain(c.name)) for c in shown)))
+    name = min(name, max(7, *(len(plain_text(c.name)) for c in shown)))
     unit = f" {'unit':{units}}" if units else ""
     heads = "".join(f" {word:>{_NUMBER}}" for word in words)
     yield f"{'channel':{name}}{unit}{heads} {'NaN %':>5}"
@@ -334,26 +335,21 @@ def _percent(share: float) -> str:
     return "0 %" if share < 1e-7 else f"{100 * share:.2g} %"  # below is the rounding of float64
 
 
-def _plain(text: str) -> str:
-    """Text from a file without what a terminal would obey."""
-    return re.sub(r"[^\x20-\x7e\xa1-\ud7ff\ue000-\uffef]", "?", text)
-
-
 def _cut(text: str, width: int) -> str:
-    text = _plain(text)
+    text = plain_text(text)
     return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
 def _squeezed(text: str, width: int) -> str:
     """A name that is cut in its middle: the ends tell the topic and the field."""
-    text = _plain(text)
+    text = plain_text(text)
     half = (width - 3) // 2
     return text if len(text) <= width else f"{text[:half]}...{text[half + 3 - width :]}"
 
 
 def _lines(text: str, width: int) -> list[str]:
     """Lines no wider than the screen: a setting without its end, a sentence going on below."""
-    text = _plain(text).rstrip()
+    text = plain_text(text).rstrip()
     if len(text) <= width:
         return [text]
     if re.match(r"  \S+ = ", text):

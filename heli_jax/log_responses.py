@@ -154,7 +154,7 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     from heli_jax.identification.validation.misread import degrees_for_radians
 
     return tuple(
-        doubt.finding.sentence
+        doubt.sentence
         for label, flight in zip(labels(tuple(flights)), flights, strict=True)
         for doubt in degrees_for_radians(experiment.model, label, flight)
     )

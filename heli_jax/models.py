@@ -16,6 +16,7 @@ from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.dynamics.roll import on_stand, pitch, roll
 from heli_jax.errors import InputError, nearest
 from heli_jax.import_path import by_path, is_path
+from heli_jax.linear_models import read as linear_models
 
 roll_on_stand = on_stand(roll)
 pitch_on_stand = on_stand(pitch)
@@ -101,7 +102,9 @@ def names() -> tuple[str, ...]:
 
 def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not is_path(name):
-        known = [*names(), "package.module:name"]
+        # As a configuration writes them: linear models are named by their file.
+        files = (name,) if name.endswith((".yaml", ".yml")) else linear_models.shipped()
+        known = [*names(), *(f"{{linear: {n}}}" for n in files), "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):

@@ -23,11 +23,13 @@ def number(value: float | None, digits: int = 4) -> str:
         return "∞" if value > 0 else "−∞"
     # Of the rounded value, since 0.0009999 to two digits is 0.0010 and not 10·10⁻⁴.
     power = _power(float(f"{value:.{max(digits, 1) - 1}e}"))
-    text = f"{value / 10.0**power:.{digits}g}"
+    # 10**-324 is no number: of the smallest in two steps.
+    mantissa = value / 10.0 ** max(power, -300) / 10.0 ** min(power + 300, 0)
+    text = f"{mantissa:.{digits}g}"
     # `g` falls back to an exponent where the digits left of the point are more than asked for;
     # the power of ten has been taken out already, and a number has one.
     if "e" in text:
-        text = f"{value / 10.0**power:.0f}"
+        text = f"{mantissa:.0f}"
     return _signed(text) + _times(power)
 
 

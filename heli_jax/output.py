@@ -1,13 +1,13 @@
 """What the commands print and write."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heli_jax import run_directory
 from heli_jax.config.frequency import missing_handling
+from heli_jax.finding import Finding
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate, Fit
@@ -15,7 +15,6 @@ from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
@@ -31,9 +30,7 @@ def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     _print_outcome(fit)
-    # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
-    # stand in fit.json and the report.
-    shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
+    shown = {**fit.estimates, **_shown_nuisances(fit.nuisance)}
     stopped = fit.status == "not-converged"
     rows = [_row(name, e, stopped=stopped) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
@@ -94,19 +91,30 @@ def print_fit(run: FitRun) -> None:
         tell(f"report: {run.directory / 'report.html'}")
 
 
+def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Those of all flights, and offsets of inputs that are not zero, the most significant ones."""
+    # Others of a single flight ('flight/bias') are many and of interest to few: they stand in
+    # fit.json and the report. An offset says that a stick's zero is not the log's.
+    common = {n: e for n, e in nuisance.items() if "/" not in n}
+    offsets = {
+        n: abs(e.value) / e.sd
+        for n, e in nuisance.items()
+        if "/offset " in n and e.sd and e.lower95 is not None and e.upper95 is not None
+        # The interval is without zero.
+        if e.lower95 * e.upper95 > 0
+    }
+    most = sorted(offsets, key=lambda n: -offsets[n])[:_MOST_OFFSETS]
+    return common | {n: nuisance[n] for n in most}
+
+
 def _print_outcome(fit: Fit) -> None:
     """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
     text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    held = f". Held out: {doubt}" if (doubt := report_tables.held_out_doubt(fit)) else ""
-    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
-    # Reasons have a line each below: they are said once.
-    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
-    below = why and not fit.adequate and not fit.adequacy.unjudged
-    adequate = "no (why: below)" if below else report_tables.adequate(fit)
-    tell(f"{arrived}: {text} adequate: {adequate}{held}")
+    converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
+    tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         tell(f"! {line}")
@@ -129,13 +137,13 @@ def _print_handling(run: FitRun) -> None:
 
 
 def run_compatibility(
-    config: str, out: str | None, overrides: list[str], say: Callable[[str], None]
+    config: str, out: Path, overrides: list[str], say: Callable[[str], None]
 ) -> bool:
     """Compare a log's sensors and print what was found; whether they agree.
 
     Args:
         config: the configuration.
-        out: a new directory; runs/NAME-DATE-TIME unless given.
+        out: a new directory.
         overrides: of `--set`.
         say: for words as the work goes on.
 
@@ -145,8 +153,7 @@ def run_compatibility(
     # Here: of all commands only this one needs it.
     from heli_jax import compatibility
 
-    place = run_directory.default_directory(Path(config)) if out is None else Path(out)
-    result = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
+    result = compatibility.run_compatibility(config, out, overrides=overrides, progress=say)
     tell(result.verdict)
     for line in result.doubts:
         tell(f"! {line}")
@@ -156,8 +163,9 @@ def run_compatibility(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
     )
-    tell(f"corrections: {place / compatibility.FILE}")
-    tell(f"report: {place / 'report.html'}")
+    assert result.run.directory is not None
+    tell(f"corrections: {result.run.directory / compatibility.FILE}")
+    tell(f"report: {result.run.directory / 'report.html'}")
     return result.compatible
 
 
@@ -194,6 +202,8 @@ def _range(estimate: Estimate | Combination) -> str:
     return f"{shown[0]} to {shown[1]}"
 
 
+_MOST_OFFSETS = 4
+"""offsets of inputs that the terminal shows"""
 _GATES = 5
 """failed gates that the terminal names; the report has all"""
 _NEAR = 10.0
@@ -228,11 +238,12 @@ def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
         return (name, at, "", "", e.unit, percent(e.prior_share, 0))
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
-    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
+    if e.sd is None or not math.isfinite(e.sd):
         return (name, "not determined", "", "", e.unit, percent(e.prior_share, 0))
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)
-    return (name, value + at_bound, sd, _range(e), e.unit, percent(e.prior_share, 0))
+    interval = "not trusted" if e.lower95 is None or e.upper95 is None else _range(e)
+    return (name, value + at_bound, sd, interval, e.unit, percent(e.prior_share, 0))
 
 
 def print_check(check: Check) -> None:
@@ -256,14 +267,14 @@ def print_check(check: Check) -> None:
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
         tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
+    follows = all(f.code != NOTHING_FOLLOWS for f in check.findings)
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         tell(f"! {sentence}")
     for note in check.further_notes:
-        tell(f"! {note}")
+        tell(f"! {note.sentence}")
     _print_findings(check.findings)
 
 

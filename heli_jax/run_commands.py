@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,8 +11,11 @@ from typing import Any
 from heli_jax import run_directory
 from heli_jax.errors import InputError
 from heli_jax.numbers import adequacy_of
+from heli_jax.regular_file import read_regular
 from heli_jax.terminal_table import print_table, tell
 
+_LARGEST = 10**9
+"""bytes of a fit.json"""
 _DEEPEST = 3
 """folders below the one that is asked for"""
 
@@ -41,29 +45,30 @@ def runs(options: argparse.Namespace) -> int:
 def _found(folder: Path) -> Iterator[dict[str, Any]]:
     for path in _files(folder, _DEEPEST):
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST))
             # Without its reasons, for which a table has no room.
             adequate = adequacy_of(content).partition(" (")[0]
             row = {k: content[k] for k in ("model", "method", "status")}
             untrusted = ", ".join(map(str, content.get("untrusted") or ()))
+            date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
         # Any file may be called so: what no fit wrote is no run.
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             continue
-        date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
         name = str(path.parent.relative_to(folder))
         yield {"run": name, "date": date, **row, "adequate": adequate, "untrusted": untrusted}
 
 
 def _files(folder: Path, deepest: int) -> Iterator[Path]:
+    # Also one that may be listed and not entered says of nothing in it what it is.
     try:
-        inside = sorted(folder.iterdir())
+        inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        files = [e.path for e in inside if e.name == "fit.json" and e.is_file()]
+        folders = [e.path for e in inside if e.is_dir(follow_symlinks=False)]
     except OSError:
         return
-    for path in inside:
-        if path.name == "fit.json" and path.is_file():
-            yield path
-        elif deepest and path.is_dir() and not path.is_symlink():
-            yield from _files(path, deepest - 1)
+    yield from map(Path, files)
+    for path in folders if deepest else ():
+        yield from _files(Path(path), deepest - 1)
 
 
 def compare(options: argparse.Namespace, say: Callable[[str], None]) -> int:

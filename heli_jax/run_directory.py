@@ -1,10 +1,12 @@
 """Directories and files that appear whole or not at all."""
 
 import contextlib
+import itertools
 import os
 import secrets
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -20,6 +22,25 @@ _finished: list[Path] = []
 def default_directory(config: Path) -> Path:
     """runs/NAME-DATE-TIME for a configuration NAME.yaml."""
     return Path("runs") / f"{config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def free_directory(path: Path) -> Path:
+    """`path`, or with a warning the first of path-2, path-3, ... that does not exist.
+
+    For functions: a notebook's cell runs twice. Commands refuse what exists (`require_free`).
+
+    Raises:
+        InputError: the parent cannot hold a new directory.
+    """
+    free = path
+    for number in itertools.count(2):
+        if not os.path.lexists(free):
+            break
+        free = path.with_name(f"{path.name}-{number}")
+    if free != path:
+        warnings.warn(f"{path} exists already: this run goes to {free}", stacklevel=3)
+    require_free(free)
+    return free
 
 
 def require_free(path: Path, otherwise: str = "") -> None:
@@ -48,30 +69,46 @@ def require_free(path: Path, otherwise: str = "") -> None:
 
 
 @contextlib.contextmanager
-def whole(path: Path, *, replaces: bool = False) -> Iterator[Path]:
+def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Iterator[Path]:
     """A temporary directory beside `path`, renamed to it at the end, removed where that fails.
 
     Args:
         path: the directory.
         replaces: whether it stands for an earlier one of this process, which goes then.
+        or_beside: whether it becomes `path-2` and so on where another process has made `path`
+            meanwhile; `written` says which.
+
+    Raises:
+        InputError: it cannot be written.
     """
     # Beside it and not in /tmp: a rename is atomic within one file system only.
-    path.absolute().parent.mkdir(parents=True, exist_ok=True)
     temporary = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
     _unfinished.add(temporary)
     try:
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir(mode=0o700)
         yield temporary
         temporary.chmod(0o755)  # until now for its owner alone
         if replaces:
             _give_way(path)
-        os.rename(temporary, path)
-        _finished.append(path)
-    except BaseException:  # an interrupt too
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        _finished.append(_renamed(temporary, path, or_beside))
+    except OSError as e:
+        raise InputError(f"--out {path}: cannot be written ({e.strerror or e})") from e
     finally:
+        # Where it failed, by an interrupt too.
+        shutil.rmtree(temporary, ignore_errors=True)
         _unfinished.discard(temporary)
+
+
+def _renamed(temporary: Path, path: Path, or_beside: bool) -> Path:
+    """Give the directory its name, or where another process has made it the next; returns it."""
+    beside = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    place = path
+    while or_beside and os.path.lexists(place):
+        place = next(beside)
+    # It takes the place of an empty directory, and of nothing else.
+    os.rename(temporary, place)
+    return place
 
 
 def _give_way(path: Path) -> None:
@@ -116,7 +153,8 @@ def whole_file(path: Path, where: str) -> Iterator[Path]:
     except OSError as e:
         raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         _unfinished.discard(temporary)
 
 

@@ -11,11 +11,14 @@ from typing import Any
 from heli_jax import stages
 from heli_jax.numbers import terminal_sentence
 from heli_jax.stages import Stage
+from heli_jax.terminal_table import plain_text
 
 _AFTER = 2.0
 """s: what is done sooner shows nothing"""
 _EVERY = 30.0
 """s between two lines where standard error is no terminal"""
+_COUNTED = 100_000
+"""steps beyond which a share is shown: bytes of a file"""
 _SHORTEST = 12
 """letters of a stage's name that stay, however narrow the terminal"""
 _COMPILES = "/jax/compilation_cache/compile_requests_use_cache"
@@ -49,11 +52,14 @@ class _Display:
         self.lock = threading.Lock()
         self.over = threading.Event()
         self.thread: threading.Thread | None = None
+        self.listens = False
 
     def begin(self, stage: Stage) -> None:
         self.stack.append(stage)
-        if self.thread is None:
+        # Not imported for it: commands that read a log alone do without JAX.
+        if not self.listens and "jax" in sys.modules:
             self._listen()
+        if self.thread is None:
             self.thread = threading.Thread(target=self._watch, daemon=True)
             self.thread.start()
 
@@ -67,7 +73,7 @@ class _Display:
         """Show nothing more."""
         self.over.set()
         self._hide()
-        if self.thread is None:
+        if not self.listens:
             return
         from jax import monitoring
 
@@ -80,12 +86,12 @@ class _Display:
             stage = self.stack[-1]
         except IndexError:
             return ""
-        return terminal_sentence(in_words(stage, self.compiling, time.perf_counter()))
+        return plain_text(terminal_sentence(in_words(stage, self.compiling, time.perf_counter())))
 
     def _listen(self) -> None:
-        # The first stage comes after JAX has been imported.
         from jax import monitoring
 
+        self.listens = True
         monitoring.register_event_listener(self._compiles)
         monitoring.register_event_duration_secs_listener(self._compiled)
 
@@ -120,6 +126,7 @@ class _Display:
             if self.live is not None or not self.stack or self.over.is_set():
                 return
             from rich.console import Console
+            from rich.errors import LiveError
             from rich.live import Live
             from rich.text import Text
 
@@ -129,13 +136,15 @@ class _Display:
                 return Text(fitted(self.text(), console.width), no_wrap=True, overflow="ellipsis")
 
             # What else is printed meanwhile comes above the line.
-            self.live = Live(
+            live = Live(
                 console=console,
                 get_renderable=line,
                 transient=True,
                 refresh_per_second=2,
             )
-            self.live.start()
+            with contextlib.suppress(LiveError):  # the bar of a sweep is shown
+                live.start()
+                self.live = live
 
     def _hide(self) -> None:
         with self.lock:
@@ -183,11 +192,12 @@ def in_words(stage: Stage, compiling: float | None, now: float) -> str:
         detail = [f"start {stage.part[0]} of {stage.part[1]}", *detail]
     if stage.first is None:
         return f"{stage.words}: {', '.join([*detail, _time(spent)])}"
+    share = stage.total is not None and stage.total > _COUNTED
     of = f"{stage.done} of {stage.total}" if stage.total else f"step {stage.done}"
-    parts = [of, *detail]
+    parts = [f"{100 * stage.done / stage.total:.0f} %" if stage.total and share else of, *detail]
     done, since = stage.done - stage.first[0], now - stage.first[1]
     # The first step compiles: a rate that contained it would foretell hours.
-    if done and since > 0:
+    if done and since > 0 and not share:
         parts.append(f"{done / since:.2g} a second")
     parts.append(_time(spent))
     if done and stage.total and stage.done < stage.total:

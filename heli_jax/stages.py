@@ -188,8 +188,19 @@ def advance(steps: int = 1, detail: str = "") -> None:
     """
     work = _work.get()
     if work is not None and work.stack:
+        reach(work.stack[-1].done + steps, detail)
+
+
+def reach(done: int, detail: str = "") -> None:
+    """The innermost stage has done so many steps in all.
+
+    Args:
+        done: how many.
+        detail: what the last one said.
+    """
+    work = _work.get()
+    if work is not None and work.stack:
         inner = work.stack[-1]
-        inner.done += steps
-        inner.detail = detail
+        inner.done, inner.detail = done, detail
         if inner.first is None:
             inner.first = inner.done, time.perf_counter()

@@ -71,7 +71,7 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
         # Without a scheduler --workers are processes of our own, for which dask is not needed.
         dask = None
         if options.scheduler:
-            dask = s.enter_context(cli_options.dask_client(options, study.path))
+            dask = s.enter_context(cli_options.dask_client(options))
         carrying = studies.Options(options.resume, workers, dask, options.reports, progress, say)
         result = studies.run(study, out, carrying)
     print_study(result)
@@ -80,10 +80,13 @@ def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -
 
 
 def _code(result: "xr.Dataset") -> int:
-    statuses = set(map(str, result["status"].to_numpy().ravel()))
-    if statuses - {"converged", "not-identifiable"}:
+    """The exit code of the worst fit."""
+    status, adequate, untrusted = (
+        set(map(str, result[n].to_numpy().ravel())) for n in ("status", "adequate", "untrusted")
+    )
+    if status - {"converged", "not-identifiable"} or "no" in adequate:
         return NOT_CONVERGED
-    return NOT_DETERMINED if "not-identifiable" in statuses else DONE
+    return NOT_DETERMINED if "not-identifiable" in status or untrusted - {""} else DONE
 
 
 def print_study(result: "xr.Dataset") -> None:
@@ -117,7 +120,7 @@ def print_study(result: "xr.Dataset") -> None:
     _print_scatter(flat, parameters)
     for names, runs in _distrusted(flat).items():
         more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-        tell(f"! Not to be trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
+        tell(f"! Not trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
     failures = _failures(flat)
     for run, sentence in failures[:_MOST_FAILURES]:
         tell(f"! {run}: {sentence}")
@@ -166,7 +169,7 @@ def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
 
 
 def _distrusted(flat: "xr.Dataset") -> dict[str, list[str]]:
-    """By the parameters that are not to be trusted the fits whose they are."""
+    """By the parameters whose intervals are not trusted the fits."""
     by_names: dict[str, list[str]] = {}
     for run, names in zip(flat["run"].to_numpy(), flat["untrusted"].to_numpy(), strict=True):
         if names:

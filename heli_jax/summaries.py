@@ -96,8 +96,10 @@ def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
-        if e.sd is None or e.lower95 is None or e.upper95 is None:
+        if e.sd is None:
             cells = ("not determined", "", "")
+        elif e.lower95 is None or e.upper95 is None:
+            cells = (*measured(e.sd, e.value), "not trusted")
         else:
             # To the digits that the sd leaves, all four alike.
             value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)

@@ -4,7 +4,8 @@ import contextlib
 import sys
 from collections.abc import Iterator
 
-from heli_jax import reading_progress, stage_display
+from heli_jax import stage_display
+from heli_jax.errors import shortened
 from heli_jax.stages import Note
 from heli_jax.terminal_table import tell
 
@@ -12,7 +13,7 @@ from heli_jax.terminal_table import tell
 def say(text: str) -> None:
     """Print a line."""
     # On standard error: standard output is for results, which may be piped on.
-    tell(f"heli-jax: {text}", sys.stderr)
+    tell(f"heli-jax: {shortened(text)}", sys.stderr)
 
 
 def say_notes(text: str) -> None:
@@ -23,7 +24,7 @@ def say_notes(text: str) -> None:
 
 @contextlib.contextmanager
 def progress_shown(quiet: bool) -> Iterator[None]:
-    """Show how far the reading of a log and long work are.
+    """Show how far long work is, such as the reading of a log.
 
     Args:
         quiet: show nothing.
@@ -31,5 +32,5 @@ def progress_shown(quiet: bool) -> Iterator[None]:
     if quiet:
         yield
         return
-    with reading_progress.on_terminal(), stage_display.on_terminal(say):
+    with stage_display.on_terminal(say):
         yield

@@ -13,6 +13,14 @@ _BETWEEN = 3
 """columns from one column's end to the next one's beginning"""
 
 
+def plain_text(text: str) -> str:
+    """Words that may hold a name of a log, a file or a configuration, without what a terminal would
+    obey: escape sequences, marks that turn the direction of writing, halves of characters."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else " " if c.isspace() else "?" for c in text)
+
+
 def tell(text: str, file: TextIO | None = None) -> None:
     """Print sentences, on a terminal with new lines between words.
 
@@ -20,7 +28,7 @@ def tell(text: str, file: TextIO | None = None) -> None:
         text: what is told; a new line in it stays one.
         file: standard output unless given.
     """
-    text = terminal_sentence(text)
+    text = plain_text(terminal_sentence(text))
     stream = sys.stdout if file is None else file
     if stream.isatty():
         width = shutil.get_terminal_size().columns
@@ -52,6 +60,7 @@ def print_table(head: _Row, rows: list[_Row], *, keys: int = 1) -> None:
         rows: as many cells each.
         keys: columns that name a row together, the first ones.
     """
+    head, rows = tuple(map(plain_text, head)), [tuple(map(plain_text, row)) for row in rows]
     # In a pipe nobody knows how wide a line may be, and a program reads it whole.
     most = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     columns = list(zip(head, *rows, strict=True))

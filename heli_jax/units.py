@@ -303,14 +303,28 @@ def is_unit(unit: str) -> bool:
 
 
 def as_text(exponents: Mapping[str, int]) -> str:
-    """The SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2/s^2`."""
+    """The SI unit with these exponents of kg, m, s, rad, A and K: `kg m^2`, `rad/s^2/V`."""
 
     def power(unit: str, n: int) -> str:
         return unit if n == 1 else f"{unit}^{n}"
 
-    above = " ".join(power(u, n) for u, n in exponents.items() if n > 0)
-    below = "".join(f"/{power(u, -n)}" for u, n in exponents.items() if n < 0)
+    above = " ".join(power(u, n) for u, n in _shortest(exponents).items() if n > 0)
+    below = "".join(f"/{power(u, -n)}" for u, n in _shortest(exponents).items() if n < 0)
     return f"{above or '1'}{below}"
+
+
+def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
+    """The exponents with volt for ampere and newton for kg, where these are less."""
+    spellings = [dict(exponents)]
+    volts = -exponents.get("A", 0)
+    for volt in range(min(volts, 0), max(volts, 0) + 1):  # kg m^2/s^3/A
+        for newton in {0, exponents.get("kg", 0) - volt}:  # kg m/s^2
+            taken = {"kg": newton + volt, "m": newton + 2 * volt, "s": -2 * newton - 3 * volt}
+            taken |= {"A": -volt}
+            rest = {u: exponents.get(u, 0) - taken.get(u, 0) for u in {**taken, **exponents}}
+            first, last = ({"V": volt}, {}) if volt > 0 else ({}, {"V": volt})
+            spellings.append({"N": newton} | first | rest | last)
+    return min(spellings, key=lambda spelling: sum(map(abs, spelling.values())))
 
 
 def is_plain(unit: str) -> bool:

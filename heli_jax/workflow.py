@@ -19,6 +19,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, require_kind
+from heli_jax.finding import Finding, note
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -26,10 +27,8 @@ from heli_jax.identification.method_comparison import MethodComparison, compare_
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
-from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
@@ -114,17 +113,17 @@ def run_fit(
 
     Args:
         config: of `load_config`, or the path of a configuration.
-        out: a new directory for the report, as of `write_report`; none is written unless given.
+        out: directory for the report, as of `write_report`; none is written unless given.
         progress: called with what the log's reader assumed and what is going on, in words.
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
         InputError: a log or something of the configuration is wrong, a log is too slow for the
-            model at its start values (docs/enough.md), or `out` exists.
+            model at its start values (docs/enough.md), or `out` cannot be written.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
-        run_directory.require_free(Path(out))  # before the work, not after it
+        out = run_directory.free_directory(Path(out))  # before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
         run = _fit_run(config, progress, began, out)
@@ -133,7 +132,32 @@ def run_fit(
         return run
     progress("writing the report")
     with stage("writing the report"):
-        return write_report(run, out, replaces=_long_intervals(run.config))
+        return _written(run, Path(out), progress)
+
+
+class NotWritten(InputError):
+    """A fit is done and its run directory cannot be written; `run` has the fit."""
+
+    run: FitRun
+
+
+def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
+    """The run with its directory: that of a moment before, or a new one.
+
+    Raises:
+        NotWritten: the disk is full, for example.
+    """
+    before = run.directory
+    try:
+        written = _write(run, before or out, replaces=before is not None)
+    except InputError as e:
+        failure = NotWritten(f"{e}; the fit stands above, in {before}" if before else str(e))
+        failure.run = run
+        raise failure from e
+    if written.directory not in (out, before):
+        words = f"{out}: another process has made it meanwhile; written to {written.directory}"
+        progress(Note(words))
+    return written
 
 
 def _fit_run(
@@ -141,8 +165,7 @@ def _fit_run(
 ) -> FitRun:
     """`run_fit` without its report; before intervals that take long, that of the fit alone."""
     with_findings = out is not None
-    # A reader shows how far it is by itself.
-    with stage("reading the log", name="reading", shown=False):
+    with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # One fit of it alone would look like the study's result.
         if config.config.study is not None:
@@ -152,8 +175,8 @@ def _fit_run(
             )
         problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
     try:
@@ -169,27 +192,20 @@ def _fit_run(
             )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
-    with stage("beside another method", name="second method"):
-        fitted = with_second_method(
-            problem,
-            fitted,
-            undisturbed=lambda: configuration.by_method(config, problem, "frequency-error"),
-            max_steps=options.max_steps,
-            progress=progress,
-        )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
+    kept = None
     if out is not None and _long_intervals(config):
-        _keep(FitRun(config, problem, fitted, rls, began=began), out, progress)
+        kept = _keep(FitRun(config, problem, fitted, rls, began=began), Path(out), progress)
     try:
         further = _supplementary(config, problem, fitted, progress)
     except InputError:
-        if out is not None and _long_intervals(config):
-            shutil.rmtree(out, ignore_errors=True)
+        if kept is not None:
+            shutil.rmtree(kept, ignore_errors=True)
         raise
     with stage("whether the log was enough", name="findings"):
         further = further._replace(findings=_at_estimates(problem, fitted, enough))
-    return FitRun(config, problem, fitted, rls, further, began=began)
+    return FitRun(config, problem, fitted, rls, further, directory=kept, began=began)
 
 
 def _fitted(
@@ -213,14 +229,17 @@ def _long_intervals(config: Experiment) -> bool:
     return bool(methods.profile or methods.bootstrap or methods.nuts)
 
 
-def _keep(run: FitRun, out: str | Path, progress: Say) -> None:
-    """Write a fit before further intervals are sought, so that an interrupt does not lose it."""
+def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
+    """Write a fit before further intervals are sought, so that an interrupt does not lose it;
+    returns its directory."""
     words = "The further intervals that were asked for are not in it: the run was interrupted."
     # Its own times: the run's go on.
-    fitted = replace(run.fit, notes=(*run.fit.notes, words), timing=dict(run.fit.timing))
+    findings = (*run.fit.findings, note("uncertainty.interrupted", words))
+    fitted = replace(run.fit, findings=findings, timing=dict(run.fit.timing))
     with stage("writing the fit", name="report before further intervals"):
-        write_report(replace(run, fit=fitted), out)
-    progress(f"the fit is in {out}; what else was asked for comes into it")
+        directory = _written(replace(run, fit=fitted), out, progress).directory
+    progress(f"the fit is in {directory}; what else was asked for comes into it")
+    return directory
 
 
 def _require_rates(problem: Problem) -> None:
@@ -255,8 +274,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     """
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
-    for note in reading_notes(problem):
-        progress(note)
+    for said in reading_notes(problem):
+        progress(said)
     try:
         with stage("what the log can determine"):
             return check(problem)
@@ -380,35 +399,38 @@ def compare_models(
         raise InputError(f"{config.path}: fit: {e}") from e
 
 
-def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> FitRun:
+def write_report(run: FitRun, out: str | Path) -> FitRun:
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
-    The directory appears whole or not at all. Returns the run with `directory` set.
+    The directory appears whole or not at all. Returns the run with `directory` set: `out`, or where
+    that exists a numbered sibling, with a warning.
 
     Args:
         run: of `run_fit`.
         out: the directory.
-        replaces: whether it stands there from an earlier moment of this run.
 
     Raises:
-        InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
+        InputError: `out` cannot be written to, or the extra `bayes` is missing.
         TypeError: `run` is no FitRun.
     """
     require_kind("run", run, FitRun, "a FitRun, as heli_jax.run_fit(config) returns it")
+    return _write(run, run_directory.free_directory(Path(out)))
+
+
+def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
+    """The run directory, in place of that of an earlier moment of this run where it `replaces`
+    one."""
     from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
     from heli_jax.report.origin import origin
     from heli_jax.report.sample_files import sample_files, write_samples
 
-    out = Path(out)
-    if not replaces:
-        run_directory.require_free(out)
     started = time.perf_counter()
     # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run)
-    with run_directory.whole(out, replaces=replaces) as folder:
+    with run_directory.whole(out, replaces=replaces, or_beside=not replaces) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem
@@ -424,7 +446,7 @@ def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> Fit
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)
         files.write_json(folder / "fit.json", content)
-    return replace(run, directory=out, supplementary=extra)
+    return replace(run, directory=run_directory.written()[-1], supplementary=extra)
 
 
 def _with_responses(run: FitRun) -> SupplementaryAnalyses:

@@ -1,5 +1,6 @@
 """heli-jax compatibility: errors found, written, and taken off the signals again."""
 
+import dataclasses
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import Prior, compatibility, config, run_directory, workflow
+from heli_jax import Prior, compatibility, config, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
+from heli_jax.finding import note
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.advice import OutputAdequacy
 
@@ -77,10 +79,13 @@ def notes_of(flight):
 def test_errors_are_found(folder, capsys, monkeypatch):
     path = configured(folder)
     out = folder / "out"
-    out.mkdir()
+
+    def written(run, place):
+        place.mkdir()
+        return dataclasses.replace(run, directory=place)
+
     # The page takes longer than the fit, and is that of any fit.
-    monkeypatch.setattr(run_directory, "require_free", lambda place: None)
-    monkeypatch.setattr(workflow, "write_report", lambda run, place: run)
+    monkeypatch.setattr(workflow, "write_report", written)
     assert main(["compatibility", str(path), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("Compatible once ")
@@ -126,6 +131,7 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     y = np.sin(np.arange(100.0))
     left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
     signals = SimpleNamespace(measured=dict.fromkeys(shares, y), simulated=left, hold_out=False)
+    of_machine = note("of.machine", "of a machine")
     fit = SimpleNamespace(
         estimates={
             n: Estimate(v, 0.5 * w, v - w, v + w, "1", 0.0, 0.9 if n == "b_r" else 0.0, False)
@@ -135,8 +141,9 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         status=status,
         signals=[signals],
         notes=("of the fit", "of a machine"),
+        findings=(note("of.fit", "of the fit"), of_machine),
         adequacy=SimpleNamespace(
-            sentences=("of a machine",),
+            findings=(of_machine,),
             judged=[OutputAdequacy(n, True, r, 1.0, True, 0.0, 0.4) for n, r in shares.items()],
         ),
         method="filter-error",

@@ -18,11 +18,12 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 BASE = {
     "errors", "pickled", "import_path", "regular_file", "units", "naming", "numerics", "yaml_file",
-    "vehicle", "versions", "numbers", "summaries", "exports", "stages", "unit_spelling",
+    "vehicle", "versions", "numbers", "summaries", "exports", "stages", "unit_spelling", "finding",
 }  # fmt: skip
 # What each part may import of heli_jax, beside itself.
 ALLOWED = {
     "errors": set(),
+    "finding": set(),
     "regular_file": {"errors"},
     "import_path": {"errors", "regular_file"},
     "unit_spelling": set(),
@@ -37,13 +38,16 @@ ALLOWED = {
     "summaries": {"naming", "numbers"},
     "exports": {"naming", "summaries"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
-    "flights": {"numbers", "errors", "regular_file", "units", "summaries", "yaml_file"},
+    "flights": {
+        "stages", "numbers", "errors", "regular_file", "units", "summaries", "yaml_file",
+        "import_path",
+    },
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors", "pickled"},
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
-    "models": {"dynamics", *BASE},
+    "models": {"linear_models", "dynamics", *BASE},
     "fused": {"numerics"},
     "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
     "report": {
@@ -54,7 +58,7 @@ ALLOWED = {
 # Entry points may import everything below them, never the command line.
 ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
-    "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
+    "log_output", "log_windows", "log_responses", "cli_options", "interrupts",
     "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
     "file_commands", "run_commands", "stage_display", "terminal", "studies", "study_command",
     "sweep_workflow",
@@ -124,7 +128,7 @@ ROOMS = (
     "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns",
     "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
     "agreement", "fit_notes", "judgement", "assemble", "further_starts", "fit", "likelier_hold",
-    "second_method", "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
+    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 

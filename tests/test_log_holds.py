@@ -37,14 +37,3 @@ def test_several_inputs_that_were_guessed_are_told_of_in_one_sentence() -> None:
     assert note.startswith("lat, lon: taken to move in straight lines")
     assert "as each moves at 100 % of the samples" in note
     assert "signals.inputs.NAME.hold" in note
-
-
-def test_several_inputs_that_are_held_in_some_flights_alone_are_told_of_in_one_sentence() -> None:
-    lat = np.sin(np.arange(0.0, 4.0, 0.02))
-    both = {"lat": lat, "lon": lat}
-    first, other = (
-        Flight(0.02, both, {"p": lat}, hold=dict.fromkeys(both, hold))
-        for hold in ("linear", "zero-order")
-    )
-    (note,) = between_samples([first, other], ["lat", "lon"])
-    assert note.startswith("lat, lon: of the first flight")

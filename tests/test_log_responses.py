@@ -18,6 +18,7 @@ from heli_jax.analysis.flight_responses import Pair, Settings, Wanted, flight_re
 from heli_jax.analysis.transfer_fit import Measured, TransferFit, fit_transfer
 from heli_jax.cli import main
 from heli_jax.config.frequency_section import FrequencyConfig
+from heli_jax.dynamics.model import Axis
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report.figures.responses import branch_of, seen_of
@@ -188,6 +189,8 @@ def test_the_phase_keeps_its_branch_through_noise_and_through_missing_bins():
 def test_an_axis_without_a_stick_is_said_and_a_speed_has_no_handling_qualities():
     model = linear_model("roll-flybarless").model
     assert not handling_gaps(model, ["p"])
+    pendulum = dataclasses.replace(model, axes=(Axis("swing", rate="p", angle="phi", stick="lat"),))
+    assert not handling_gaps(pendulum, ["p", "phi"])
     nameless = dataclasses.replace(model, axes=())
     (said,) = handling_gaps(nameless, ["p", "phi"])
     assert "axes: {roll: {stick: INPUT}}" in said

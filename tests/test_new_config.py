@@ -83,6 +83,13 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     assert out.read_text() == before
 
 
+def test_a_model_of_one_s_own_beside_the_configuration(tmp_path: Path) -> None:
+    assert cli.main(["new-model", "pendulum", "--out", str(tmp_path / "own")]) == 0
+    log, out = write(tmp_path / "run.csv", table("theta_deg")), tmp_path / "own" / "mine.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "pendulum:model"]) == 0
+    assert yaml_file.read_mapping(out)["model"] == "pendulum:model"
+
+
 def test_what_only_the_user_knows_is_refused_until_it_is_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,6 +209,19 @@ def test_names_of_a_log_cannot_leave_their_place(tmp_path: Path) -> None:
     assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-flybarless"]) == 0
     made = Config.model_validate(yaml_file.read_mapping(out))
     assert made.flights[0].signals.outputs["p"].signal == "p"
+
+
+@pytest.mark.parametrize("mark", ["\x1b[2J", "\x7f", "\x9b", "\u202e", "\ufeff", "\U000e0001", "é"])
+def test_what_a_name_holds_is_read_back(
+    tmp_path: Path, mark: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write(tmp_path / f"run{mark}.csv", table(stick=f"aileron{mark} pwm"))
+    out = tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-flybarless"]) == 0
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    assert made.flights[0].log == log.name
+    printed = "".join(capsys.readouterr())
+    assert all(c.isprintable() for line in printed.split("\n") for c in line)
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ def test_terminal_and_page_round_to_the_same_digit_of_the_standard_deviation(val
     ("value", "page", "terminal"),
     [
         (7.5e-6, "7.5·10⁻⁶", "7.5e-06"),
+        (5e-324, "4.941·10⁻³²⁴", "4.941e-324"),
         (-1.25e7, "−1.25·10⁷", "-1.25e+07"),
         (0.0123, "0.0123", "0.0123"),
         (0.0032, "0.0032", "0.0032"),

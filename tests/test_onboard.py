@@ -141,5 +141,5 @@ def test_a_value_that_nobody_gave_is_named(written, tmp_path):
     rows = np.column_stack([t, np.sign(np.sin(3 * t)), np.cos(3 * t)])
     np.savetxt(tmp_path / "roll.csv", rows, delimiter=",", header="t,stick,p", comments="")
     # delay_lat has a start value in the fit, which is enough.
-    with pytest.raises(InputError, match="vehicle: zeta_servo missing"):
+    with pytest.raises(InputError, match="zeta_servo missing"):
         run_check(written(vehicle=rest))

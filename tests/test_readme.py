@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from heli_jax.cli import main
+from heli_jax.yaml_file import parse_mapping
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,6 +35,15 @@ def run(folder, program):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
+
+
+PAGES = ("README.md", *(str(p.relative_to(ROOT)) for p in sorted(ROOT.glob("docs/**/*.md"))))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_configurations_of_the_pages_are_yaml(page):
+    for block in re.findall(r"```yaml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL):
+        assert parse_mapping(block, page)
 
 
 def test_the_readme_is_one_screen():

@@ -79,6 +79,11 @@ def test_an_observer_hears_of_stages_of_its_own_thread_alone():
             "fit: step 11, start 3 of 5, cost 2, 1 a second, 14 s, about 21 s left",
         ),
         (
+            Stage("reading a.bin (100 MB)", 10**8, 5 * 10**7, "", 0.0, (10**7, 6.0)),
+            None,
+            "reading a.bin (100 MB): 50 %, 14 s, 10 s left",
+        ),
+        (
             Stage("bootstrap", 1000, 0, "3 of 8 side by side arrived, step 7", 0.0),
             None,
             "bootstrap: 3 of 8 side by side arrived, step 7, 14 s",

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from heli_jax import output
+from heli_jax.identification.result import Estimate
 from heli_jax.terminal_table import print_table, tell
 
 HEAD = ("parameter", "estimate", "95 % (autocorrelated residuals)", "unit", "of another method")
@@ -32,6 +34,15 @@ def test_every_cell_is_whole_and_lines_fit(
         assert any("Yv" in line and "0.04023" in line for line in lines)
     elif width >= 50:
         assert max(map(len, lines)) <= width
+
+
+def test_a_terminal_obeys_no_name(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "p\x1b[2J\x07\x9b1m\u202e\u2066\u200f\u2028\udcff\tq"
+    tell(f"log {name}\nnext")
+    print_table(("channel", name), [(name, "1")])
+    out = capsys.readouterr().out
+    assert out.startswith("log p?[2J??1m???")
+    assert all(c.isprintable() for line in out.split("\n") for c in line)
 
 
 @pytest.mark.parametrize("width", [None, 80, 50])
@@ -74,3 +85,14 @@ def test_each_part_of_a_wide_table_has_all_columns_that_name_a_row(
     for row in rows:
         assert all(cell in text for cell in row)
     assert max(map(len, text.splitlines())) <= width
+
+
+def test_offsets_of_inputs_that_are_not_zero_are_shown_the_most_significant_first() -> None:
+    def estimate(value: float) -> Estimate:
+        return Estimate(value, 0.3, value - 0.6, value + 0.6, "V", 0.0, 0.0, at_bound=False)
+
+    nuisance = {f"flight {i}/offset d": estimate(-0.2 * i) for i in range(8)}
+    nuisance |= {"flight 1/bias p": estimate(5.0), "tau": estimate(0.0)}
+    assert list(output._shown_nuisances(nuisance)) == [
+        "tau", *(f"flight {i}/offset d" for i in (7, 6, 5, 4)),
+    ]  # fmt: skip

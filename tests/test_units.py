@@ -273,3 +273,8 @@ def test_temperatures_from_one_zero_are_known_and_others_say_what_to_state() -> 
     assert units.base_of("J/K") == {"kg": 1, "m": 2, "s": -2, "K": -1}
     with pytest.raises(ValueError, match=r"another zero than K; .* offset: -273.15"):
         units.factor("degC", "K")
+
+
+def test_units_are_written_with_newton_and_volt_where_that_is_shorter():
+    for text in ("rad/s^2/V", "N m/rad", "V s", "kg m^2", "kg/m^3", "1/s^2", "A", "N/V", "V/A"):
+        assert units.as_text(units.base_of(text)) == text

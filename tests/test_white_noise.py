@@ -2,15 +2,11 @@
 
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Problem, cli, linear_model, yaml_file
-from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.validation import wandering_angles
-from heli_jax.identification.validation.wandering_angles import wandering_notes
+from heli_jax import cli, yaml_file
 from heli_jax.numerics.white_noise import (
     noise_guess,
     rises_when_slower,
@@ -56,33 +52,6 @@ def test_a_smoothed_signal_has_no_noise_of_a_sensor() -> None:
     assert not without_noise(gyro)
     assert noise_guess(gyro) == pytest.approx(0.03, rel=0.1)
     assert not without_noise(np.zeros(10))
-
-
-def test_filter_error_says_of_an_integrated_angle_that_its_error_wanders(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    roll = linear_model("roll-flybarless")
-    gyro, sensor, integrated = angles(1)
-
-    def notes(phi: np.ndarray, method: str) -> list[str]:
-        flight = Flight(dt=0.01, inputs={"lat": STICK}, outputs={"phi": phi, "p": gyro})
-        filtered = method == "filter-error"
-        model = with_disturbance(roll.model, "roll") if filtered else roll.model
-        gust = {"sigma_w": jnp.asarray(1.0), "tau_w": jnp.asarray(0.3)} if filtered else {}
-        vehicle = model.Params(**roll.vehicle().params._asdict(), **gust)
-        problem = Problem(model, vehicle, [flight], {"Lb": Free(100.0)}, method=method)
-        return wandering_notes(problem)
-
-    (note,) = notes(integrated, "filter-error")
-    # A camera at 120 Hz in a flight of 100 Hz: its low-pass coloured the noise, and no gyro did.
-    monkeypatch.setattr(wandering_angles, "is_decimated", lambda flight, output: output == "phi")
-    assert not notes(integrated, "filter-error")
-    monkeypatch.undo()
-    assert "The error of phi is no white noise" in note
-    assert "fit without phi" in note
-    assert not notes(sensor, "filter-error")
-    # Output error's intervals allow for errors that wander.
-    assert not notes(integrated, "output-error")
 
 
 def _new(folder: Path, phi: np.ndarray, p: np.ndarray) -> tuple[dict, str]:

@@ -1,16 +1,19 @@
 """What the site takes from the code when it is built, so that no page can lag behind it.
 
-A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`. Beside them
-stand the figures and the report of the demo, of which nothing is kept in the repository.
+A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`, or
+`console`, which runs the block of commands below it and shows what each prints; exit codes have to
+be 0, unless `$ echo $?` follows. Beside them stand the figures and the report of the demo, of which
+nothing is kept in the repository.
 """
 
 import contextlib
 import functools
-import importlib.util
 import io
 import os
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,8 +23,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
-# With the block of commands below it, if any: the site has what they print too.
-_MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n(?:.*\n)*?```$)?", re.MULTILINE)
+_MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n((?:.*\n)*?)```$)?", re.MULTILINE)
 _ENDS = re.compile(r"([|<>])")
 _PAGE = re.compile(r"docs/([\w-]+)\.md")
 # Of these the demo has the figures that the gallery shows; the report has all.
@@ -45,20 +47,40 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """The page with what it asks for."""
-    return _MARK.sub(lambda mark: _part(mark[1]), markdown)
+    if "<!-- generated: console -->" not in markdown:
+        return _MARK.sub(lambda mark: _PARTS[mark[1]](), markdown)
+    # A folder for each page, as `make demo` leaves it: its commands build on one another.
+    with tempfile.TemporaryDirectory(prefix="heli_jax-page-") as folder:
+        for part in ("configs", "runs"):
+            shutil.copytree(_made() / part, Path(folder) / part)
+        return _MARK.sub(
+            lambda m: _console(m[2], folder) if m[1] == "console" else _PARTS[m[1]](), markdown
+        )
 
 
-def _part(name: str) -> str:
-    if name in _PARTS:
-        return _PARTS[name]()
-    # By path, since mkdocs loads hooks one by one, and knows no package of them.
-    place = Path(__file__).with_name("first_steps.py")
-    spec = importlib.util.spec_from_file_location("first_steps", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.outputs()[name]
+def _console(commands: str, folder: str) -> str:
+    """The block with what each command prints, on standard output and standard error."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    lines, code = ["```console"], 0
+    for command in commands.splitlines():
+        lines.append(command)
+        if command == "$ echo $?":
+            lines.append(str(code))
+            code = 0
+            continue
+        if code:
+            break
+        done = subprocess.run(
+            ["bash", "-c", command.removeprefix("$ ")],
+            cwd=folder, env=os.environ | {"PATH": path, "COLUMNS": "100"},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
+        )  # fmt: skip
+        code = done.returncode
+        # Tables begin and end with lines of spaces.
+        lines += [line.rstrip() for line in done.stdout.splitlines()]
+    if code:
+        raise ValueError(f"exit code {code}, expected 0 or a line `$ echo $?`: {lines}")
+    return "\n".join([*lines, "```"])
 
 
 def on_shutdown(**_: Any) -> None:
@@ -76,11 +98,18 @@ def _made() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="heli_jax-site-"))
     shutil.copytree(_ROOT / "configs", folder / "configs")
     # Commands name files as they are told, and a page must not show where it was built.
-    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["simulate", _DEMO, "--out", "runs/demo/bench.csv"]) == 0
         assert main(["fit", _DEMO, "--set", "fit.starts=1", "--out", "fit"]) == 0
+        Path("fit.txt").write_text(printed.getvalue(), encoding="utf-8")
         assert main(["sweep", *_SWEEP, "--out", "sweep"]) == 0
     return folder
+
+
+def _printed(begins: str) -> str:
+    """The line of the demo's fit that begins so."""
+    lines = (_made() / "fit.txt").read_text(encoding="utf-8").splitlines()
+    return f"```text\n{next(line for line in lines if line.startswith(begins))}\n```"
 
 
 def _table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> str:
@@ -240,6 +269,8 @@ _API = {
 }
 
 _PARTS: dict[str, Callable[[], str]] = {
+    "demo-first-line": lambda: _printed("converged"),
+    "demo-card": lambda: _printed("acceptance card"),
     "keys": _keys,
     "fit-keys": _fit_keys,
     "commands": _commands,

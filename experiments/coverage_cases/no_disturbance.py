@@ -43,7 +43,7 @@ def flags(result: Fit) -> dict[str, bool]:
     """What must not be said of a disturbance that is not there."""
     sigma, tau = result.nuisance["sigma_w"], result.nuisance["tau_w"]
     absent = sigma.value == 0.0 and sigma.sd is None and tau.sd is None
-    noted = any("No disturbance shows" in note for note in result.notes)
+    noted = any(f.code == "noise.no-disturbance" for f in result.findings)
     relative = [e.sd / e.value for e in (sigma, tau) if e.sd is not None and e.value > 0]
     return {
         "absurd sigma_w": not absent and not 1e-6 < sigma.value < 1e6,

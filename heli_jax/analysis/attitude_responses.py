@@ -89,9 +89,13 @@ def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
         model: any.
         outputs: those of the model's that were logged.
     """
-    with_stick = {a.name for a in axes_of(model) if _stick(model, a) is not None}
+    axes = axes_of(model)
+    with_stick = {a.name for a in axes if _stick(model, a) is not None}
+    # An axis of another name is none of an aircraft's, such as a pendulum's with the angle theta.
+    other = {o for a in axes if a.name not in _ATTITUDES for o in (a.angle, a.rate)}
     logged_outputs = {
-        n: [o for o in (_ANGLES[n], n, r) if o in outputs] for n, r in _ATTITUDES.items()
+        n: [o for o in (_ANGLES[n], n, r) if o in outputs and o not in other]
+        for n, r in _ATTITUDES.items()
     }
     inputs = ", ".join(naming.names(model.Inputs))
     return tuple(

@@ -81,16 +81,6 @@ class ResponseAgreement(NamedTuple):
         return ""
 
     @property
-    def limit(self) -> str:
-        """What keeps a model that explains the responses from a plain yes; empty where nothing."""
-        if self.doubt or not self.chi_squared > self.upper95:
-            return ""
-        return (
-            f"squared errors of the responses are {self.chi_squared:.3g} times what their random "
-            f"errors let expect, at most {self.upper95:.3g}"
-        )
-
-    @property
     def sentences(self) -> tuple[str, ...]:
         """What takes no part."""
         words = list(self.notes)

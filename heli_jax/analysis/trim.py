@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from heli_jax import naming
 from heli_jax.analysis.trim_guess import first_guess
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing
+from heli_jax.dynamics.model import Model, SteadyFlight, require_constants
 from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0), "x_collective": (-1.0, 1.0)}
@@ -140,9 +140,7 @@ def trim(
     steady = _require(model, power_off)
     if sticks is None:
         sticks = {n: ends for n, ends in STICKS.items() if n in naming.names(model.Inputs)}
-    missing = needed_but_missing(model, params)
-    if missing:
-        raise ValueError(f"trim: {', '.join(missing)} missing, model {model.name} needs it")
+    require_constants(model, params)
     best: Trim | None = None
     # Arrays of one kind, so that all vehicles are served by one compiled program.
     params, condition, air = jax.tree.map(

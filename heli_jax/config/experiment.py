@@ -18,7 +18,7 @@ from heli_jax.config.quantities import in_si, initial_state
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
-from heli_jax.errors import InputError, nearest, require_kind
+from heli_jax.errors import InputError, VehicleError, nearest, require_kind
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
@@ -34,6 +34,12 @@ class Experiment(NamedTuple):
     vehicle: Vehicle
     logs: OpenedLogs
     """those that were opened for the model's sake, until the flights are read"""
+
+    def wrong(self, section: str, error: ValueError) -> InputError:
+        """The error with its place before it: the section, or where the vehicle's constants are."""
+        if isinstance(error, VehicleError):
+            return InputError(f"{self.vehicle.path}: {error.problem}")
+        return InputError(f"{self.path}: {f'{section}: ' if section else ''}{error}")
 
 
 def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
@@ -338,7 +344,11 @@ def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
     which units."""
     fitted = _found_by_fit(config)
     if config.vehicle is None and not fitted:
-        raise InputError(f"{path}: vehicle: missing")
+        raise InputError(
+            f"{path}: vehicle: missing, expected the file with the constants of {model.name}, or "
+            f"these themselves: {', '.join(naming.names(model.Params)[:3])}, ... (heli-jax new LOG "
+            f"--model {model.name} writes a file to fill in)"
+        )
     if isinstance(config.vehicle, str):
         return read_vehicle(path.parent / config.vehicle, model.Params, fitted)
     return vehicle_from_mapping(config.vehicle or {}, f"{path}: vehicle", model.Params, fitted)

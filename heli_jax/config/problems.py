@@ -79,9 +79,7 @@ def problem(experiment: Experiment) -> Problem:
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:
-        # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
-        place = path if str(e).startswith("vehicle") else f"{path}: fit"
-        raise InputError(f"{place}: {e}") from e
+        raise experiment.wrong("fit", e) from e
     # Of the flights that are fitted: by now their windows are chosen.
     return started_in_frequency(experiment, whole)
 

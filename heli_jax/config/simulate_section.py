@@ -30,6 +30,12 @@ class StickConfig(Section):
     band: tuple[Positive, Positive] = (0.05, 5.0)
     """first and last frequency of a chirp [Hz]"""
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "StickConfig":
+        if self.hold[0] > self.hold[1]:
+            raise ValueError(f"hold: expected the shortest time first, got {list(self.hold)}")
+        return self
+
 
 class NoiseConfig(Section):
     sd: Positive

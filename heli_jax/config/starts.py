@@ -65,9 +65,7 @@ def first_guesses(
             experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
         )
     except ValueError as e:
-        # What is wrong with the vehicle is not in the section `fit`.
-        place = f"{path}" if str(e).startswith("vehicle") else f"{path}: fit"
-        raise InputError(f"{place}: {e}") from e
+        raise experiment.wrong("fit", e) from e
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
@@ -137,5 +135,5 @@ def started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
         base = replace(problem, **bare, **whole)
         guess = frequency_error_start(base, max_steps=config.max_steps)
     except ValueError as e:
-        raise InputError(f"{experiment.path}: fit.start: {e}") from e
+        raise experiment.wrong("fit.start", e) from e
     return started(problem, guess)

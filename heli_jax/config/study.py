@@ -23,6 +23,9 @@ from heli_jax.yaml_file import parse_value
 _MOST = 100_000
 """fits: each has a directory of its own"""
 
+_LONGEST_PATTERN = 4096
+"""letters, as many as a path has"""
+
 # What YAML holds is Any below: a number, a text, a list or a section.
 Axes = dict[str, tuple[Any, ...]]
 
@@ -180,6 +183,9 @@ def _logs(key: str, values: tuple[Any, ...], path: Path) -> tuple[Any, ...]:
     folder = path.absolute().parent
     named: list[Any] = []
     for value in values:
+        if isinstance(value, str) and len(value) > _LONGEST_PATTERN:
+            problem = f"expected a name of at most {_LONGEST_PATTERN} letters, got {len(value)}"
+            raise InputError(f"{path}: {key}: {problem}")
         # A file may be called so all the same.
         if not isinstance(value, str) or not glob.has_magic(value) or (folder / value).exists():
             named.append(value)

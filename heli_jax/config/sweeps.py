@@ -103,8 +103,7 @@ def sweep_job(
     except InputError:  # a ValueError too, which names its file already
         raise
     except ValueError as e:
-        outside = str(e).startswith("vehicle:")  # not in the section `sweep`
-        raise InputError(f"{path if outside else where}: {e}") from e
+        raise experiment.wrong("sweep", e) from e
 
 
 def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:

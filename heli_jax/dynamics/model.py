@@ -2,7 +2,7 @@
 
 import copy
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.errors import VehicleError
 from heli_jax.naming import Record
 from heli_jax.pickled import by_value
 
@@ -376,6 +377,23 @@ def needed_but_missing(model: Model, params: Record) -> list[str]:
     # and it is known to be read by its name.
     late = dict(model.delays).values()
     return [n for n in missing if n in late or np.isnan(_at_one(model, params, n, np.nan)).any()]
+
+
+def require_constants(model: Model, params: Record, given: Collection[str] = ()) -> None:
+    """Refuse parameters that lack what the model reads.
+
+    Args:
+        model: of one machine.
+        params: the model's Params; concrete numbers, NaN where not given.
+        given: parameters that come from elsewhere.
+
+    Raises:
+        VehicleError: one is missing.
+    """
+    missing = [n for n in needed_but_missing(model, params) if n not in given]
+    if missing:
+        it = "it" if len(missing) == 1 else "them"
+        raise VehicleError(f"{', '.join(missing)} missing, model {model.name} needs {it}")
 
 
 def reads(model: Model, params: Record, name: str) -> bool:

@@ -5,17 +5,26 @@ An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` 
 
 import copy
 import hashlib
+import importlib.util
+import json
+import signal
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from heli_jax.flights import hdf5_texts, mat_file, packed
+from heli_jax import import_path
+from heli_jax.errors import InputError
+from heli_jax.flights import mat_file, packed
 from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.mat_references import References
 from heli_jax.flights.named_columns import NamedColumns, as_lists
 from heli_jax.flights.table import (
+    Budget,
     Survey,
     column,
     require_columns,
@@ -27,12 +36,12 @@ from heli_jax.flights.time_units import time_unit
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 10**9
-_MOST_CELLS = 3 * 10**8
-"""of all arrays: 2.4 GB of numbers, which a few compressed bytes can claim"""
+_SECONDS, _RATE = 20, 10**7
+"""processor time [s] that an HDF5 file may take, and bytes for which it has a second more"""
+_PATIENCE = 10
+"""times as long by the clock"""
 _MOST_ELEMENTS = 100
 """columns of a matrix: more are data of another shape than a log's"""
-_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
-"""the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -119,18 +128,14 @@ def open_mat(path: Path) -> ArrayTable:
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
     try:
-        read = mat_file.read_mat(data)
+        read = mat_file.read_mat(data, Budget(str(path), len(data)))
         whole, units, notes = labelled(read.arrays, read.texts)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
-    except mat_file.LargeMatFile as e:
-        raise wrong(str(path), str(e)) from e
     if read.objects:
         _require_arrays(path, whole, read.objects)
         listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
         notes = (*notes, f"objects of MATLAB are left out: {listed}")
-    # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
-    _require_few_cells(path, sum(array.size for array in whole.values()))
     real = {name: np.real(array) for name, array in whole.items()}
     named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
@@ -206,8 +211,7 @@ def open_netcdf(path: Path) -> ArrayTable:
         # The engine is named, so that what else is installed does not decide which library reads
         # the file.
         with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_cf=False) as file:
-            _require_few_cells(path, sum(v.size for v in file.variables.values()))
-            read = DataSets()
+            read = DataSets(Budget(str(path), len(data)))
             for name, variable in file.variables.items():
                 read.add(str(name), np.asarray(variable.values), variable.attrs)
             return read
@@ -218,7 +222,8 @@ def open_netcdf(path: Path) -> ArrayTable:
 class DataSets:
     """What is read of a file whose data sets have attributes."""
 
-    def __init__(self) -> None:
+    def __init__(self, budget: Budget) -> None:
+        self.budget = budget
         self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
@@ -239,6 +244,7 @@ class DataSets:
 
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
+        self.budget.take_numbers(stored.size, stored.nbytes)
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
             values, is_scaled, missing = packed.unpack(stored, packing)
@@ -259,6 +265,10 @@ class DataSets:
 
     def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
         """All of them."""
+        return ArrayTable(path, kind, data, *self.vectors())
+
+    def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[str, ...]]:
+        """Arrays (N,) and units by name, and notes."""
         notes = packed.notes_of(self._scaled, self._missing, self._left_out)
         paths = {name: self.references.path(name) for name in self._stored}
         whole = labelled(
@@ -272,8 +282,7 @@ class DataSets:
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or stated.get(name, "")
-        said = (*notes, *self._notes, *whole.notes, *named.notes)
-        return ArrayTable(path, kind, data, arrays, units, said)
+        return arrays, units, (*notes, *self._notes, *whole.notes, *named.notes)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -290,95 +299,49 @@ def open_hdf5(path: Path) -> ArrayTable:
 
 
 def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
-    try:
-        import h5py  # pyright: ignore[reportMissingImports]
-    except ImportError as e:
+    """The file as `hdf5_file` reads it, in a process of its own.
+
+    Raises:
+        InputError: of that process, or it ended otherwise, or went on for too long.
+    """
+    if importlib.util.find_spec("h5py") is None:
         problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
-        raise wrong(str(path), problem) from e
-
-    def read() -> DataSets:
-        read = DataSets()
-        cells, claimed = 0, 0
-
-        # Any: h5py's classes cannot be named where it is not installed.
-        def visit(name: str, item: Any) -> None:
-            nonlocal cells, claimed
-            if not isinstance(item, h5py.Dataset):
-                return
-            # Of a damaged file h5py gives names that are no text as bytes.
-            name = name.decode("utf-8", "replace") if isinstance(name, bytes) else name
-            dotted = name.replace("/", ".") if kind == "mat 7.3" else name
-            if (texts := hdf5_texts.list_of(item)) is not None:
-                read.add_texts(dotted, texts)
-                return
-            if kind == "mat 7.3":
-                read.references.add(dotted, item)
-            if hdf5_texts.is_text(item):
-                read.references.add_letters(dotted, item)
-                return
-            if not holds_numbers(item.dtype, item.ndim):
-                return
-            if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
-                return
-            cells += int(item.size or 0) * _numbers_in(item.dtype)  # an empty dataset has none
-            _require_few_cells(path, cells)
-            claimed += int(item.size or 0) * item.dtype.itemsize
-            try:
-                mat_file.require_few_bytes(claimed, len(data))
-            except mat_file.LargeMatFile as e:
-                raise wrong(str(path), str(e)) from e
-            # A structure's path is as `open_mat` gives it for older versions, so that a
-            # configuration does not depend on the version in which a file was saved.
-            # Of others nothing is read: they may be of types that h5py does not know.
-            counting = (*packed.ATTRIBUTES, *packed.UNIT_ATTRIBUTES)
-            attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
-            for beside, texts in hdf5_texts.of_attributes(item).items():
-                read.add_texts(f"{dotted}_{beside}", texts)
-            for field, values, own in _fields(dotted, np.asarray(item), attributes):
-                read.add(field, values, own)
-
-        with h5py.File(path, "r") as file:
-            # This visits every object once and follows no links, of which a circle would never end
-            # and one to another file would read that.
-            file.visititems(visit)
-            for name, number in hdf5_texts.numbers_of(file).items():
-                read.add(name, np.array([number]), {})
-        return read
-
-    return guarded(path, "HDF5 file", read).table(str(path), kind, data)
+        raise wrong(str(path), problem)
+    seconds = _SECONDS + len(data) // _RATE
+    arguments = (str(path), kind, str(len(data)), str(seconds))
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "heli_jax.flights.hdf5_file", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=import_path.environment() | {"OPENBLAS_NUM_THREADS": "1"},
+    )
+    # Where the system sets no limit to its processor time.
+    watch = threading.Timer(_PATIENCE * seconds, process.kill)
+    watch.daemon = True
+    watch.start()
+    try:
+        with process:
+            assert process.stdout is not None
+            head = json.loads(process.stdout.readline() or "{}")
+            arrays = {}
+            for name, dtype, size in head.get("arrays", ()):
+                arrays[name] = np.empty(size, dtype)
+                process.stdout.readinto(arrays[name].view(np.uint8))
+    finally:
+        watch.cancel()
+    if "error" in head:
+        raise InputError(head["error"])
+    if process.returncode:
+        slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
+        ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
+        raise wrong(str(path), slow if ended else "is no whole HDF5 file (its reader crashed)")
+    return ArrayTable(str(path), kind, data, arrays, head["units"], tuple(head["notes"]))
 
 
 def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
     """Whether a data set is an array of numbers, or a table of named fields that are."""
     return dimensions <= (1 if kind.names else 2) and (bool(kind.names) or kind.kind in "biuf")
-
-
-def _numbers_in(kind: np.dtype) -> int:
-    """How many numbers an element has."""
-    if kind.names is None:
-        return int(np.prod(kind.shape))
-    return sum(_numbers_in(kind[name]) for name in kind.names)
-
-
-def _fields(
-    name: str, values: np.ndarray, attributes: Mapping[str, Any]
-) -> Iterator[tuple[str, np.ndarray, Mapping[str, Any]]]:
-    """A data set, or the fields of its table as data sets in a group of its name, each with the
-    attributes that are its own."""
-    names = values.dtype.names
-    if names is None:
-        yield name, values, attributes
-        return
-    # What stands beside a table is of none of its fields, unless it is as many texts.
-    stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), ())
-    units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
-    for field, unit in zip(names, units, strict=True):
-        yield from _fields(f"{name}/{field}", values[field], {"units": unit})
-
-
-def _require_few_cells(path: Path, count: int) -> None:
-    if count > _MOST_CELLS:
-        raise wrong(str(path), f"expected at most {_MOST_CELLS} values, got {count}")
 
 
 def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
@@ -393,8 +356,6 @@ def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
             return read()
     # Each library raises what its parser stumbles over: KeyError, TypeError, zlib.error, ...
     except (Exception, MemoryError) as e:
-        from heli_jax.errors import InputError
-
         # Our own refusals, such as too many values, say more than that the file is not whole.
         if isinstance(e, InputError):
             raise

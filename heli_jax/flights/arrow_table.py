@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from heli_jax.flights.digest import Digest
-from heli_jax.flights.parquet_table import ColumnTable
-from heli_jax.flights.table import require_few_columns, wrong
+from heli_jax.flights.parquet_table import ColumnTable, is_nested
+from heli_jax.flights.table import Budget, require_few_columns, wrong
 from heli_jax.regular_file import read_regular
 
 # Imported again within the functions that need it, as in `csv_table`.
@@ -17,7 +17,6 @@ MARK = b"ARROW1"
 """what files begin with, and those of Feather"""
 _STREAM = b"\xff\xff\xff\xff"
 _LARGEST = 10**9
-_MOST_CELLS = 10**8
 
 
 def open_arrow(path: Path) -> "ArrowTable":
@@ -33,14 +32,14 @@ def open_arrow(path: Path) -> "ArrowTable":
     data = read_regular(path, "a log in Arrow's format", _LARGEST)
     if not data.startswith((MARK, _STREAM)):
         raise wrong(where, "is no file of Arrow, expected one that begins with its mark")
-    source = pa.BufferReader(pa.py_buffer(data))
+    source, budget = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data))
     try:
         if data.startswith(_STREAM):
-            table = _joined(pa.ipc.open_stream(source))
+            table = _joined(pa.ipc.open_stream(source), budget)
         else:
             file = pa.ipc.open_file(source)
             batches = (file.get_batch(i) for i in range(file.num_record_batches))
-            table = pa.Table.from_batches(list(_checked(batches)), file.schema)
+            table = pa.Table.from_batches(list(_checked(batches, budget)), file.schema)
         table.validate(full=True)
     # pyarrow raises UnicodeDecodeError where the name of a column is no text.
     except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
@@ -48,21 +47,20 @@ def open_arrow(path: Path) -> "ArrowTable":
     if not len(table.schema) or not table.num_rows:
         raise wrong(where, "holds no rows, expected a log")
     require_few_columns(where, len(table.schema))
-    if table.num_rows * len(table.schema) > _MOST_CELLS:
-        raise wrong(where, f"expected at most {_MOST_CELLS} values; save it as Parquet")
     return ArrowTable(where, len(data), Digest(data), table)
 
 
-def _joined(stream: "pa.RecordBatchReader") -> "pa.Table":
+def _joined(stream: "pa.RecordBatchReader", budget: Budget) -> "pa.Table":
     import pyarrow as pa
 
-    return pa.Table.from_batches(list(_checked(stream)), stream.schema)
+    return pa.Table.from_batches(list(_checked(stream, budget)), stream.schema)
 
 
 def _checked(
-    batches: "Iterator[pa.RecordBatch] | pa.RecordBatchReader",
+    batches: "Iterator[pa.RecordBatch] | pa.RecordBatchReader", budget: Budget
 ) -> "Iterator[pa.RecordBatch]":
     for batch in batches:
+        budget.take(max(batch.nbytes, 8 * batch.num_rows * batch.num_columns))
         batch.validate(full=True)
         yield batch
 
@@ -77,5 +75,9 @@ class ArrowTable(ColumnTable):
         self._table = table
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
-        table = self._table if names is None else self._table.select(list(names))
-        yield from table.to_batches()
+        # By place: of two columns of one name `select` takes neither.
+        fields = enumerate(self._schema)
+        kept = [
+            i for i, f in fields if names is None or (f.name in names and not is_nested(f.type))
+        ]
+        yield from self._table.select(kept).to_batches()

@@ -10,6 +10,11 @@ from heli_jax import units
 from heli_jax.flights.signal_facts import SignalFacts
 
 HOLDS = ("zero-order", "linear")
+_BY_NAME = {
+    **dict.fromkeys(("inputs", "outputs", "instruments"), "arrays by name, as {'p': p}"),
+    **dict.fromkeys(("sd", "known"), "numbers by name, as {'p': 0.01}"),
+    "hold": f"{' or '.join(HOLDS)} by input, as {{'lat': 'linear'}}",
+}
 """What an input may do between samples: stay until the next, or follow a straight line to it."""
 
 
@@ -148,10 +153,11 @@ class Flight:
     instruments: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for kind in ("inputs", "outputs", "instruments"):
-            if not isinstance(getattr(self, kind), Mapping):
-                got = type(getattr(self, kind)).__name__
-                raise TypeError(f"{kind}: expected arrays by name, as {{'p': p}}, got {got}")
+        for kind, expected in _BY_NAME.items():
+            value = getattr(self, kind)
+            if not isinstance(value, Mapping):
+                got = repr(value)[:60] if isinstance(value, str) else type(value).__name__
+                raise TypeError(f"{kind}: expected {expected}, got {got}")
         if isinstance(self.dt, str):
             raise TypeError(f"dt is {self.dt!r}, expected a number of seconds")
         if not (math.isfinite(self.dt) and self.dt > 0):

@@ -5,17 +5,11 @@ import io
 import zlib
 from pathlib import Path
 
-from heli_jax.flights.table import wrong
-from heli_jax.regular_file import size_words
+from heli_jax.flights.table import Budget, wrong
 
 ENDING = ".gz"
-_MOST = 4 * 10**9
-"""bytes of an unpacked text, which is held in memory"""
-_MOST_SMALL = 250 * 10**6
-_DENSEST = 200
-"""bytes that one packed byte may stand for, where they are more than `_MOST_SMALL`: numbers of a
-log pack by less than ten"""
 _BLOCK = 1 << 22
+_BEHIND = (b"\n", b",", b";", b"\t")
 
 
 def is_gzipped(path: Path) -> bool:
@@ -38,17 +32,13 @@ def unpacked(path: str, data: bytes) -> bytes:
     Raises:
         InputError: it is none of gzip, it is cut off or damaged, or it claims more than a log has.
     """
-    most = min(_MOST, max(_MOST_SMALL, _DENSEST * len(data)))
-    pieces, size = [], 0
+    text, budget = bytearray(), Budget(path, len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             while piece := file.read(_BLOCK):
-                pieces.append(piece)
-                size += len(piece)
-                if size > most:
-                    problem = f"unpacks to more than {size_words(most)}"
-                    of = f"a file of {size_words(len(data))}"
-                    raise wrong(path, f"{problem} from {of}, which no log of a flight does")
+                # And its numbers: of two letters, a digit and what is behind it, eight bytes.
+                budget.take(len(piece) + 8 * sum(map(piece.count, _BEHIND)))
+                text += piece
     except (OSError, EOFError, zlib.error) as e:
         raise wrong(path, f"is no whole file of gzip ({type(e).__name__})") from e
-    return b"".join(pieces)
+    return bytes(text)

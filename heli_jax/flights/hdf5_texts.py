@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.flights.table import shown, wrong
+
 _MOST_TEXTS, _LONGEST = 100, 1000
 """of a list, and bytes of each: others are data"""
 _ATTRIBUTES = ("columns", "names", "labels", "channels", "column_names", "channel_names")
@@ -12,6 +14,21 @@ _ATTRIBUTES = ("columns", "names", "labels", "channels", "column_names", "channe
 
 
 # Any: h5py's classes cannot be named where it is not installed.
+def content(item: Any) -> np.ndarray:
+    """All of a data set. Nothing else here reads one.
+
+    Args:
+        item: a data set of h5py.
+
+    Raises:
+        InputError: it is kept in another file, any of which a log could name.
+    """
+    if item.is_virtual or item.external:
+        problem = "is kept in another file, expected its numbers in this one"
+        raise wrong(item.file.filename, problem, f"data set {shown(str(item.name))}")
+    return np.asarray(item[()])
+
+
 def list_of(item: Any) -> Sequence[Any] | None:
     """The texts of a data set that is a list of them; None of any other.
 
@@ -21,11 +38,11 @@ def list_of(item: Any) -> Sequence[Any] | None:
     if not 0 < (item.size or 0) <= _MOST_TEXTS:
         return None
     if item.dtype.kind == "S" and item.dtype.itemsize <= _LONGEST:
-        return list(np.ravel(np.asarray(item)))
+        return list(np.ravel(content(item)))
     if item.dtype.kind != "O":
         return None
     # Texts of any length, or in MATLAB's cells references to arrays of letters.
-    values = list(np.ravel(item[()]))
+    values = list(np.ravel(content(item)))
     if all(isinstance(v, bytes | str) and len(v) <= _LONGEST for v in values):
         return values
     if _class_of(item) != "cell":
@@ -33,7 +50,7 @@ def list_of(item: Any) -> Sequence[Any] | None:
     letters = [item.file[v] if v else None for v in values]
     if not all(x is not None and is_text(x) and x.size <= _LONGEST for x in letters):
         return None
-    return ["".join(map(chr, np.ravel(np.asarray(x)))) for x in letters]
+    return ["".join(map(chr, np.ravel(content(x)))) for x in letters]
 
 
 def is_text(item: Any) -> bool:

@@ -14,11 +14,12 @@ import numpy as np
 
 from heli_jax.flights.array_table import ArrayTable, DataSets
 from heli_jax.flights.csv_dates import is_date, seconds_of_dates
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.table import Budget, shown, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
-"""bytes: as objects of Python numbers take several times as much"""
+_OBJECTS = {b",": 32, b"[": 64, b"{": 200, b'"': 30}
+"""bytes of memory that Python takes for what begins or ends with each of these"""
 _MOST_COLUMNS = 10_000
 _MOST_TEXTS = 100
 _DEEPEST = 8
@@ -35,10 +36,11 @@ def open_json(path: Path) -> ArrayTable:
     """
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
+    sets = DataSets(Budget(where, len(data)))
+    sets.budget.take(sum(size * data.count(mark) for mark, size in _OBJECTS.items()))
     content = _parsed(where, data)
-    sets = DataSets()
     texts: list[str] = []
-    for name, values in _columns(where, content).items():
+    for name, values in _columns(where, content, sets.budget).items():
         _add(sets, name, values, texts)
     if texts:
         more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
@@ -72,20 +74,22 @@ def _parsed(where: str, data: bytes) -> Any:
     return records
 
 
-def _columns(where: str, content: Any) -> dict[str, Any]:
+def _columns(where: str, content: Any, budget: Budget) -> dict[str, Any]:
     """Columns of a file, each a list or an array, by path."""
     if isinstance(content, list) and not _are_runs(content):
-        return _of_rows(where, content)
+        return _of_rows(where, content, budget)
     if isinstance(content, list):
         content = {"data": content}
     if isinstance(content, dict):
-        columns = dict(_within(content, "", 0))
+        columns = dict(_within(content, "", 0, budget))
         if len(columns) <= _MOST_COLUMNS:
             return columns
     raise wrong(where, "holds no records and no columns, expected a log")
 
 
-def _within(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
+def _within(
+    record: Mapping[str, Any], path: str, depth: int, budget: Budget
+) -> Iterator[tuple[str, Any]]:
     """The lists in records within records by path; numbers that stand alone too, such as a rate."""
     for key, value in record.items():
         name = f"{path}.{key}" if path else str(key)
@@ -94,12 +98,12 @@ def _within(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[
             if len(value) > 1 and all(map(str.isdigit, value)):
                 yield name, list(value.values())
             else:
-                yield from _within(value, name, depth + 1)
+                yield from _within(value, name, depth + 1, budget)
         elif _are_runs(value) and depth < _DEEPEST:
             for i, run in enumerate(value):
-                yield from _within(run, f"{name}[{i}]", depth + 1)
+                yield from _within(run, f"{name}[{i}]", depth + 1, budget)
         elif isinstance(value, list) and value and isinstance(value[0], dict):
-            yield from ((f"{name}.{n}", x) for n, x in _of_rows(name, value).items())
+            yield from ((f"{name}.{n}", x) for n, x in _of_rows(name, value, budget).items())
         elif isinstance(value, list):
             yield name, value
         elif isinstance(value, int | float):
@@ -118,13 +122,15 @@ def _are_runs(value: Any) -> bool:
     )
 
 
-def _of_rows(where: str, rows: list[Any]) -> dict[str, Any]:
+def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
     """Columns of records or rows; what one of them lacks is missing there."""
     if not rows or not isinstance(rows[0], dict):
         return {"data": rows}
     columns: dict[str, list[Any]] = {}
     for i, row in enumerate(rows):
         for name, value in _cells(row, "", 0) if isinstance(row, dict) else ():
+            if name not in columns:
+                budget.take(8 * len(rows))
             column = columns.setdefault(name, [])
             # Rows before that had none of this.
             column.extend([None] * (i - len(column)))
@@ -158,6 +164,7 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
         else:
             texts.append(name)
         return
+    sets.budget.take(8 * len(values))
     try:
         if filled and isinstance(filled[0], list):
             array = np.array([[_number(x) for x in row] for row in values], np.float64)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.regular_file import size_words
+from heli_jax.errors import InputError
+from heli_jax.flights.table import Budget
 
 # By the number that the format has for each type of data; 8, 10 and 11 are reserved.
 _NUMBERS = {
@@ -28,25 +29,17 @@ _LONGEST_TEXT = 1000
 _MOST_LETTERS = 20_000
 """bytes of a list of names"""
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
-_MOST_BYTES = 2 * 10**9
-"""of all arrays once they are unpacked"""
-_MOST_SMALL = 250 * 10**6
-_DENSEST = 200
-"""bytes that one compressed byte of a log may stand for, where they are more than `_MOST_SMALL`: a
-signal that stands still packs by a thousand, numbers of sensors by less than ten"""
 _MOST_VALUES = 3 * 10**8
 _DEEPEST = 8
 """structures within structures"""
+_PATH = 100
+"""bytes that a path takes in memory"""
 _MOST_ELEMENTS = 100
 """of an array of structures: more are data of another shape than a log's"""
 
 
 class DamagedMatFile(Exception):
     """The file is no MATLAB file, or not whole; in words what is wrong."""
-
-
-class LargeMatFile(Exception):
-    """The file holds more than a log does, or than its bytes can; in words how much."""
 
 
 class _Element(NamedTuple):
@@ -72,27 +65,29 @@ class _Object(NamedTuple):
     kind: str
 
 
-def read_mat(data: bytes) -> MatFile:
+def read_mat(data: bytes, budget: Budget) -> MatFile:
     """The arrays and texts of a file.
 
     Raises:
         DamagedMatFile: it cannot be read.
-        LargeMatFile: its arrays would fill the memory.
+        InputError: its arrays would fill the memory.
     """
     try:
         # Level 5 ends its header of 128 bytes with the letters MI as a number of the machine that
         # wrote it, so their order tells that of all bytes. Level 4 has no header.
         mark = data[126:128]
         if len(data) > 128 and mark in (b"IM", b"MI"):
-            variables = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
+            variables = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">", budget))
         else:
-            variables = dict(_level_4(memoryview(data)))
+            variables = dict(_level_4(memoryview(data), budget))
         return MatFile(
             # What MATLAB keeps of objects stands behind them without a name.
             {name: x for name, x in variables.items() if isinstance(x, np.ndarray) and name},
             {name: text for name, text in variables.items() if isinstance(text, str)},
             {name: x.kind for name, x in variables.items() if isinstance(x, _Object)},
         )
+    except InputError:
+        raise
     except (struct.error, ValueError, UnicodeDecodeError, zlib.error) as e:
         raise DamagedMatFile("a piece of it is no array") from e
 
@@ -101,21 +96,20 @@ type _Content = tuple[str, np.ndarray | str | _Object]
 """the path of an array, a text or an object, and what it is"""
 
 
-def _level_5(data: memoryview, order: str) -> Iterator[_Content]:
-    at, unpacked = 128, 0
+def _level_5(data: memoryview, order: str, budget: Budget) -> Iterator[_Content]:
+    at = 128
     while at + 8 <= len(data):
         element = _element(data, at, order)
         at = element.end
         # A compressed piece holds one whole piece with a head of its own.
         if element.kind == _COMPRESSED:
             claimed = _claimed(element.data, order)
-            unpacked += claimed
-            require_few_bytes(unpacked, len(data))
+            budget.take(claimed)
             # Stopped where it claims to end: what is behind is not looked at by any reader.
             content = zlib.decompressobj().decompress(element.data, claimed)
             element = _element(memoryview(content), 0, order)
         if element.kind == _MATRIX:
-            yield from _matrix(element.data, order, "", 0)
+            yield from _matrix(element.data, order, "", 0, budget)
 
 
 def _claimed(data: memoryview, order: str) -> int:
@@ -126,26 +120,6 @@ def _claimed(data: memoryview, order: str) -> int:
     word, size = struct.unpack(f"{order}2I", head)
     # A small piece is all in its head.
     return 8 if word >> 16 else 8 + size
-
-
-def require_few_bytes(claimed: int, size: int) -> None:
-    """Refuse arrays that would fill the memory, before they are unpacked.
-
-    Args:
-        claimed: bytes of all arrays so far.
-        size: of the file [bytes].
-
-    Raises:
-        LargeMatFile: saying how much.
-    """
-    if claimed > _MOST_BYTES:
-        words = f"{size_words(_MOST_BYTES)}, got {size_words(claimed)} or more"
-        raise LargeMatFile(f"expected arrays of at most {words}: save fewer, or at a lower rate")
-    if claimed > max(_MOST_SMALL, _DENSEST * size):
-        raise LargeMatFile(
-            f"its arrays claim {size_words(claimed)} or more in a file of {size_words(size)}, "
-            "which no numbers of a flight do"
-        )
 
 
 def _element(data: memoryview, at: int, order: str) -> _Element:
@@ -165,7 +139,9 @@ def _element(data: memoryview, at: int, order: str) -> _Element:
     return _Element(kind, data[begin : begin + size], end)
 
 
-def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_Content]:
+def _matrix(
+    data: memoryview, order: str, prefix: str, depth: int, budget: Budget
+) -> Iterator[_Content]:
     """The arrays in one matrix; `prefix` is its path, empty where it has a name of its own."""
     if not data or depth > _DEEPEST:
         return
@@ -191,7 +167,8 @@ def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_
     if _FIRST_NUMERIC <= kind <= _LAST_NUMERIC:
         # The numbers may be stored in a smaller type than the array has: MATLAB saves a double of
         # whole numbers as bytes. What counts is the type that stands with them.
-        values, _ = _numbers(data, label.end, order)
+        values, _ = _numbers(data, label.end, order, budget)
+        budget.take(16 * values.size if is_complex else 0)
         if values.size != np.prod(shape):
             raise DamagedMatFile(f"an array of {values.size} values claims {np.prod(shape)}")
         # The real part comes first, and is what is read; the type says that there is another.
@@ -206,16 +183,17 @@ def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_
             for i, path in enumerate(_indexed(name, shape[:1])):
                 yield path, text[i :: shape[0]].strip("\0 ")
     elif kind == _CELL:
-        yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
+        yield from _members(data, label.end, order, [_indexed(name, shape)], depth, budget)
     elif kind == _STRUCT:
         # All names of a structure's fields are of one width, filled up with zeros.
         width, at = _numbers(data, label.end, order)
         fields = _element(data, at, order)
         if width.size != 1 or not 0 < width[0] <= 1000:
             raise DamagedMatFile("a structure has no names of fields")
+        budget.take(len(fields.data) // int(width[0]) * _MOST_ELEMENTS * _PATH)
         names = _field_names(bytes(fields.data), int(width[0]))
         paths = [[f"{each}.{field}" for field in names] for each in _indexed(name, shape)]
-        yield from _members(data, fields.end, order, paths, depth)
+        yield from _members(data, fields.end, order, paths, depth, budget)
 
 
 def _text(element: _Element, order: str, longest: int = 0) -> str:
@@ -246,7 +224,7 @@ def _indexed(name: str, shape: np.ndarray) -> list[str]:
 
 
 def _members(
-    data: memoryview, at: int, order: str, paths: list[list[str]], depth: int
+    data: memoryview, at: int, order: str, paths: list[list[str]], depth: int, budget: Budget
 ) -> Iterator[_Content]:
     """The arrays in matrices that follow each other, by their paths."""
     for path in (path for row in paths for path in row):
@@ -255,19 +233,23 @@ def _members(
         if element.kind != _MATRIX:
             raise DamagedMatFile("a structure or cell holds something else than arrays")
         # Members have no names of their own in the file: the path is what tells them apart.
-        yield from _matrix(element.data, order, path, depth + 1)
+        yield from _matrix(element.data, order, path, depth + 1, budget)
 
 
-def _numbers(data: memoryview, at: int, order: str) -> tuple[np.ndarray, int]:
+def _numbers(
+    data: memoryview, at: int, order: str, budget: Budget | None = None
+) -> tuple[np.ndarray, int]:
     """The numbers of a piece, in the machine's own order, and where the next begins."""
     element = _element(data, at, order)
     if element.kind not in _NUMBERS:
         raise DamagedMatFile(f"numbers are of kind {element.kind}, which is none")
     kind = np.dtype(order + _NUMBERS[element.kind])
+    if budget is not None:
+        budget.take_numbers(len(element.data) // kind.itemsize, len(element.data))
     return np.frombuffer(element.data, kind).astype(kind.newbyteorder("=")), element.end
 
 
-def _level_4(data: memoryview) -> Iterator[_Content]:
+def _level_4(data: memoryview, budget: Budget) -> Iterator[_Content]:
     at = 0
     # The first word is a number below 5000 whose digits say how the array is stored. So its fourth
     # byte is zero if it was written lowest byte first, and hardly otherwise.
@@ -287,5 +269,6 @@ def _level_4(data: memoryview) -> Iterator[_Content]:
             raise DamagedMatFile("it is cut off")
         name = bytes(data[begin - length : begin]).split(b"\0")[0].decode("latin-1")
         if what == 0 and count:
+            budget.take_numbers(count)
             values = np.frombuffer(data[begin : begin + count * dtype.itemsize], dtype)
             yield name, values.astype(dtype.newbyteorder("=")).reshape((rows, columns), order="F")

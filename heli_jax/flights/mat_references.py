@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.flights.hdf5_texts import content
+
 _MOST, _LONGEST = 1000, 1000
 """elements of an array, and letters of a text, that are looked at"""
 _KEPT = "#refs#"
@@ -31,7 +33,7 @@ class References:
         if item.dtype.kind != "O" or not 0 < (item.size or 0) <= _MOST:
             return
         parent, _, field = path.rpartition(".")
-        for i, reference in enumerate(np.ravel(item[()])):
+        for i, reference in enumerate(np.ravel(content(item))):
             if not reference or isinstance(reference, bytes | str):
                 continue
             target = item.file[reference].name.strip("/").replace("/", ".")
@@ -47,7 +49,7 @@ class References:
             item: a data set of h5py.
         """
         if 0 < (item.size or 0) <= _LONGEST:
-            self._letters[path] = "".join(map(chr, np.ravel(np.asarray(item))))
+            self._letters[path] = "".join(map(chr, np.ravel(content(item))))
 
     def path(self, name: str) -> str:
         """Where an array belongs; its own name where nothing refers to it."""

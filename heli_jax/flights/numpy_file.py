@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax.flights import array_table, mat_file
+from heli_jax.flights import array_table
 from heli_jax.flights.array_table import ArrayTable, DataSets
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.table import Budget, shown, wrong
 from heli_jax.regular_file import read_regular
 
 MAGIC = b"\x93NUMPY"
@@ -32,10 +32,10 @@ def open_numpy(path: Path) -> ArrayTable:
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", _LARGEST)
-    sets, objects = DataSets(), []
+    sets, objects = DataSets(Budget(where, len(data))), []
 
     def read() -> None:
-        for name, content in _members(where, data):
+        for name, content in _members(data, sets.budget):
             array = _array(content)
             if array is None:
                 objects.append(name)
@@ -53,17 +53,14 @@ def open_numpy(path: Path) -> ArrayTable:
     return sets.table(where, "numpy", data)
 
 
-def _members(where: str, data: bytes) -> Iterator[tuple[str, bytes]]:
+def _members(data: bytes, budget: Budget) -> Iterator[tuple[str, bytes]]:
     """The arrays of a file by name, each as a .npy file has it."""
     if data.startswith(MAGIC):
         yield "data", data
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()[:_MOST_ARRAYS]
-        try:
-            mat_file.require_few_bytes(sum(m.file_size for m in members), len(data))
-        except mat_file.LargeMatFile as e:
-            raise wrong(where, str(e)) from e
+        budget.take(sum(m.file_size for m in members))
         for member in members:
             if member.filename.endswith(".npy"):
                 yield member.filename.removesuffix(".npy"), archive.read(member)

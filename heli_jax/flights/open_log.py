@@ -21,7 +21,7 @@ from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.gzipped import inner_ending, is_gzipped
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import Table, require_short_names, shown, wrong
 from heli_jax.flights.table_view import with_joined_clock
 from heli_jax.regular_file import open_regular, require_regular
 
@@ -119,6 +119,8 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
             opened = reader(path)
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
+    for log in opened if isinstance(opened, tuple) else (opened,):
+        require_short_names(log.path, log.names)
     # Arrays may have lengths of their own, of which no row is made.
     if isinstance(opened, tuple | array_table.ArrayTable):
         return opened

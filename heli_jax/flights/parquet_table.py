@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from heli_jax.flights.digest import Digest
-from heli_jax.flights.table import Survey, column, require_columns, require_few_columns, wrong
+from heli_jax.flights.table import (
+    Budget,
+    Survey,
+    column,
+    require_columns,
+    require_few_columns,
+    wrong,
+)
 from heli_jax.regular_file import open_regular, size_words
 
 # Imported again within the functions that need it, as in `csv_table`.
@@ -19,10 +26,6 @@ if TYPE_CHECKING:
 _LARGEST = 16 * 10**9
 """bytes: the whole file goes through sha256, the columns asked for into memory"""
 _LONGEST_FOOTER = 64 * 10**6
-_MOST_ROWS = 10**8
-"""at 1 kHz more than a day; a few bytes can claim any number of equal rows"""
-_MOST_CELLS = 3 * 10**8
-"""of the columns that are read: 2.4 GB of numbers"""
 _AT_ONCE = 2 * 10**6
 """cells that are decoded before their rows are counted: 16 MB of numbers"""
 
@@ -51,8 +54,6 @@ def open_parquet(path: Path) -> "ParquetTable":
         if not len(schema) or not n_rows:
             raise wrong(str(path), "holds no rows, expected a log")
         require_few_columns(str(path), metadata.num_columns)
-        if n_rows > _MOST_ROWS:
-            raise wrong(str(path), f"expected a log of at most {_MOST_ROWS} rows, got {n_rows}")
         # Text stays as its dictionary: a few words that every row repeats can be large.
         texts = [f.name for f in schema if _is_text(f.type)]
         if texts:
@@ -80,11 +81,14 @@ class ColumnTable:
 
     format = "arrow"
     notes: tuple[str, ...] = ()
+    _unpacked = 0
+    """bytes of all columns once they are unpacked, where the file states them"""
 
     def __init__(
         self, path: str, size: int, digest: Digest, schema: "pa.Schema", n_rows: int
     ) -> None:
         self.path, self.size = path, size
+        self._budget = Budget(path, size)
         self._digest, self._schema, self._n_rows = digest, schema, n_rows
         self.names: tuple[str, ...] = tuple(self._schema.names)
         stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
@@ -113,6 +117,7 @@ class ColumnTable:
             if not _is_number(kind):
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         needed = sorted(set(names))
+        self._budget.require(8 * self._n_rows * len(needed))
         # Each piece goes to its place as it is decoded: all of them together, and an array made of
         # them, would be three times the numbers.
         numbers = {name: np.empty(self._n_rows) for name in needed}
@@ -127,16 +132,16 @@ class ColumnTable:
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text. Lists and records within cells are
         not read, so that all of their cells count as filled."""
-        nested = [_is_nested(f.type) for f in self._schema]
-        flat = [f.name for f, is_nested in zip(self._schema, nested, strict=True) if not is_nested]
+        nested = [is_nested(f.type) for f in self._schema]
+        flat = [f.name for f, n in zip(self._schema, nested, strict=True) if not n]
         data = self._read(flat if any(nested) else None)
         # By name: two columns may have the same, and come in an order of their own.
         columns: dict[str, list[pa.ChunkedArray]] = {}
         for name, x in zip(data.column_names, data.columns, strict=True):
             columns.setdefault(name, []).append(x)
         surveys = []
-        for name, is_nested in zip(self.names, nested, strict=True):
-            if is_nested:
+        for name, of_lists in zip(self.names, nested, strict=True):
+            if of_lists:
                 surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)
@@ -167,6 +172,7 @@ class ColumnTable:
         """The columns, none of them of lists or records; all of the file without names."""
         import pyarrow as pa
 
+        self._budget.require(max(8 * self._n_rows * len(names or self.names), self._unpacked))
         return pa.Table.from_batches(list(self._pieces(names)))
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
@@ -182,6 +188,10 @@ class ParquetTable(ColumnTable):
     def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
         super().__init__(path, size, digest, file.schema_arrow, file.metadata.num_rows)
         self._file = file
+        # Of groups of rows: what is said of a single column is not asked, since of some damage to
+        # it pyarrow ends the whole process.
+        groups = (file.metadata.row_group(i) for i in range(file.metadata.num_row_groups))
+        self._unpacked = sum(group.total_byte_size for group in groups)
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
         """The columns in pieces, of as many rows together as the file says that it has.
@@ -192,14 +202,9 @@ class ParquetTable(ColumnTable):
         import pyarrow as pa
 
         n_rows, count = self._n_rows, len(names or self.names)
-        if n_rows * count > _MOST_CELLS:
-            problem = f"expected at most {_MOST_CELLS} values in the columns read, got"
-            words = f"{problem} {n_rows * count}; read fewer columns, or resample the log"
-            raise wrong(self.path, words)
         columns = None if names is None else list(names)
         # In pieces that are counted: a damaged column can claim, and decode to, any number of
-        # rows. What the metadata say of a single column is not asked, since of some damage to it
-        # pyarrow ends the whole process.
+        # rows.
         rows = 0
         try:
             for piece in self._file.iter_batches(
@@ -217,7 +222,8 @@ class ParquetTable(ColumnTable):
             raise wrong(self.path, "is no whole Parquet file")
 
 
-def _is_nested(kind: "pa.DataType") -> bool:
+def is_nested(kind: "pa.DataType") -> bool:
+    """Whether cells hold lists or records."""
     import pyarrow as pa
 
     return pa.types.is_nested(kind)

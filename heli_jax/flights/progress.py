@@ -1,64 +1,27 @@
-"""How far the reading of a file is, for whoever wants to show it; nobody does unless asked to."""
+"""How far the reading of a file is, as a stage of the work."""
 
 import contextlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
+from heli_jax import stages
+from heli_jax.regular_file import size_words
 
-class Observer(Protocol):
-    """Hears of files that are read."""
-
-    def begin(self, path: str, size: int) -> None:
-        """A file of `size` bytes is about to be read."""
-        ...
-
-    def advance(self, done: int) -> None:
-        """Its first `done` bytes are read."""
-        ...
-
-    def end(self) -> None:
-        """It is read, or cannot be."""
-        ...
-
-
-# One for the process: a reader is many calls deep, and a log is read by one thread.
-_observer: Observer | None = None
 STEP = 1 << 22
 """bytes between two calls of `advance`"""
 
 
-@contextlib.contextmanager
-def observed_by(observer: Observer) -> Iterator[None]:
-    """Tell an observer of what is read meanwhile."""
-    global _observer
-    before, _observer = _observer, observer
-    try:
-        yield
-    finally:
-        _observer = before
-
-
-@contextlib.contextmanager
-def reading(path: str | Path, size: int) -> Iterator[None]:
+def reading(path: str | Path, size: int) -> contextlib.AbstractContextManager[None]:
     """A file is read meanwhile.
 
     Args:
         path: the file.
         size: of it [bytes].
     """
-    observer = _observer
-    if observer is None:
-        yield
-        return
-    observer.begin(str(path), size)
-    try:
-        yield
-    finally:
-        observer.end()
+    # Names may hold anything; a terminal obeys escape sequences.
+    name = "".join(c if c.isprintable() else "?" for c in Path(path).name)[:40]
+    return stages.stage(f"reading {name} ({size_words(size)})", total=size)
 
 
 def advance(done: int) -> None:
     """The first `done` bytes of the file that is read are read."""
-    if _observer is not None:
-        _observer.advance(done)
+    stages.reach(done)

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
+from heli_jax.regular_file import size_words
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,71 @@ def require_few_columns(path: str, count: int, *place: str) -> None:
     """
     if count > MOST_COLUMNS:
         raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
+
+
+_MOST_BYTES = 24 * 10**8
+"""of all numbers of a file as float64: 3e8 of them"""
+_MOST_SMALL = 250 * 10**6
+_DENSEST = 200
+"""bytes that one byte of a file may stand for, where they are more than `_MOST_SMALL`: a signal
+that stands still packs by a thousand, numbers of sensors by less than ten"""
+
+
+class Budget:
+    """Memory that a file may take, asked before it is taken: a few bytes can claim any number of
+    zeros."""
+
+    def __init__(self, path: str, size: int) -> None:
+        """Nothing is taken yet.
+
+        Args:
+            path: of the file, for messages.
+            size: of the file [bytes].
+        """
+        self._path, self._size, self._taken = path, size, 0
+        self.most = min(_MOST_BYTES, max(_MOST_SMALL, _DENSEST * size))
+        """bytes"""
+
+    def take(self, count: int) -> None:
+        """Count bytes that are to be filled.
+
+        Raises:
+            InputError: they and those before are more than the file may take.
+        """
+        self._taken += count
+        self.require(self._taken)
+
+    def take_numbers(self, count: int, stored: int = 0) -> None:
+        """Count what numbers take as float64 beyond the bytes that were counted for them."""
+        self.take(max(8 * count, stored) - stored)
+
+    def require(self, count: int) -> None:
+        """Refuse more bytes than the file may take at all."""
+        if count <= self.most:
+            return
+        problem = f"its content takes {size_words(count)} of memory or more, expected at most"
+        if self.most == _MOST_BYTES:
+            remedy = f"{size_words(self.most)}: save fewer signals, or at a lower rate"
+        else:
+            of = f"from a file of {size_words(self._size)}"
+            remedy = f"{size_words(self.most)} {of}: it is damaged, or no log"
+        raise wrong(self._path, f"{problem} {remedy}")
+
+
+_LONGEST_NAME = 1000
+"""letters of a column's name: patterns that look at names take their square"""
+
+
+def require_short_names(path: str, names: Sequence[str]) -> None:
+    """Refuse a column's name that is no name.
+
+    Raises:
+        InputError: naming the length.
+    """
+    longest = max(map(len, names), default=0)
+    if longest > _LONGEST_NAME:
+        problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
+        raise wrong(path, problem)
 
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:

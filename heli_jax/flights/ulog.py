@@ -27,6 +27,12 @@ _MOST_FIELDS = 5_000
 _DEEPEST = 8
 """levels of types within types"""
 _MOST_TOPICS = 5_000
+_MOST_IN_ALL = 200_000
+"""fields of all topics: logs have some thousand"""
+_FAR = 86_400_000_000
+"""us: a row whose stamp is a day from its topic's others is damage"""
+_TOLD = 1.0
+"""% of a file, above which it is told how much is lost"""
 _TYPES = {
     "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
@@ -36,6 +42,10 @@ _TYPES = {
 _FIELD = re.compile(r"([A-Za-z_]\w*)(?:\[(\d{1,5})\])? ([A-Za-z_]\w*)")
 # Kinds of messages by letter. Newer firmware may add others, which are passed over by their length.
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
+_PARSED = frozenset(b"FIPAB")
+_DATA, _FLAGS = b"DB"
+_HEADER = 16
+"""bytes before the first message"""
 
 
 class _Damaged(Exception):
@@ -62,7 +72,12 @@ class _Content:
     information: dict[str, str | int | float] = field(default_factory=dict)
     parameters: dict[str, str | int | float] = field(default_factory=dict)
     appended: list[int] = field(default_factory=list)
+    n_fields: int = 0
     damaged: int = 0
+    lost: int = 0
+    """bytes of what is damaged"""
+    mark: int = 0
+    """the end of the logger's next mark, as far as it was looked for"""
     dropouts: int = 0
     dropped: int = 0
     """ms"""
@@ -89,7 +104,9 @@ def open_ulog(path: Path) -> ChannelLog:
     notes = []
     if content.damaged:
         count = content.damaged
-        notes.append(f"{count} damaged message{'' if count == 1 else 's'} skipped")
+        share = 100 * content.lost / len(data)
+        lost = f" ({share:.2g} % of the file)" if share >= _TOLD else ""
+        notes.append(f"{count} damaged message{'' if count == 1 else 's'} skipped{lost}")
     if content.dropouts:
         times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
         lost = f"{content.dropped * 1e-3:.3g} s in all"
@@ -119,7 +136,7 @@ def _version(information: dict[str, str | int | float]) -> str:
 
 def _read_messages(path: str, data: bytes, content: _Content) -> None:
     """All messages, the parts that were appended after a crash included."""
-    end = _read_part(path, data, 16, len(data), content)
+    end = _read_part(path, data, _HEADER, len(data), content)
     # Where an offset is named, the part before it ends with a message that was cut.
     for offset in content.appended:
         if end < offset <= len(data):
@@ -135,39 +152,79 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
         size, kind = data[at] | data[at + 1] << 8, data[at + 2]
         body, after = at + 3, at + 3 + size
         limit = min((o for o in content.appended if o > at), default=end)
-        # A length of zero or a huge one of an unknown kind is no message of newer firmware. The
-        # length is then no way on, and the next mark of the logger is.
-        if kind not in _KNOWN and (not kind or not size or size > _LONGEST_MESSAGE):
-            content.damaged += 1
-            at = _next_sync(data, at)
-            continue
-        if after > limit:
-            # Cut off: by the end of the file or by the part that was appended.
-            content.damaged += 1
-            return at if limit == end else _read_part(path, data, limit, end, content)
-        if kind == 0x44:  # 'D', nearly all of them
-            number = data[body] | data[body + 1] << 8 if size > 1 else -1
-            topic = content.subscriptions.get(number)
-            # A message may leave out the padding at its end, so any length from that without it to
-            # that with all of it is right. Any other is damage.
-            if topic is not None and topic.dtype.itemsize <= size - 2 <= topic.longest:
-                topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
-            else:
+        topic = _topic_of(data, at, content) if kind == _DATA else None
+        if topic is not None and after <= limit:  # nearly all of them
+            topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
+        elif after <= limit and _is_whole(path, data, at, limit, content):
+            pass
+        elif after <= limit and _begins(data, at, limit) and _begins(data, after, limit):
+            # Its length is right: samples of an unknown topic, or another kind that was hit.
+            if kind in _KNOWN:
                 content.damaged += 1
+                content.lost += after - at
         else:
-            try:
-                _take(path, chr(kind), data[body:after], content)
-            except (_Damaged, struct.error, IndexError):
-                content.damaged += 1
+            # Damage, so that its length is no way on; or cut off, by the end of the file or by the
+            # part that was appended.
+            content.damaged += 1
+            after = min(_next_message(data, at, limit, content), limit)
+            content.lost += after - at
+            if after == end:
+                return at
         at = after
     return at
 
 
-def _next_sync(data: bytes, at: int) -> int:
-    """Behind the next mark that the logger writes from time to time, or the end."""
+def _topic_of(data: bytes, at: int, content: _Content) -> _Subscription | None:
+    """Whose samples the message D at a place holds; None where it is damaged."""
+    size = data[at] | data[at + 1] << 8
+    if size < 2 or at + 5 > len(data):
+        return None
+    topic = content.subscriptions.get(data[at + 3] | data[at + 4] << 8)
+    # A message may leave out the padding at its end, so any length from that without it to that
+    # with all of it is right. Any other is damage.
+    if topic is None or not topic.dtype.itemsize <= size - 2 <= topic.longest:
+        return None
+    return topic
+
+
+def _is_whole(path: str, data: bytes, at: int, end: int, content: _Content) -> bool:
+    """Take in a message that is no D; False where it is damaged, or of a kind that is not known."""
+    size, kind = data[at] | data[at + 1] << 8, data[at + 2]
+    # Flags stand at the beginning alone.
+    if kind not in _KNOWN or kind == _DATA or (kind == _FLAGS and at != _HEADER):
+        return False
+    try:
+        _take(path, chr(kind), data[at + 3 : at + 3 + size], content)
+    except (_Damaged, struct.error, IndexError):
+        return False
+    # Of other kinds any bytes may be one.
+    return kind in _PARSED or _begins(data, at + 3 + size, end)
+
+
+def _begins(data: bytes, at: int, end: int) -> bool:
+    """True if a message may begin here, or the file ends."""
+    if at + 3 > end:
+        return at == end
+    size, kind = data[at] | data[at + 1] << 8, data[at + 2]
+    # A length of zero or a huge one is none of newer firmware.
+    return kind in _KNOWN or bool(kind and 0 < size <= _LONGEST_MESSAGE)
+
+
+def _next_message(data: bytes, at: int, end: int, content: _Content) -> int:
+    """The next place with samples of a known topic and a message behind them, or behind the next
+    mark that the logger writes from time to time; otherwise the end."""
     # The mark is itself a message, S, whose body it is; the next message begins right behind it.
-    position = data.find(_SYNC, at)
-    return position + len(_SYNC) if position >= 0 else len(data)
+    if content.mark < at:
+        mark = data.find(_SYNC, at)
+        content.mark = mark + len(_SYNC) if mark >= 0 else len(data)
+    end = min(content.mark, end)
+    place = at + 1
+    while (place := data.find(b"D", place + 2, end) - 2) >= 0:
+        size = data[place] | data[place + 1] << 8
+        if _topic_of(data, place, content) and _begins(data, place + 3 + size, end):
+            return place
+        place += 1
+    return end
 
 
 def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
@@ -207,6 +264,9 @@ def _take_format(body: bytes, content: _Content) -> None:
         if not match:
             raise _Damaged
         parsed.append((match[1], int(match[2] or 1), match[3]))
+    # Nothing could be laid out of such a type, however often it stands in another.
+    if not parsed:
+        raise _Damaged
     content.formats[name] = parsed
 
 
@@ -224,6 +284,10 @@ def _take_subscription(body: bytes, content: _Content) -> None:
     instance, number = struct.unpack("<BH", body[:3])
     name = body[3:].decode("utf-8", "ignore")
     fields: list[tuple[str, str]] = []
+    if len(content.subscriptions) + len(content.closed) >= _MOST_TOPICS:
+        raise _Damaged
+    if content.n_fields >= _MOST_IN_ALL:
+        raise _Damaged
     _flatten("", name, content, fields, 0)
     # With all padding, before what stands at the end is taken off: firmware writes it or not.
     longest = sum(np.dtype(kind).itemsize for _, kind in fields)
@@ -233,8 +297,7 @@ def _take_subscription(body: bytes, content: _Content) -> None:
     # The rows become a structured array, whose fields need names of their own.
     if "timestamp" not in names or len(set(names)) < len(names):
         raise _Damaged
-    if len(content.subscriptions) + len(content.closed) >= _MOST_TOPICS:
-        raise _Damaged
+    content.n_fields += len(fields)
     before = content.subscriptions.get(number)
     if before is not None:
         # A number that is given anew is another topic's from here on; what was gathered under it
@@ -265,7 +328,12 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
     whole.sort(key=lambda s: (s.name, s.instance))
     merged: dict[tuple[str, int], list[np.ndarray]] = {}
     for s in whole:
-        merged.setdefault((s.name, s.instance), []).append(np.frombuffer(s.data, s.dtype))
+        rows = np.frombuffer(s.data, s.dtype)
+        stamps = rows["timestamp"].astype(np.float64)
+        middle = (stamps.size - 1) // 2
+        near = np.abs(stamps - np.partition(stamps, middle)[middle]) <= _FAR
+        content.damaged += int(np.count_nonzero(~near))
+        merged.setdefault((s.name, s.instance), []).append(rows if near.all() else rows[near])
     topics = []
     for (name, instance), parts in merged.items():
         rows = parts[0]

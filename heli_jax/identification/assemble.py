@@ -7,6 +7,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from heli_jax.finding import Finding, weighed
 from heli_jax.identification.agreement import (
     free_runs,
     pooled_metrics,
@@ -42,8 +43,8 @@ from heli_jax.identification.validation.aliases import (
     fast_modes,
     measurement_noise,
 )
-from heli_jax.identification.validation.closed_loop_trust import Loop, known_no_gusts
-from heli_jax.identification.validation.held_out import validate
+from heli_jax.identification.validation.closed_loop_trust import Loop
+from heli_jax.identification.validation.held_out import validate, worse_than_mean
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
@@ -63,8 +64,6 @@ class OptimizationRun(NamedTuple):
     seed: int
     timing: dict[str, float]
     """[s], by what was done"""
-    doubts: tuple[str, ...] = ()
-    """why no model of these records is adequate, in a few words each"""
 
 
 def noise_by_name(
@@ -90,7 +89,7 @@ class _HeldOut(NamedTuple):
     signals: tuple[Signals, ...] = ()
     free_run: tuple[Signals, ...] = ()
     """with windows: simulated in one piece"""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     in_frequency: HeldOutFrequency | None = None
 
 
@@ -107,8 +106,13 @@ def _held_out(end: End, loop: Loop) -> _HeldOut:
         closed = loop.held or any(f.present for f in loop.found)
         feedback = closed and not loop.instruments
         in_frequency = validate_in_frequency(problem, at, end.e, flights, feedback=feedback)
-    said = in_frequency.sentences if in_frequency else ()
-    return _HeldOut(signals_of(checked.e, flights), free_run, (*checked.notes, *said), in_frequency)
+    signals, found = signals_of(checked.e, flights), list(checked.notes)
+    if in_frequency is not None:
+        found += in_frequency.findings
+    elif not (at.layout.estimator.process_noise or at.layout.estimator.noise_spectrum):
+        # With gusts in the model, or no simulation in the fit, a simulation says little.
+        found += worse_than_mean(pooled_metrics(signals))
+    return _HeldOut(signals, free_run, tuple(found), in_frequency)
 
 
 def _numbers(
@@ -172,7 +176,7 @@ def assemble(
     held = _held_out(end, judged.loop)
     # Of rounding, and of numbers that are none, notes of their own speak.
     astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
-    notes = [
+    findings = [
         *fit_notes(
             problem,
             search,
@@ -185,8 +189,8 @@ def assemble(
         *(open_directions(run.before, errors.verdict) if astray else ()),
         *limit_notes(errors.limits),
         *excitation.aliasing(fast),
-        *judged.notes,
-        *held.notes,
+        *judged.findings,
+        *held.findings,
     ]
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     return Fit(
@@ -210,25 +214,17 @@ def assemble(
         one_step=pooled_metrics(end.signals, one_step=True),
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=end.white,
-        adequacy=judged.adequacy.doubted(
-            # What is wrong with the record makes any mode: that one is no reason of its own then.
-            run.doubts or [mode.words for mode in fast if mode.undetermined]
-        )._replace(at_optimum=status != "not-converged"),
+        adequacy=judged.adequacy,
         coloured=errors.coloured,
         responses=judged.responses,
         starts=table(layout, search.data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
         # Of several outputs and flights the same is said once.
-        notes=tuple(dict.fromkeys(notes)),
+        findings=tuple(weighed(findings, numbers.of_interest)),
         reached=end.at,
         feedback=tuple(judged.loop.found),
-        moved_by_feedback=judged.moved_by_feedback,
-        held_upright=judged.loop.held,
-        weak_instrument=judged.weak_instrument,
         instruments=tuple(judged.loop.instruments),
-        disturbed_loop=not end.all_white and known_no_gusts(problem, judged.loop.found),
-        late_stick=judged.late_stick,
         seed=run.seed,
         timing=run.timing,
     )

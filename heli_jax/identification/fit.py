@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, note, sentences
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
@@ -30,7 +31,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.same_responses import better_of_same_responses
-from heli_jax.identification.estimation.shooting_start import SAID, by_windows
+from heli_jax.identification.estimation.shooting_start import BY_WINDOWS, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
 from heli_jax.identification.further_starts import (
@@ -47,7 +48,7 @@ from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
+from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
     Solution,
@@ -64,16 +65,15 @@ from heli_jax.identification.validation.expected_accuracy import (
     unstated_gusts,
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
-from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.input_units import doubtful_inputs
+from heli_jax.identification.validation.input_units import doubtful_inputs, scaled_by
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
+    RATE_AGAINST_ANGLE,
     against_start,
-    contradictions,
     sticks_of,
 )
 from heli_jax.stages import stage
@@ -159,9 +159,9 @@ def check(problem: Problem) -> Check:
     notes += feedback_notes(problem, feedback)
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
-    notes += tuple(of_disturbances(guess.layout, guess.e))
+    notes += of_disturbances(guess.layout, guess.e)
     notes += other_hold(problem, at, guess.e, skip=not_identifiable)
-    notes += [gusts] if (gusts := guessed_gusts(problem, at)) else []
+    notes += guessed_gusts(problem, at)
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
@@ -220,8 +220,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    gusts = guessed_gusts(problem, at)
-    notes = (*ranking.notes, gusts) if gusts else ranking.notes
+    notes = (*ranking.notes, *sentences(guessed_gusts(problem, at)))
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 
@@ -283,35 +282,33 @@ def fit(
         search, points, optima, optimum = _search(
             problem, guess, points, further, max_steps, report
         )
-    doubts = record_doubts(problem)
-    said = (*cautions(problem), *(f.sentence for f in doubts.findings))
-    optimum = optimum._replace(notes=(*said, *optimum.notes))
+    about_record = (*cautions(problem), *record_doubts(problem))
+    optimum = optimum._replace(notes=(*about_record, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
+        run = OptimizationRun(before, points, optima, seed, timing)
         estimate = assemble(problem, search, optimum, run)
-        return _with_doubtful_signals(problem, guess, estimate, doubts.unsure)
+        return concluded(_with_doubtful_signals(problem, guess, estimate))
 
 
-def _with_doubtful_signals(
-    problem: Problem, guess: FirstGuess, estimate: Fit, unsure: list[str]
-) -> Fit:
-    """No plain yes where a unit is in doubt, since a fit follows numbers in any unit; with what
-    moved too far or not far enough at the start values, and where the model did not follow from
-    there what moved the wrong way, first of all notes."""
+def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
+    """With the parameters that a signal in a doubtful unit moves, and where the model did not
+    follow from the start values what moved the wrong way there, first of all findings."""
     # Of an angle that is in other units than its rate that is said already, and is surer.
-    if contradictions(problem):
-        return dataclasses.replace(estimate, adequacy=estimate.adequacy.only_if(unsure))
+    if any(f.code == RATE_AGAINST_ANGLE and f.denies for f in estimate.findings):
+        return estimate
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     at_start = (flights, guess.e.simulated, sticks_of(problem.model))
-    inputs = doubtful_inputs(*at_start)
-    doubts = [finding for _, finding in inputs]
-    names = dict.fromkeys(f"the unit of {name} is in doubt" for name, _ in inputs)
-    adequacy = estimate.adequacy.only_if([*unsure, *names])
-    if not estimate.adequacy.adequate:
+    doubts = doubtful_inputs(*at_start)
+    if not estimate.adequate:
         doubts += against_start(*at_start)
-    notes = (*(f.sentence for f in doubts), *estimate.notes)
-    return dataclasses.replace(estimate, adequacy=adequacy, notes=notes)
+    findings = [
+        f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
+        if f.code == UNIT_IN_DOUBT and not f.denies and estimate.status != "not-converged"
+        else f
+        for f in (*doubts, *estimate.findings)
+    ]
+    return dataclasses.replace(estimate, findings=tuple(findings))
 
 
 def _search(
@@ -338,7 +335,7 @@ def _search(
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
     if shooting is not None:
-        best, notes = shooting, (SAID,)
+        best, notes = shooting, (BY_WINDOWS,)
     if further is not None and explains_little(first, quick, best):
         report(SAID_FURTHER)
         more = further_starts(layout, problem, guess.z, further)
@@ -365,7 +362,7 @@ def _search(
     return search, points, optima, optimum
 
 
-def cautions(problem: Problem) -> tuple[str, ...]:
+def cautions(problem: Problem) -> tuple[Finding, ...]:
     """What the logs say of their signals that biases a fit to them; once where flights agree."""
     flights, said = tuple(problem.flights), {}
     for label, flight in zip(labels(flights), flights, strict=True):
@@ -374,18 +371,19 @@ def cautions(problem: Problem) -> tuple[str, ...]:
     own = own_instruments(problem.training, naming.names(problem.model.Inputs))
     own = own if problem.instrument is None else ()
     return (
-        *(f"{label}: {caution}" for caution, label in said.items()),
-        *((f"{own_said(own)}; it is not used.",) if own else ()),
+        *(note("quality.caution", f"{label}: {c}", label) for c, label in said.items()),
+        *((note("loop.instrument-unused", f"{own_said(own)}; it is not used."),) if own else ()),
         *_whole_band(problem),
     )
 
 
-def _whole_band(problem: Problem) -> tuple[str, ...]:
+def _whole_band(problem: Problem) -> tuple[Finding, ...]:
     """That a band which is stated is none of the fit's."""
     estimator, band = estimator_of(problem.method), problem.frequency.band
     if band is None or not estimator.noise_spectrum or estimator.fits_responses:
         return ()
-    return (
+    words = (
         f"frequency.band ({band[0]:g} to {band[1]:g} Hz) is that of the report's responses alone: "
-        "frequency error uses all frequencies of a record. frequency-response fits within a band.",
+        "frequency error uses all frequencies of a record. frequency-response fits within a band."
     )
+    return (note("frequency.band-unused", words),)

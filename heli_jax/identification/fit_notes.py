@@ -1,10 +1,10 @@
 """What a fit says in sentences: of its optimum, of what its method assumes, of its numbers."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -16,17 +16,18 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import (
-    bound_notes,
-    delay_notes,
+    bound_findings,
+    delay_findings,
     extreme_noise_notes,
-    prior_notes,
+    prior_findings,
     stated_noise_notes,
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.other_hold import other_hold
-from heli_jax.identification.validation.wandering_angles import wandering_notes
 
+STOPPED = "search.stopped"
+_NO_DISTURBANCE = "noise.no-disturbance"
 _NEAR_ZERO = 0.2
 """of an estimate, below which a start says nothing of its sign"""
 
@@ -82,8 +83,8 @@ def fit_notes(
     numbers: Numbers,
     correlated: dict[str, float],
     white: bool,
-) -> list[str]:
-    """Of the optimum, of what the method takes for granted, and of the numbers.
+) -> list[Finding]:
+    """Findings about the optimum, what the method takes for granted, and the estimates.
 
     Args:
         problem: what was fitted.
@@ -95,11 +96,12 @@ def fit_notes(
         white: whether all residuals, or innovations, are white.
     """
     layout, data, best = search.layout, search.data, optimum.best
+    at = Solution(layout, data, optimum.noise, best.z)
     none, absent = no_disturbance(optimum), absent_names(layout, optimum)
     # A bound that the data do not bear out comes first: it is the cause of what follows. Then an
     # optimiser that has not arrived, which makes all else doubtful.
     return [
-        *bound_notes(numbers.of_interest),
+        *bound_findings(numbers.of_interest),
         # Rounding has a remedy of its own.
         *([] if numbers.ill else _stopped_notes(layout, best, optimum)),
         *_disturbance_notes(optimum.ratio if none else None, white),
@@ -107,38 +109,19 @@ def fit_notes(
         *_absent_notes(layout, optimum.absent),
         *of_disturbances(layout, e, absent),
         *optimum.notes,
-        *by_label(
-            layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
-            labels(problem.training),
-        ),
+        *layout.estimator.notes(at, e, labels(problem.training), numbers.ill),
         *stated_noise_notes(problem, numbers.noise),
-        *wandering_notes(problem),
         *_correlation_notes(correlated),
-        *delay_notes(problem, numbers.of_interest),
-        *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
-        *_sign_notes(turned_signs(problem, numbers.of_interest) if bool(best.converged) else {}),
+        *delay_findings(problem, numbers.of_interest),
+        *prior_findings(problem, {k: numbers.of_interest[k] for k in layout.free}),
+        *(sign_notes(problem, numbers.of_interest) if bool(best.converged) else []),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),
     ]
 
 
-def by_label(notes: Sequence[str], flights: Sequence[str]) -> list[str]:
-    """Notes that begin with a flight by its number, with what all else calls it: of a log that was
-    split at gaps the third part is `hover, part 3`.
-
-    Args:
-        notes: of an estimator, which knows no names of flights.
-        flights: their labels.
-    """
-
-    def named(match: re.Match[str]) -> str:
-        return flights[int(match[1]) - 1]
-
-    return [re.sub(r"^Flight (\d+)(?=:| was)", named, note) for note in notes]
-
-
-def turned_signs(problem: Problem, estimates: Mapping[str, Estimate]) -> dict[str, str]:
-    """By name, in words, the parameters that surely have the other sign than they began with,
-    where they began with a value and not next to zero.
+def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Finding]:
+    """Doubt about parameters that surely have the other sign than they began with, where they began
+    with a value and not next to zero: a turned signal fits as well, and the start alone tells.
 
     One whose sign is declared (`Model.positive`, `sign: keep`, bounds) cannot turn.
 
@@ -155,17 +138,14 @@ def turned_signs(problem: Problem, estimates: Mapping[str, Estimate]) -> dict[st
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
         if surely and abs(free.start) > _NEAR_ZERO * abs(e.value):
             turned[name] = f"{name} ({free.start:.3g} to {e.value:.3g})"
-    return turned
-
-
-def _sign_notes(turned: Mapping[str, str]) -> list[str]:
     if not turned:
         return []
-    return [
-        f"{listed(list(turned.values()))} ended with the other sign than the start's: where that "
-        "sign is known, an input or an output has the wrong one in the log, or an axis points the "
-        "other way (`invert: true`)."
-    ]
+    words = (
+        f"{listed(list(turned.values()))} ended with the other sign than the start's: "
+        "where that sign is known, an input or an output has the wrong one in the log, or an axis "
+        "points the other way (`invert: true`)."
+    )
+    return [Finding("signs.turned-from-start", "doubt", words, subjects=tuple(turned))]
 
 
 def _hold_notes(
@@ -174,7 +154,7 @@ def _hold_notes(
     optimum: RelaxedOptimum,
     e: Evaluation,
     estimates: dict[str, Estimate],
-) -> list[str]:
+) -> list[Finding]:
     """Where the log let inputs be taken as linear between samples, and it matters."""
     # Elsewhere a step of Gauss and Newton tells how far the optimum is, not what the hold does.
     if not bool(optimum.best.converged):
@@ -184,40 +164,44 @@ def _hold_notes(
     return other_hold(problem, at, e, sd, in_doubt=True)
 
 
-def _correlation_notes(correlated: dict[str, float]) -> list[str]:
+def _correlation_notes(correlated: dict[str, float]) -> list[Finding]:
     if not correlated:
         return []
     words = "; ".join(f"{names}: {rho:+.2f}" for names, rho in correlated.items())
-    return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
+    sentence = f"Residuals of outputs are correlated ({words}): the intervals allow for it."
+    return [note("noise.outputs-correlated", sentence, *correlated)]
 
 
-def _disturbance_notes(ratio: float | None, white: bool) -> list[str]:
+def _disturbance_notes(ratio: float | None, white: bool) -> list[Finding]:
     if ratio is None:
         return []
     gained = f"(twice the log-likelihood gained by one is {ratio:.2g})"
     if white:
         words = "output error suffices, and these are its numbers."
-        return [f"No disturbance shows in the record {gained}: {words}"]
+        words = f"No disturbance shows in the record {gained}: {words}"
+        return [note(_NO_DISTURBANCE, words)]
     # Output error by its own name allows for what is left; a filter's intervals do not.
-    return [
+    words = (
         f"No disturbance of this kind shows in the record {gained}: these are the estimates of "
-        "output error, whose residuals are not white, and the intervals are too narrow. "
-        "output-error by name has intervals that allow for it."
-    ]
+        "output error, whose residuals are not white. Use method: output-error, whose intervals "
+        "allow for it."
+    )
+    return [note(_NO_DISTURBANCE, words)]
 
 
-def _absent_notes(layout: Layout, absent: tuple[str, ...]) -> list[str]:
+def _absent_notes(layout: Layout, absent: tuple[str, ...]) -> list[Finding]:
     """Which of several disturbances do not show."""
     names = [d.name for d in disturbances_of(layout.model) if d.sigma in absent]
     if not names:
         return []
-    return [
+    words = (
         f"No disturbance shows on {', '.join(names)} (twice the log-likelihood gained by each is "
         f"below {NO_DISTURBANCE:g}): the fit goes without."
-    ]
+    )
+    return [note(_NO_DISTURBANCE, words, *names)]
 
 
-def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> list[str]:
+def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> list[Finding]:
     """What to do where the optimiser has not arrived."""
     if bool(best.converged):
         return []
@@ -229,14 +213,14 @@ def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> li
             "tie the windows together (continuity), since a state that no output shows is free in "
             f"each of them; or {remedy}"
         )
-    return [
-        f"The optimiser stopped after {steps} step{'s' * (steps != 1)} without arriving: these "
-        "numbers are no result. "
-        f"Remedy: {remedy}."
-    ]
+    words = (
+        f"The optimiser stopped after {steps} step{'s' * (steps != 1)} without converging: these "
+        f"numbers are no result. Remedy: {remedy}."
+    )
+    return [Finding(STOPPED, "doubt", words, float(steps), "steps")]
 
 
-def open_directions(before: Verdict, at_end: Verdict) -> list[str]:
+def open_directions(before: Verdict, at_end: Verdict) -> list[Finding]:
     """Why a search that has not arrived may never do so: what the data leave open from the start.
 
     Args:
@@ -247,8 +231,8 @@ def open_directions(before: Verdict, at_end: Verdict) -> list[str]:
     names = [n for n in at_end.names if n in either[0] & either[1]]
     if not names:
         return []
-    return [
-        "Where the search began and where it stopped alike the data do not determine "
-        f"{listed(names)}, and along what they leave open a search may go on without end: fix some "
-        "of these or give them priors, before more steps are allowed."
-    ]
+    words = (
+        f"The data do not determine {listed(names)}, neither at the start nor where the search "
+        "stopped, so that it may go on without end: fix some of these or give them priors."
+    )
+    return [Finding("search.open-directions", "doubt", words, subjects=tuple(names))]

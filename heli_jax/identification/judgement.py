@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.finding import Finding
 from heli_jax.identification.agreement import (
     correlated_residuals,
     pooled_metrics,
@@ -20,11 +20,9 @@ from heli_jax.identification.estimation.frequency_instrument import instruments_
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
-from heli_jax.identification.fit_notes import Numbers, absent_names, turned_signs
-from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.fit_notes import Numbers, absent_names
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals
-from heli_jax.identification.uncertainty.estimates import delay_doubts
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
@@ -38,9 +36,9 @@ from heli_jax.identification.validation.adequacy import (
 from heli_jax.identification.validation.advice import Record, is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
-    Moved,
-    feedback_trust_notes,
+    feedback_trust,
     held_upright,
+    known_no_gusts,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import (
@@ -51,18 +49,17 @@ from heli_jax.identification.validation.excitation_test import (
 from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of, untested
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.late_stick import LateStick, late_stick, with_late_stick
+from heli_jax.identification.validation.late_stick import late_stick
+from heli_jax.identification.validation.logging_rate import loop_between_samples
 from heli_jax.identification.validation.metrics import Whiteness, metrics
-from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
-from heli_jax.identification.validation.noisy_inputs import noisy_inputs, with_noisy_inputs
-from heli_jax.identification.validation.unmodelled import (
-    unasked,
-    unmodelled,
-    with_unmodelled,
-)
+from heli_jax.identification.validation.noisy_inputs import noisy_inputs
+from heli_jax.identification.validation.unmodelled import unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
+
+
+_IN_A_LOOP = "the inputs follow the response, and the residuals are not white"
 
 
 class End(NamedTuple):
@@ -121,12 +118,8 @@ class Judgement(NamedTuple):
     numbers: Numbers
     adequacy: Adequacy
     loop: Loop
-    moved_by_feedback: Mapping[str, Moved]
-    weak_instrument: tuple[str, ...]
-    """the unknowns that instruments tell too little of"""
     responses: ResponseAgreement | None
-    late_stick: LateStick | None
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def judge(
@@ -155,37 +148,28 @@ def judge(
     if arrived and not explains:
         errors = errors._replace(verdict=verdict, limits={})
         numbers = numbers_of(errors)
-    lacking, late = (), None
+    misfits: list[Finding] = []
     named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
     if arrived and explains and not (ahead or instruments or any(f.present for f in feedback)):
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
-        sds, flights = {n: sd for n, (_, sd) in named.items()}, labels(problem.training)
-        lacking = unmodelled(at, end.e, sds, coloured=in_colour, flights=flights)
-        adequacy = with_unmodelled(adequacy, lacking, unasked(at))
-        late = late_stick(problem, at, end.e, named)
-        adequacy = with_late_stick(adequacy, late)
+        flights = labels(problem.training)
+        misfits += late_stick(problem, at, end.e, named)
+        misfits += unmodelled(at, end.e, coloured=in_colour, flights=flights)
     if arrived and not (ahead or instruments):
-        adequacy = with_noisy_inputs(adequacy, noisy_inputs(problem, at, end.e, named))
-    estimates = {k: numbers.of_interest[k] for k in layout.free}
-    adequacy = adequacy.doubted(delay_doubts(problem, estimates))
-    if arrived and (turned := turned_signs(problem, numbers.of_interest)):
-        # A turned signal fits as well as one that is not: the start alone knows the sign.
-        words = f"{listed(list(turned))} ended with the other sign than the start's"
-        adequacy = adequacy.only_if([words])
-    held = held and WRONG_OPTIMUM not in adequacy.advice
+        misfits += noisy_inputs(problem, at, end.e, named)
+    held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
     if adequacy.by_chance:
-        # Of an optimum of chance nothing is to be told, of who holds the machine either.
+        # Of an optimum of chance nothing is to be told, of who holds the vehicle either.
         moved, held = {}, False
     loop = Loop(feedback, instruments, held)
-    mentioned = any(not f.by_amplitude for f in lacking)
-    notes = (
+    findings = (
         *closed_loop,
-        *feedback_trust_notes(moved, loop),
+        *feedback_trust(moved, loop),
         *weak_note(weak),
-        *adequacy.sentences,
-        *_missing(end, adequacy, mentioned=mentioned),
+        *misfits,
+        *adequacy.findings,
     )
-    return Judgement(errors, numbers, adequacy, loop, moved, weak, responses, late, notes)
+    return Judgement(errors, numbers, adequacy, loop, responses, findings)
 
 
 def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:
@@ -194,7 +178,7 @@ def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tup
     ahead = against is not None and (is_unstable(problem, params) or _bent(end, against))
     pooled = pooled_metrics(end.signals)
     adequacy = (
-        by_responses(responses, pooled)
+        by_responses(responses)
         or by_excitation(problem, end.at, pooled)
         or (_ahead(end, params) if ahead else _over_records(end, params, against))
     )
@@ -230,30 +214,24 @@ def _against_expected(end: End) -> dict[str, float] | None:
     return layout.estimator.against_expected(layout, at.data, at.noise, end.e, at.z)
 
 
-def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
+def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], list[Finding]]:
     """Whether inputs follow the outputs, and what is to be said of it."""
     # Whether feedback does harm depends on the residuals: with white innovations the direct method
     # is unbiased in a closed loop too.
     problem, estimates = end.problem, numbers.of_interest if end.arrived else {}
     # A late log looks like feedback: each input at the time at which it acted.
     feedback = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
-    notes = feedback_notes(problem, feedback, all(w.white for w in end.white.values()))
-    return feedback, (*notes, *untested(problem))
-
-
-def _missing(end: End, adequacy: Adequacy, *, mentioned: bool) -> list[str] | tuple[()]:
-    """What inputs still explain of the residuals (innovations)."""
-    # Where the model is inadequate its own sentences say more.
-    if end.all_white or not adequacy.adequate:
-        return ()
-    return missing_dynamics(
-        tuple(
-            Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
-            for s, flight in zip(end.signals, end.problem.training, strict=True)
-        ),
-        sensors=is_kinematic(end.problem.model),
-        mentioned=mentioned,
-    )
+    white = all(w.white for w in end.white.values())
+    findings = feedback_notes(problem, feedback, white)
+    if end.arrived and not end.all_white and known_no_gusts(problem, feedback):
+        # Nothing shows which of them: a disturbance in the inputs moves all.
+        findings = [
+            f._replace(severity="doubt", brief=_IN_A_LOOP, distrusts=tuple(estimates))
+            for f in findings
+        ]
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    fast = [f._replace(distrusts=tuple(estimates)) for f in loop_between_samples(flights, feedback)]
+    return feedback, [*fast, *findings, *untested(problem)]
 
 
 def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:

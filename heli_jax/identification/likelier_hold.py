@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+from heli_jax.finding import note
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.other_hold import likelier_hold
@@ -32,4 +33,5 @@ def with_likelier_hold(
     again = refit(held.problem)
     if again.status == "not-converged" or not again.log_likelihood > fit.log_likelihood:
         return problem, fit
-    return held.problem, dataclasses.replace(again, notes=(held.sentence, *again.notes))
+    taken = note("timing.likelier-hold", held.sentence, *held.inputs)
+    return held.problem, dataclasses.replace(again, findings=(taken, *again.findings))

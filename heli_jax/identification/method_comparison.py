@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from heli_jax.identification.fit import fit
+from heli_jax.identification.fit_notes import STOPPED
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
@@ -37,13 +38,10 @@ class MethodResult(NamedTuple):
         if self.fit.status == "not-converged":
             return "not converged"
         words = [] if self.fit.status == "converged" else ["not identifiable"]
-        # `in size only`, `one step ahead only`: its reasons are those of a fit by that method.
-        how = self.fit.adequacy.summary.split(" (")[0].split(",")[0]
-        limited = [f"adequate {how}"] if how != "yes" else []
-        words += limited if self.fit.adequate else ["not adequate"]
+        words += [] if self.fit.adequate else ["not adequate"]
         words += ["intervals too narrow"] if self.fit.overconfident else []
         doubted = self.fit.untrusted
-        words += [f"{', '.join(doubted)} not to be trusted"] if doubted else []
+        words += [f"{', '.join(doubted)} not trusted"] if doubted else []
         return ", ".join(words) or "converged, adequate"
 
 
@@ -153,6 +151,5 @@ def compare_methods(
 def _why_none(fit: Fit) -> str:
     if fit.status != "not-converged":
         return ""
-    # What stopped the optimiser is the first of its notes about itself.
-    stopped = [n for n in fit.notes if "stopped" in n]
+    stopped = [f.sentence for f in fit.findings if f.code == STOPPED]
     return stopped[0] if stopped else "it did not converge"

@@ -13,10 +13,10 @@ from heli_jax import naming
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
+from heli_jax.dynamics.model import Model, require_constants, require_linear
 from heli_jax.dynamics.sensor_noise import sensor_noise
 from heli_jax.dynamics.start import cannot_start
-from heli_jax.errors import nearest
+from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.arguments import check_arguments, warn_of_degrees
 from heli_jax.identification.filtered_noise import filtered_noise
@@ -322,7 +322,7 @@ def _check_possible(problem: Problem) -> None:
     concrete = {n: float(np.asarray(v)) for n, v in naming.asdict(problem.start_params()).items()}
     wrong = impossible({n: v for n, v in concrete.items() if not math.isnan(v)})
     if wrong:
-        raise ValueError(f"vehicle with the free parameters at their starts: {wrong}")
+        raise VehicleError(f"with the free parameters at their starts, {wrong}")
 
 
 def _check_flight(flight: Flight, problem: Problem) -> None:
@@ -392,11 +392,7 @@ def _check_model(problem: Problem) -> None:
     params = problem.start_params()
     # With what each flight knows: that alone may complete a vehicle.
     for flight in problem.flights:
-        missing = needed_but_missing(problem.model, naming.replace(params, **flight.known))
-        if missing:
-            raise ValueError(
-                f"vehicle: {', '.join(missing)} missing, model {problem.model.name} needs it"
-            )
+        require_constants(problem.model, naming.replace(params, **flight.known))
     if not problem.model.linear:
         _check_start(problem, params)
     require_linear(problem.model, params)

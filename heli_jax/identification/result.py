@@ -1,25 +1,23 @@
 """What a fit gives: plain data."""
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.finding import Distrust, Finding, distrusted, exit_code, sentences
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import UNJUDGED, WORSE, Adequacy
-from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, untrusted
+from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.excitation import ALIASED
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
-from heli_jax.identification.validation.late_stick import LateStick
+from heli_jax.identification.validation.logging_rate import LOGGING_RATE
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:
@@ -46,17 +44,6 @@ class Estimate(NamedTuple):
     """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
     sd_alone: float | None = None
     """the Cramer-Rao sd if all other unknowns were known: Tischler's insensitivity"""
-
-
-class SecondMethod(NamedTuple):
-    """Where a method that weighs by the noise's spectrum has other values than output error. The
-    names of the fields are keys of fit.json."""
-
-    label: str
-    """the method, as reports call it"""
-    estimates: Mapping[str, tuple[float, float, float] | None]
-    """by parameter that it does not bear out its estimate there and the ends of its 95 % interval;
-    None where the data do not determine it by that method"""
 
 
 class Signals(NamedTuple):
@@ -101,7 +88,7 @@ class Check:
     verdict: Verdict
     noise: dict[str, float]
     """sd assumed for each flight and output"""
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
     guessed: tuple[str, ...] = ()
     """flights and outputs whose noise nobody stated"""
     findings: tuple[Finding, ...] = ()
@@ -111,11 +98,12 @@ class Check:
     sd is relative to, and the unit"""
 
     @property
-    def further_notes(self) -> tuple[str, ...]:
+    def further_notes(self) -> tuple[Finding, ...]:
         """The notes without those that a finding says too."""
         said = {f.sentence for f in self.findings}
-        slow = any(f.topic == "logging rate" and f.bad for f in self.findings)
-        return tuple(n for n in self.notes if n not in said and not (slow and ALIASED in n))
+        slow = any(f.code == LOGGING_RATE and f.bad for f in self.findings)
+        notes = (n for n in self.notes if not (slow and n.code == ALIASED))
+        return tuple(n for n in notes if n.sentence not in said)
 
 
 # Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
@@ -155,39 +143,23 @@ class Fit:
     steps: int
     trace: tuple[tuple[int, float], ...]
     """(steps, cost) of every round of the optimiser"""
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     reached: Solution
     """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
     """with windows: the same simulated in one piece, from the initial state of the first window"""
     held_out_frequency: HeldOutFrequency | None = None
     """of a fit in frequency: what the flights held out say in frequency"""
-    adequacy: Adequacy = UNJUDGED
-    """whether the model explains what was measured, judged against what"""
+    adequacy: Adequacy = field(default_factory=Adequacy)
+    """how well the fitted outputs are explained"""
     coloured: bool = False
     """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
     responses: ResponseAgreement | None = None
     """frequency-response: how the model's responses agree with the measured ones"""
     feedback: tuple[Feedback, ...] = ()
     """by flight and input, whether it follows the response"""
-    moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
-    """frequency error without an instrument: by parameter what feedback may have done to it"""
-    weak_instrument: tuple[str, ...] = ()
-    """the parameters of which an instrument tells too little"""
-    held_upright: bool = False
-    """in frequency: whether the model is unstable and the record does not grow, so that somebody
-    closes a loop even where no input was found to follow the response"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
-    disturbed_loop: bool = False
-    """in time without process noise: whether inputs follow the response and the residuals are not
-    white, so that a disturbance comes back through the inputs"""
-    second_method: SecondMethod | None = None
-    """where a method that weighs by the noise's spectrum differs from output error with coloured
-    residuals, or from filter error whose values the inputs do not ask for; None where that was not
-    asked"""
-    late_stick: LateStick | None = None
-    """by how much inputs look later than they acted, where that is clear and matters"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
@@ -199,38 +171,38 @@ class Fit:
         return f"{label} by instrument ({by})" if by else label
 
     @property
-    def untrusted(self) -> tuple[str, ...]:
-        """The parameters that feedback may have biased, of which the instruments say too little, or
-        that another method does not bear out."""
-        if self.disturbed_loop:
-            # Nothing tells which of them: a disturbance in the inputs moves all.
-            return tuple(self.estimates)
-        if self.not_borne_out:
-            # One estimate of a wrong optimum is as wrong as another.
-            return tuple(n for n, e in self.estimates.items() if e.sd is not None)
-        loop = Loop(self.feedback, self.instruments, self.held_upright)
-        doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
-        return tuple(n for n in self.estimates if n in doubted)
+    def distrusts(self) -> dict[str, Distrust]:
+        """By parameter why its interval may not be used; none where no optimum was reached."""
+        if self.status == "not-converged":
+            return {}
+        return distrusted(self.findings, self.estimates)
 
     @property
-    def not_borne_out(self) -> tuple[str, ...]:
-        """The parameters whose estimates a method that weighs by the noise's spectrum excludes, or,
-        of output error with coloured residuals, does not determine."""
-        return tuple(self.second_method.estimates) if self.second_method is not None else ()
+    def untrusted(self) -> tuple[str, ...]:
+        """The parameters whose intervals may not be used."""
+        return tuple(self.distrusts)
 
     @property
     def distrust(self) -> str:
         """A sentence that belongs beside what the data determine; empty where all is trusted."""
-        if not self.untrusted or self.status == "not-converged":
+        each = [
+            n if d.shift is None else f"{n} (would move by {d.shift:+.2g}: {d.brief})"
+            for n, d in self.distrusts.items()
+        ]
+        if not each:
             return ""
-        why = "weak instrument" if self.weak_instrument else "closed loop without an instrument"
-        if self.disturbed_loop:
-            why = "the inputs follow the response, and the residuals are not white"
-        elif self.second_method is not None and self.second_method.estimates:
-            names = ", ".join(self.not_borne_out)
-            knows = "any gusts" if self.method == "filter-error" else "gusts"
-            why = f"{self.second_method.label}, which allows for {knows}, does not bear {names} out"
-        return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
+        why = dict.fromkeys(d.brief for d in self.distrusts.values() if d.shift is None)
+        return f"Not trusted: {', '.join(each)}{f' ({"; ".join(why)})' if why else ''}."
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences of the findings."""
+        return tuple(sentences(self.findings))
+
+    @property
+    def exit_code(self) -> int:
+        """0, 3 or 4, as the command line returns it."""
+        return exit_code(self.status, self.adequate, self.distrusts)
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
@@ -245,20 +217,16 @@ class Fit:
 
     @property
     def adequate(self) -> bool:
-        """Whether the model explains what was measured (`adequacy` says why not)."""
-        return self.adequacy.adequate
+        """True if no finding shows that the model does not explain the record."""
+        return not any(f.denies for f in self.findings)
 
     @property
-    def held_out_worse(self) -> tuple[str, ...]:
-        """The outputs that flights held out show worse than their mean, by more than chance makes
-        of one that does not respond; of a fit in frequency, of what follows the inputs there."""
-        if self.held_out_frequency is not None:
-            return self.held_out_frequency.worse
-        # With gusts in the model, or no simulation in the fit, a simulation says little.
-        estimator = estimator_of(self.method)
-        if estimator.process_noise or estimator.noise_spectrum:
-            return ()
-        return tuple(n for n, m in self.validation.items() if not m.vaf >= WORSE)
+    def adequate_in_words(self) -> str:
+        """`yes`, `not judged` (no optimum was reached), or `no (VAF of p is 20.0 %)`."""
+        if self.status == "not-converged":
+            return "not judged"
+        why = dict.fromkeys(f.brief for f in self.findings if f.denies)
+        return f"no ({'; '.join(why)})" if why else "yes"
 
     @property
     def disturbable(self) -> bool:
@@ -295,8 +263,6 @@ class Fit:
     @property
     def interval(self) -> str:
         """What to call the intervals."""
-        if self.status != "not-converged" and self.late_stick is not None:
-            return "95 % (stick late)"
         if self.status != "not-converged" and self.coloured:
             return "95 % (autocorrelated residuals)"
         # Where no optimum was reached there are none.
@@ -330,6 +296,19 @@ class Fit:
         from heli_jax.exports import estimates_frame
 
         return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
+
+
+def concluded(fit: Fit) -> Fit:
+    """The fit without the intervals that its findings take away.
+
+    Args:
+        fit: with all its findings.
+    """
+    estimates = {
+        n: e._replace(lower95=None, upper95=None) if n in fit.distrusts else e
+        for n, e in fit.estimates.items()
+    }
+    return replace(fit, estimates=estimates)
 
 
 def _warn_renamed(old: str, new: str) -> None:

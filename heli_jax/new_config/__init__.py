@@ -60,7 +60,7 @@ def write_config(
         raise InputError(f"{out}: is there already; expected another place, --out FILE")
     require_place(out, str(out))
     read = read_log(Path(log), flight, time_rate)
-    chosen = text.Chosen(*chosen_model(model, read, str(log)))
+    chosen = text.Chosen(*chosen_model(model, read, str(log), out.absolute().parent))
     preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
     signals = None if preset else signals_of(chosen.model, read)
     known = {} if signals is None else signals.known

@@ -1,11 +1,11 @@
 """The model that a log is fitted with: the one that is named, or that of the axis that moves."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax import models
-from heli_jax.errors import InputError, nearest
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
@@ -28,39 +28,27 @@ _FULL_TRAVEL = 1.5
 """of a stick in parts of it, which radios let exceed 1"""
 
 
-def chosen_model(name: str | None, log: Log, path: str) -> tuple[Any, str | dict[str, str], bool]:
-    """The model, what a configuration calls it, and whether it is linear from a file."""
+def chosen_model(
+    name: str | None, log: Log, path: str, folder: Path
+) -> tuple[Any, str | dict[str, str], bool]:
+    """The model, what a configuration calls it, and whether it is linear from a file.
+
+    Args:
+        name: as stated; chosen by what moves unless given.
+        log: of which signals are known.
+        path: of the log.
+        folder: of the configuration, where a module of one's own lies.
+    """
     if name is None:
         name = _by_what_moves(log, path)
     # Of roll and pitch there are the paper's model and a linear one: the latter by {linear: roll}.
     stated = name.strip().removeprefix("{").removesuffix("}")
     linear = stated.startswith("linear:")
     stated = stated.removeprefix("linear:").strip()
-    if (
-        not linear
-        and not linear_models.is_shipped(stated)
-        and not stated.endswith((".yaml", ".yml"))
-    ):
-        return _by_name(stated), stated, False
-    if not linear and stated in ("roll", "pitch"):
-        return models.by_name(stated, "--model"), stated, False
+    file = linear_models.is_shipped(stated) or stated.endswith((".yaml", ".yml"))
+    if not linear and (not file or stated in ("roll", "pitch")):
+        return models.by_name(stated, "--model", folder), stated, False
     return linear_models.linear_model(stated).model, {"linear": stated}, True
-
-
-def _by_name(stated: str) -> Any:
-    try:
-        return models.by_name(stated, "--model")
-    except InputError as e:
-        if ":" in stated:
-            raise
-        # The library's own list leaves out what is linear, and files.
-        known = tuple(dict.fromkeys((*models.names(), *linear_models.shipped())))
-        near = nearest(stated, known)
-        meant = near if "did you mean" in near else ""
-        raise InputError(
-            f"--model: expected one of {', '.join(known)}, a linear model's file (NAME.yaml) or "
-            f"package.module:name, got {stated!r}{meant}"
-        ) from e
 
 
 def _by_what_moves(log: Log, path: str) -> str:

@@ -22,6 +22,9 @@ _GUSTS = (
     "  # With a disturbance, since gusts move real machines too; where none do, output-error",
     "  # and no section disturbance.",
 )
+_NO_AXIS = (
+    "  # output-error: the model names no axis on which gusts could act (axes in its file).",
+)
 _SMOOTH = (
     "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
     "  # simulated, and filter-error needs the noise as the sensors gave it.",
@@ -122,7 +125,7 @@ def configuration(
         axes = ()
     lines += [
         "fit:",
-        *(_SMOOTH if smooth else _GUSTS),
+        *(_SMOOTH if smooth else _GUSTS if axes else _NO_AXIS),
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
@@ -380,7 +383,11 @@ def _value(value: Any) -> str:
         return "{" + ", ".join(f"{k}: {_value(v)}" for k, v in value.items()) + "}"
     # What YAML might read as something else stands in quotes, which are those of JSON too.
     text = str(value)
-    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+    if _PLAIN.fullmatch(text):
+        return text
+    quoted = json.dumps(text, ensure_ascii=False)
+    # YAML takes such characters as their numbers alone.
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
 
 
 def _comment(text: str) -> str:

@@ -151,9 +151,7 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
     if fit.verdict.identifiable and shares:
         named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
         determined = f"determined, by priors: {named}"
-    # `no: p looks like ...` instead of `no (p looks like ...)`, since a summary has it in brackets.
-    verdict, _, why = fit.adequacy.summary.partition(" (")
-    adequate = f"{verdict}: {why[:-1]}" if why.endswith(")") else fit.adequacy.summary
+    adequate = fit.adequate_in_words.replace(" (", ": ", 1).removesuffix(")")
     return [
         Gate(
             "identifiability",

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit, Signals
@@ -16,7 +17,6 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check
 from heli_jax.identification.uncertainty.comparison import Intervals
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import fit_content as content
 from heli_jax.report.card import card
 from heli_jax.report.fit_content import whiteness_note as whiteness_note
@@ -71,13 +71,14 @@ def fit_json(
     return _plain(
         {
             "status": fit.status,
+            "exit_code": fit.exit_code,
             "model": fit.model,
             "method": fit.method,
             "instruments": list(fit.instruments),
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
-            "adequate": None if fit.adequacy.unjudged else fit.adequate,
-            "adequacy": content.adequacy(fit.adequacy),
+            "adequate": None if fit.status == "not-converged" else fit.adequate,
+            "adequacy": content.adequacy(fit),
             "null_directions": list(fit.verdict.null_directions),
             "determined_combinations": content.combinations(fit.verdict),
             "verdict": content.verdict(fit.verdict),
@@ -94,7 +95,7 @@ def fit_json(
             "models": content.choice(supplementary.choice),
             "methods": methods_content(supplementary.methods),
             "intervals": content.intervals(supplementary.intervals),
-            "record": [f._asdict() for f in supplementary.findings],
+            "record": [content.finding(f) for f in supplementary.findings],
             "compatibility": _sensors(supplementary.sensors),
             **content.likelihood(fit),
             # The words of the format, with which programs compare: not to be polished.
@@ -110,7 +111,7 @@ def fit_json(
             "frequency_error_start": frequency_start_content(problem),
             "starts": content.starts(fit),
             "steps": fit.steps,
-            "notes": list(fit.notes),
+            "findings": [content.finding(f) for f in fit.findings],
             **_provenance(fit, problem),
         }
     )
@@ -158,8 +159,8 @@ def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:
             "verdict": content.verdict(verdict),
             "noise_sd": check.noise,
             "noise_guessed": list(check.guessed),
-            "record": [f._asdict() for f in check.findings],
-            "notes": list(check.further_notes),
+            "record": [content.finding(f) for f in check.findings],
+            "notes": [content.finding(f) for f in check.further_notes],
             "log_notes": list(log_notes),
         }
     )

@@ -6,6 +6,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
+from heli_jax.finding import Finding
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.identification.equation_error.baseline import Baseline
@@ -16,7 +17,7 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
-from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
+from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
 from heli_jax.identification.validation.follows_response import LEVEL
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.numbers import percent
@@ -68,11 +69,7 @@ def residuals(fit: Fit) -> dict[str, Any]:
             "by_output": whiteness,
         },
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
-        "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
-        "held_upright": fit.held_upright,
-        "disturbed_loop": fit.disturbed_loop,
-        "second_method": fit.second_method._asdict() if fit.second_method else None,
-        "untrusted": list(fit.untrusted),
+        "untrusted": {n: d._asdict() for n, d in fit.distrusts.items()},
         "distrust": fit.distrust,
     }
 
@@ -152,15 +149,13 @@ def likelihood(fit: Fit) -> dict[str, Any]:
     }
 
 
-def adequacy(adequacy: Adequacy) -> dict[str, Any]:
+def adequacy(fit: Fit) -> dict[str, Any]:
     """Whether the model explains what was measured."""
     return {
-        # With the limits that it was judged against, so that a file can be read without the version
-        # that wrote it.
-        **adequacy._asdict(),
-        "adequate": None if adequacy.unjudged else adequacy.adequate,
-        "summary": adequacy.summary,
-        "judged": [output._asdict() for output in adequacy.judged],
+        "summary": fit.adequate_in_words,
+        "judged": [output._asdict() for output in fit.adequacy.judged],
+        "by_chance": fit.adequacy.by_chance,
+        "ahead": fit.adequacy.ahead,
         # The limits of this version: a later one may have others.
         "against": {
             "explained_at_least": EXPLAINED,
@@ -168,6 +163,11 @@ def adequacy(adequacy: Adequacy) -> dict[str, Any]:
             "or_power_over_what_the_disturbance_makes_at_most": EXPECTED,
         },
     }
+
+
+def finding(f: Finding) -> dict[str, Any]:
+    """A finding as plain data."""
+    return {**f._asdict(), "shifts": dict(f.shifts)}
 
 
 def choice(choice: Choice | None) -> dict[str, Any] | None:

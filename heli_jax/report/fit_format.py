@@ -8,17 +8,16 @@ from typing import Literal, TypedDict
 from heli_jax.analysis.attitude_responses import HandlingPair
 from heli_jax.analysis.handling_qualities import Number
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Distrust, Finding
 from heli_jax.identification.equation_error.first_guess import Equation, StartValue
 from heli_jax.identification.equation_error.stepwise import Step
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Combination, Pair
 from heli_jax.identification.model_selection import Candidate, Nested
-from heli_jax.identification.result import Estimate, SecondMethod, Status
+from heli_jax.identification.result import Estimate, Status
 from heli_jax.identification.uncertainty.nuts import Convergence
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
-from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.closed_loop_trust import Moved
-from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.advice import OutputAdequacy
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
@@ -70,13 +69,16 @@ class AdequacyAgainst(TypedDict):
     or_power_over_what_the_disturbance_makes_at_most: float
 
 
-class AdequacyToo(TypedDict):
-    """Beside the fields of the class."""
+class AdequacyContent(TypedDict):
+    """Whether the model explains the record."""
 
-    adequate: bool | None
-    """null where the optimiser did not arrive"""
     summary: str
     """the answer in a few words, as the first line has it"""
+    judged: list[OutputAdequacy]
+    by_chance: bool
+    """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
+    ahead: float | None
+    """[s] that is predicted at most where that, and no simulation, was judged"""
     against: AdequacyAgainst
 
 
@@ -140,7 +142,7 @@ class MethodResult(TypedDict):
     parameters: dict[str, Estimate]
     difference_joint_sd: dict[str, float]
     """from the first method's estimate, in their joint standard deviation"""
-    notes: list[str]
+    findings: list[Finding]
 
 
 class MethodsCompared(TypedDict):
@@ -325,7 +327,10 @@ class FitFile(TypedDict):
     """fit.json."""
 
     status: Status
-    """whether the optimiser arrived, and whether the data determine what was asked"""
+    """whether the optimiser converged, and whether the data determine what was asked"""
+    exit_code: Literal[0, 3, 4]
+    """0: the intervals may be used; 3: not identifiable, or not trusted; 4: not converged, or not
+    adequate"""
     model: str
     method: str
     instruments: list[str]
@@ -336,7 +341,7 @@ class FitFile(TypedDict):
     """whether the data and the priors determine every free parameter"""
     adequate: bool | None
     """whether the model explains the record; null where that was not judged"""
-    adequacy: Adequacy
+    adequacy: AdequacyContent
     null_directions: list[dict[str, float]]
     """as in `verdict`"""
     determined_combinations: list[Combination]
@@ -381,17 +386,8 @@ class FitFile(TypedDict):
     residuals: Residuals
     feedback: list[Feedback]
     """by flight and input that moves freely"""
-    moved_by_feedback: dict[str, Moved]
-    """by parameter, in a closed loop without an instrument"""
-    held_upright: bool
-    """whether somebody must have held the machine, which is unstable"""
-    disturbed_loop: bool
-    """whether gusts that the method does not know came in by feedback"""
-    second_method: SecondMethod | None
-    """a method that does not bear estimates out"""
-    untrusted: list[str]
-    """parameters that a fit in a closed loop cannot be trusted on, or a second method does not bear
-    out"""
+    untrusted: dict[str, Distrust]
+    """by parameter, why its interval may not be used"""
     distrust: str
     """the same in a sentence; empty where all is trusted"""
     responses: ResponseAgreement | None
@@ -406,8 +402,8 @@ class FitFile(TypedDict):
     """where each start led"""
     steps: int
     """of the optimiser, to the best optimum"""
-    notes: list[str]
-    """what a reader has to know of the fit"""
+    findings: list[Finding]
+    """about the record, the model and the fit"""
     timing_s: dict[str, float]
     """by what was done, and in all"""
     versions: dict[str, str]
@@ -419,7 +415,6 @@ class FitFile(TypedDict):
 
 
 TOO: dict[type, type] = {
-    Adequacy: AdequacyToo,
     Estimate: Fixed,
     Feedback: FeedbackToo,
     ResponseAgreement: ResponsesToo,

@@ -44,21 +44,23 @@ class SavedFit(NamedTuple):
     validation: dict[str, Metrics]
     """of the simulation, over the flights held out, by output"""
     signals: tuple[Signals, ...]
-    notes: tuple[str, ...]
     content: dict[str, Any]
     """all of fit.json"""
 
     @property
     def adequacy(self) -> str:
-        """`yes`, `in size only (...)`, `no (...)` and so on, as the fit said it."""
+        """`yes`, `no (...)` or `not judged`, as the fit had it."""
         return adequacy_of(self.content)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences of the findings."""
+        return tuple(f["sentence"] for f in self.content.get("findings", ()))
+
+    @property
     def distrust(self) -> str:
-        """`Not to be trusted: ...`, as the fit said it; empty where nothing speaks against it."""
-        names = ", ".join(self.content.get("untrusted") or ())
-        # Fits of earlier versions have the names alone.
-        return self.content.get("distrust") or (f"Not to be trusted: {names}." if names else "")
+        """`Not trusted: ...`, as the fit had it; empty where nothing speaks against it."""
+        return self.content.get("distrust") or ""
 
     @property
     def overconfident(self) -> bool:
@@ -121,13 +123,15 @@ def load_fit(directory: str | Path) -> SavedFit:
             metrics={n: _metrics(m) for n, m in content["metrics"].items()},
             validation={n: _metrics(m) for n, m in content["validation"].items()},
             signals=_signals(directory / "signals.csv", content),
-            notes=tuple(content["notes"]),
             content=content,
         )
-    except (KeyError, TypeError, AttributeError) as e:  # a key is missing, or holds another kind
+    except InputError:
+        raise
+    # A key is missing or holds another kind, a row is cut off, a cell is no number.
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, csv.Error) as e:
         raise InputError(
-            f"{directory / 'fit.json'}: expected what heli-jax fit writes, got a file without a "
-            f"usable {e}"
+            f"{directory}: expected fit.json and signals.csv as heli-jax fit writes them, got "
+            f"other content ({type(e).__name__}: {e})"
         ) from e
 
 
@@ -135,7 +139,7 @@ def _content(path: Path) -> dict[str, Any]:
     data = read_regular(path, "the fit.json of a run directory", _LIMIT_BYTES)
     try:
         content = json.loads(data)
-    except ValueError as e:  # no JSON, or no text
+    except (ValueError, RecursionError) as e:  # no JSON, or no text
         raise InputError(f"{path}: expected JSON, got {str(e)[:80]}") from e
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object, got a {type(content).__name__}")
@@ -146,7 +150,14 @@ def _estimate(saved: Mapping[str, Any]) -> Estimate:
     # By name and these alone: a file may have keys that a later version added.
     fields = {name: saved[name] for name in Estimate._fields}
     # What the data do not determine has no number in the file.
-    return Estimate(**{**fields, "value": _number(fields["value"])})
+    numbers = {n: v if v is None else float(v) for n, v in fields.items() if n in _NUMBERS}
+    unit = str.join("", (fields["unit"],))  # a text
+    return Estimate(**{**fields, **numbers, "unit": unit, "value": _number(fields["value"])})
+
+
+_NUMBERS = tuple(
+    name for name, kind in Estimate.__annotations__.items() if kind in (float, float | None)
+)
 
 
 def _metrics(saved: Mapping[str, float | None]) -> Metrics:

@@ -94,7 +94,7 @@ _PARTS = {"metrics": "", "validation": "held_out_"}
 _WORDS = {
     "status": "converged, not-converged, not-identifiable, failed or not run",
     "verdict": "what the data determine",
-    "untrusted": "parameters that feedback may have biased or another method does not bear out",
+    "untrusted": "parameters whose intervals may not be used",
     "adequate": "whether the model explains what was measured",
     "sentence": "why there is no fit",
     "run": "directory of the fit, within the study's",

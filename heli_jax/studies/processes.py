@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 
+from heli_jax import import_path
 from heli_jax.studies.point import Outcome, Task, failure
 from heli_jax.studies.worker import SCRATCH, read_outcome
 
@@ -33,9 +34,7 @@ class _Process:
 
     def __init__(self, cache: str) -> None:
         self.scratch = tempfile.mkdtemp(prefix="heli_jax-study-")
-        environment = os.environ | {
-            # Our own modules, and the user's, as this process finds them.
-            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        environment = import_path.environment() | {
             "JAX_COMPILATION_CACHE_DIR": cache,
             "TMPDIR": self.scratch,
             SCRATCH: self.scratch,

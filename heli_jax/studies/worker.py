@@ -14,6 +14,7 @@ import sys
 import threading
 from typing import IO
 
+from heli_jax import import_path
 from heli_jax.studies.point import Outcome, Task, fit_point
 
 SCRATCH = "HELI_JAX_STUDY_SCRATCH"
@@ -59,6 +60,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    import_path.pass_over_style_of_folder()
     tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(tasks,), daemon=True).start()
     import jax

@@ -55,7 +55,7 @@ def split_for(
     Args:
         job: the sweep.
         devices: of JAX; those of this process unless given.
-        chunk: elements written at a time; taken as it is where it is given.
+        chunk: elements written at a time; taken as it is where it is given, up to the sweep's.
         lanes: elements computed side by side on a device; likewise.
         backend: "xla", "fused" (a run as one program of machine code), or "auto": fused on
             CPUs where it can be.
@@ -81,7 +81,9 @@ def split_for(
         lanes = _measured(job, devices, kind, lanes, memory, say)
     if chunk is None:
         chunk = _chunk_for(job, kind, len(devices), lanes, shares)
-    return Split(chunk, lanes, chosen)
+    # No larger than the sweep: what a chunk lacks in elements is computed all the same.
+    step = BLOCKS * lanes * len(devices)
+    return Split(min(chunk, math.ceil(job.design.size / step) * step), lanes, chosen)
 
 
 def _fused_or_xla(
@@ -112,9 +114,7 @@ def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> 
     in_time = room if kind == "gpu" else _power(_CHUNK_S * n_devices / _guess(job))
     chunks = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
     each = _power(job.design.size / chunks)
-    chunk = max(step, math.ceil(min(in_time, room, each) / step) * step)
-    # No larger than the sweep: what a chunk lacks in elements is computed all the same.
-    return min(chunk, math.ceil(job.design.size / step) * step)
+    return max(step, math.ceil(min(in_time, room, each) / step) * step)
 
 
 def _power(n: float) -> int:

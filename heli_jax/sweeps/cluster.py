@@ -5,23 +5,24 @@ common. A worker that dies has its chunks computed by another.
 """
 
 import contextlib
+import functools
 import logging
 import signal
-import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import dask
 import distributed
 import jax
 import numpy as np
-from distributed import CancelledError, Client, LocalCluster, WorkerPlugin, as_completed
+from distributed import CancelledError, Client, LocalCluster, Security, WorkerPlugin, as_completed
 from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
+from heli_jax import import_path
 from heli_jax.errors import InputError
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.spec import Job
@@ -57,8 +58,8 @@ class Prepared(WorkerPlugin):
     # dask keeps one plugin of a name: a second sweep on the same scheduler replaces the first's.
     name: Any = "heli_jax"
 
-    def __init__(self, x64: bool, folder: str | None, cache: str | None) -> None:
-        self.x64, self.folder, self.cache = x64, folder, cache
+    def __init__(self, x64: bool, folders: tuple[str, ...], cache: str | None) -> None:
+        self.x64, self.folders, self.cache = x64, folders, cache
 
     def setup(self, worker: distributed.Worker) -> None:
         """Called by dask in every worker, later ones too."""
@@ -66,25 +67,23 @@ class Prepared(WorkerPlugin):
         jax.config.update("jax_enable_x64", self.x64)
         if self.cache:
             jax.config.update("jax_compilation_cache_dir", self.cache)
-        if self.folder and self.folder not in sys.path:
-            sys.path.insert(0, self.folder)
+        import_path.search(self.folders)
 
 
 @contextlib.contextmanager
 def connected(
     scheduler: str | None = None,
     workers: int | None = None,
-    folder: Path | None = None,
 ) -> Iterator[Client]:
     """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
 
     Args:
         scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
         workers: processes of that cluster; as many as dask thinks fit unless given.
-        folder: where the user's own modules lie.
 
     Raises:
-        InputError: nothing answers there, or workers have other versions than this process.
+        InputError: nothing answers there, workers have other versions than this process, or a
+            cluster of one's own cannot be protected.
     """
     cache: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
     with contextlib.ExitStack() as stack:
@@ -99,22 +98,50 @@ def connected(
                 ) from e
             cache = None  # a folder of this machine; theirs may have none of that name
         else:
-            local: Any = LocalCluster  # whose annotations leave out that workers may be None
-            with _ignore_sigint():
-                # One thread a process: a chunk takes all devices of its process already. No
-                # dashboard: it would open a port.
-                cluster = local(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                )
-            client = stack.enter_context(Client(stack.enter_context(cluster)))
+            client = stack.enter_context(Client(stack.enter_context(_local_cluster(workers))))
         x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
         _check_versions(client, scheduler or "--workers")
-        client.register_plugin(Prepared(x64, None if folder is None else str(folder), cache))
+        client.register_plugin(Prepared(x64, import_path.searched(), cache))
         yield client
+
+
+def _local_cluster(workers: int | None) -> LocalCluster:
+    """A cluster on this machine that this process alone can use.
+
+    Its ports are open to every user of the machine, and whoever dask listens to can run code: it
+    listens to holders of a certificate made here, which stays in memory.
+    """
+    local: Any = LocalCluster  # whose annotations leave out that workers may be None
+    # dask starts its HTTP servers whatever it is told. They have no pages then, and are stopped.
+    try:
+        security = Security.temporary()
+    except ImportError as e:
+        raise InputError(
+            "--workers: cryptography is not installed, by which only this process reaches its "
+            "workers, expected the extra distributed: pip install 'heli_jax[distributed]'"
+        ) from e
+    no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
+    with _ignore_sigint(), dask.config.set(no_pages):
+        # One thread a process: a chunk takes all devices of its process already.
+        cluster = local(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            security=security,
+            plugins=(_NoHttp(),),
+        )
+    cluster.scheduler.http_server.stop()
+    return cluster
+
+
+class _NoHttp(WorkerPlugin):
+    """A worker without the HTTP server that dask gives it."""
+
+    def setup(self, worker: distributed.Worker) -> None:
+        """Called by dask as the worker begins."""
+        worker.http_server.stop()
 
 
 @contextlib.contextmanager
@@ -206,7 +233,9 @@ def split_there(client: Client, job: Job, **options: Any) -> Split:
     with _answering():
         # Not pure: dask would give the answer that it remembers of an equal job, which may be of
         # other workers.
-        return Split(*client.submit(_split, job, options, pure=False).result())
+        running = _gathered([client.submit(_split, job, options, pure=False)])
+        ((_, split),) = _as_they_end(client, running)
+        return Split(*split())
 
 
 def _threads(client: Client) -> int:
@@ -249,10 +278,10 @@ def computed(
         return client.submit(_chunk, shipped, tuple(split), chunk, token, key=key, retries=_RETRIES)
 
     first = [submitted(k) for _, k in zip(range(_AHEAD * threads), waiting, strict=False)]
-    running = as_completed(first)
-    for future in _as_they_end(client, running):
+    running = _gathered(first)
+    for future, result in _as_they_end(client, running):
         with _answering():
-            chunk, results = future.result()
+            chunk, results = result()
         # Before the chunk is written, or the worker would keep its results for as long.
         future.release()
         following = next(waiting, None)
@@ -261,18 +290,26 @@ def computed(
         yield chunk, results
 
 
-# Any: dask's as_completed, whose futures have no type.
-def _as_they_end(client: Client, running: Any) -> Iterator[Any]:
-    """The futures as they end, in any order; more may be added meanwhile.
+# Any: dask's futures and as_completed have no types.
+def _gathered(futures: list[Any]) -> Any:
+    """Futures as they are done and their results are here: to fetch one may wait without end, where
+    the worker that holds it has died."""
+    return as_completed(futures, with_results=True, raise_errors=False)
+
+
+def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
+    """The futures as they end, in any order, each with what gives its result or raises its error;
+    more may be added meanwhile.
 
     Raises:
-        InputError: the scheduler is gone, or has had no worker for long: tasks would wait for one
-            without end, and nobody would be told.
+        InputError: the scheduler is gone, or has had no worker for long that takes work: tasks
+            would wait for one without end, and nobody would be told.
     """
     seen = looked = time.monotonic()
     while not running.is_empty():
         if running.has_ready():
-            yield next(running)
+            future, result = next(running)
+            yield future, functools.partial(_value, future, result)
             seen = looked = time.monotonic()
             continue
         time.sleep(_WAIT_S)
@@ -280,14 +317,30 @@ def _as_they_end(client: Client, running: Any) -> Iterator[Any]:
         if now - looked < _LOOK_S:
             continue
         looked = now
-        there: Any = client.nthreads
         with _answering():
-            seen = now if there() else seen
+            there = client.scheduler_info()["workers"].values()
+        seen = now if any(map(_works, there)) else seen
         if now - seen > _ALONE_S:
+            paused = f"no worker but {len(there)} that lack memory" if there else "no worker"
             raise InputError(
-                f"dask: the scheduler has had no worker for {now - seen:.0f} s, expected one at "
+                f"dask: the scheduler has had {paused} for {now - seen:.0f} s, expected one at "
                 "least to run to the end; what is finished is kept: --resume goes on"
             )
+
+
+def _value(future: Any, result: Any) -> Any:
+    """The result of a future that ended, or its error raised."""
+    if future.status == "error":
+        raise result[1]
+    if isinstance(result, CancelledError):
+        raise result
+    return result
+
+
+def _works(worker: Mapping[str, Any]) -> bool:
+    """True if a worker takes tasks or is at one: dask pauses those that are short of memory."""
+    counts = worker.get("metrics", {}).get("task_counts", {})
+    return worker.get("status") != "paused" or bool(counts.get("executing"))
 
 
 def mapped[T, R](
@@ -315,19 +368,19 @@ def mapped[T, R](
         return client.submit(function, items[k], key=f"item-{k}-{token}", pure=False)
 
     at_once = _AHEAD * _threads(client)
-    running = as_completed([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
-    for future in _as_they_end(client, running):
+    running = _gathered([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
+    for future, result in _as_they_end(client, running):
         with _answering():
             try:
-                result = future.result()
+                found = result()
             # dask counts how many workers died over one task: the others go on.
             except KilledWorker:
-                result = None
+                found = None
         future.release()
         following = next(waiting, None)
         if following is not None:
             running.add(submitted(following))
-        yield places.pop(future.key), result
+        yield places.pop(future.key), found
 
 
 def _received(job: Job) -> Job:

@@ -191,6 +191,9 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
         # With the lock held, so that no other process finishes a chunk between this question and
         # the answer.
         done = store.whole()
+        if damaged := int(np.count_nonzero(store.done() & ~done)):
+            words = "1 chunk is damaged" if damaged == 1 else f"{damaged} chunks are damaged"
+            options.say(Note(f"{where}: {words} and computed again"))
         _same_cut(store, job, options, where)
         # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
         for note in _changes(store.attributes.get("versions", {}), versions()):
@@ -229,8 +232,8 @@ def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> No
     """Refuse numbers other than those a store was begun with: its last digits depend on them."""
     for name in ("chunk", "lanes"):
         number, kept = getattr(options, name), getattr(store.split, name)
-        at_most = job.design.size if name == "lanes" else math.inf  # as `_cut` takes it
-        if number is not None and min(number, at_most) != kept:
+        # More than there are elements were cut down as the store was begun.
+        if number not in (None, kept) and not number > kept >= job.design.size:
             raise InputError(
                 f"{where}: was begun with {name} {kept}, expected the same, got {number}"
             )

@@ -10,7 +10,7 @@ from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads, require_linear
+from heli_jax.dynamics.model import Model, plain, reads, require_constants, require_linear
 from heli_jax.errors import nearest, require_kind
 from heli_jax.flights.flight import Flight
 from heli_jax.simulation.options import SimulationOptions
@@ -214,7 +214,9 @@ def job(
         raise ValueError(f"solver: model {model.name!r} is not linear, expected rk4")
     # Asked for now, so that an unknown name is refused before anything is compiled.
     solver_named(solver)
-    _check_vehicle(model, params, design, flights)
+    # Every flight has to know it: one that does not would be computed with NaN.
+    known = set.intersection(*(set(f.known) for f in flights))
+    require_constants(model, params, known.union(design.names))
     require_linear(model, params)
     trimmed = options.trimmed
     if trimmed is not None and not is_full_nonlinear(trimmed.of or model):
@@ -266,15 +268,6 @@ def _check_single(model: Model) -> None:
                     "though all it is given is float32; expected float64, or its arrays made as "
                     "jnp.asarray(table, x.dtype), x a state"
                 )
-
-
-def _check_vehicle(model: Model, params: Any, design: Design, flights: tuple[Flight, ...]) -> None:
-    """Refuse a vehicle that lacks what neither an axis nor every flight gives."""
-    missing = [n for n in needed_but_missing(model, params) if n not in design.names]
-    # Every flight has to know it: one that does not would be computed with NaN.
-    missing = [n for n in missing if not all(n in f.known for f in flights)]
-    if missing:
-        raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
 
 
 def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> None:

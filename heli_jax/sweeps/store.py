@@ -16,6 +16,7 @@ import filelock
 import numpy as np
 import xarray as xr
 import zarr
+from zarr.codecs import ZstdCodec
 from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
@@ -64,7 +65,7 @@ class Store:
         return np.asarray(firsts).reshape(-1) != NOT_RUN
 
     def whole(self) -> np.ndarray:
-        """Which chunks are finished, as `done`, with no file of them missing.
+        """Which chunks are finished, as `done`, and can be read; with no file of them missing.
 
         Raises:
             InputError: one is, or the store cannot be read.
@@ -80,6 +81,14 @@ class Store:
                         f"{self.where}: {name} has {there} chunks of {finished} that are finished, "
                         "expected a store from which nothing was taken, or another --out"
                     )
+        for chunk in np.flatnonzero(done):
+            which = slice(chunk * self.split.chunk, (chunk + 1) * self.split.chunk)
+            try:
+                for array in self._arrays.values():
+                    if array.ndim and array.shape[0] == self._arrays["status"].shape[0]:
+                        array[which]
+            except (OSError, RuntimeError, ValueError):
+                done[chunk] = False
         return done
 
     def write(self, chunk: int, results: Mapping[str, np.ndarray]) -> None:
@@ -195,6 +204,8 @@ def _array(group: zarr.Group, name: str, variable: Variable, size: int, split: S
         # Zarr's chunks are those of the sweep: a chunk is written without reading what lies beside.
         chunks=(split.chunk, *variable.shape),
         dtype=dtype,
+        # Of a file that was damaged later it is known that it was.
+        compressors=[ZstdCodec(level=0, checksum=True)],
         fill_value=_FILL[dtype.kind],
         dimension_names=variable.dims,
         attributes=variable.attributes,

@@ -1,6 +1,9 @@
 """Anyone's own model, its linearisation, and how models are named."""
 
 import dataclasses
+import importlib.machinery
+import sys
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from heli_jax import Model, linearize, models, simulate
+from heli_jax import Model, import_path, linearize, models, simulate
 from heli_jax.analysis.linear import eigenmodes
 from heli_jax.analysis.trim import steady_flight
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
@@ -134,6 +137,13 @@ def test_own_model_by_import_path(tmp_path):
     )
     found = models.by_name("beside_the_configuration:mine", folder=tmp_path)
     assert found.name == "own"
+    # A file beside a configuration never stands for what is installed.
+    (tmp_path / "llvmlite.py").write_text("raise SystemExit('ran')\n")
+    import llvmlite
+
+    assert Path(llvmlite.__file__).parent != tmp_path
+    assert importlib.machinery.PathFinder.find_spec("llvmlite").origin == llvmlite.__file__
+    assert import_path.searched()[-1] == sys.path[-1] == str(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +151,8 @@ def test_own_model_by_import_path(tmp_path):
     [
         ("rol", "unknown model 'rol'; did you mean 'roll'"),
         ("roll_on_stand", "did you mean 'roll-on-stand'"),
+        ("roll-flybarless", "did you mean '{linear: roll-flybarless}'"),
+        ("mine.yaml", "did you mean '{linear: mine.yaml}'"),
         ("", "unknown model ''"),
         ("no_such_module:model", "cannot import 'no_such_module'"),
         ("tests.dynamics.test_model:nothing", "expected a heli_jax.Model at .*, got nothing"),

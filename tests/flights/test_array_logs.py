@@ -4,13 +4,14 @@ import io
 import struct
 import sys
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
 import xarray
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights import Signal, array_table, describe_log, read_flight
 from heli_jax.flights.open_log import open_log, open_table
 
 N = 50
@@ -66,9 +67,59 @@ def test_version_7_3_needs_h5py_and_says_so(tmp_path, monkeypatch):
         open_log(path)
 
 
+def external(file, secret):
+    file.create_dataset("x", (8,), "f8", external=[(str(secret), 0, 64)])
+
+
+def virtual(file, secret):
+    with h5py.File(secret.with_name("other.h5"), "w") as other:
+        other["y"] = np.arange(8.0)
+    layout = h5py.VirtualLayout((8,), "f8")
+    layout[:] = h5py.VirtualSource(secret.with_name("other.h5"), "y", (8,))
+    file.create_virtual_dataset("x", layout)
+
+
+def linked(file, secret):
+    file["x"] = h5py.ExternalLink(str(secret.with_name("other.h5")), "/y")
+
+
+def referred(file, secret):
+    """Letters that no name leads to, of a cell."""
+    hidden = file.create_dataset(None, (8,), "u2", external=[(str(secret), 0, 16)])
+    hidden.attrs["MATLAB_class"] = np.bytes_("char")
+    cell = file.create_dataset("names", data=np.array([hidden.ref], h5py.ref_dtype))
+    cell.attrs["MATLAB_class"] = np.bytes_("cell")
+
+
+@pytest.mark.parametrize("name", ["flight.mat", "flight.h5", "flight.nc"])
+@pytest.mark.parametrize("add", [external, virtual, linked, referred])
+def test_a_log_reads_no_other_file(tmp_path, name, add):
+    secret = tmp_path / "secret"
+    secret.write_bytes(b"password" * 8)
+    with h5py.File(tmp_path / name, "w", userblock_size=512 if ".mat" in name else 0) as file:
+        file["t"] = T
+        add(file, secret)
+    with pytest.raises(InputError):
+        open_log(tmp_path / name)
+
+
+def test_a_file_over_which_its_reader_dies_or_loops_is_no_log(tmp_path, monkeypatch):
+    path = tmp_path / "flight.h5"
+    with h5py.File(path, "w") as file:
+        file["t"] = T
+    assert open_log(path).names == ("t",)
+    # What libhdf5 does over damage, in the process that reads.
+    for fault in ("import os; os.abort()", "while True: pass"):
+        (tmp_path / "h5py").mkdir(exist_ok=True)
+        (tmp_path / "h5py" / "__init__.py").write_text(fault)
+        monkeypatch.setattr(array_table, "_SECONDS", 2)
+        monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+        with pytest.raises(InputError):
+            open_log(path)
+
+
 @pytest.mark.parametrize("name", ["flight.mat", "flight.h5"])
 def test_hdf5(tmp_path, name):
-    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
     path = tmp_path / name
     block = 512 if name.endswith(".mat") else 0
     with h5py.File(path, "w", userblock_size=block) as file:

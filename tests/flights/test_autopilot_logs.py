@@ -1,7 +1,9 @@
 """ULog and DataFlash: what was written comes out, equal to pyulog's and pymavlink's own numbers."""
 
+import itertools
 import math
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -168,6 +170,64 @@ def test_damage_is_counted(tmp_path):
     cut = writers.ulog(TOPICS, **SETTINGS)[:-5]
     log = open_log(written(tmp_path, cut, "cut.ulg"))
     assert log.notes == ("1 damaged message skipped",)
+
+
+ZEROS = bytes(512)
+ONE = [("uint64_t", "timestamp"), ("float", "x")]
+END = b"\xff" * 3
+LATE = 867_798_000_000_000_000
+
+
+def rows_of(tmp_path, data, name="damaged.ulg"):
+    log = open_log(written(tmp_path, data, name))
+    return {t.name: t.times.size for t in log.topics}, log
+
+
+def test_damage_in_a_ulog_without_marks_costs_what_it_hit(tmp_path):
+    whole = writers.ulog([("a", 0, ONE, [(T0 + 4000 * i, i) for i in range(600)])])
+    at = whole.index(b"D", 3000) - 2
+    rows, log = rows_of(tmp_path, whole[:at] + ZEROS + whole[at:])
+    assert rows == {"a": 600}
+    np.testing.assert_array_equal(log.channel("a.x").values, np.arange(600))
+    assert len(log.notes) == 1
+    # 31 bytes are gone from within the rows.
+    rows, log = rows_of(tmp_path, whole[: at + 5] + whole[at + 36 :])
+    assert 597 <= rows["a"] < 600
+    assert set(log.channel("a.x").values) <= set(range(600))
+
+
+@pytest.mark.parametrize("place", [0, 300, 599])
+def test_a_row_with_a_stamp_of_another_age_is_damage(tmp_path, place):
+    stamps = [T0 + 4000 * i for i in range(600)]
+    stamps[place] = LATE
+    rows, log = rows_of(tmp_path, writers.ulog([("a", 0, ONE, [(t, 1.0) for t in stamps])]))
+    assert rows == {"a": 599}
+    assert log.topics[0].times[-1] - log.topics[0].times[0] < 3
+    assert len(log.notes) == 1
+
+
+def test_types_and_flags_that_never_end_are_damage(tmp_path):
+    def message(kind, body):
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    head = writers.ulog([])
+    chain = [message("F", f"{x}:{y} n[99999];".encode()) for x, y in itertools.pairwise("abcdefgh")]
+    nested = b"".join([*chain, message("F", b"h:"), message("A", struct.pack("<BH", 0, 0) + b"a")])
+    fields = "".join(f"uint8_t {i:04x}a;".replace(" ", " x") for i in range(4600))
+    wide = message(
+        "F", b"w:uint64_t timestamp;" + fields.encode()[:64000].rpartition(b";")[0] + b";"
+    )
+    many = wide + b"".join(message("A", struct.pack("<BH", 0, i) + b"w") for i in range(4000))
+    flags = b"".join(
+        message("B", bytes(8) + b"\1" + bytes(7) + struct.pack("<3Q", 61 + 46 * i, 0, 0))
+        + b"\xff" * 3
+        for i in range(1, 1000)
+    )
+    for data in (head + nested, head + many, head[:16] + flags):
+        begin = time.process_time()
+        with pytest.raises(InputError):
+            open_log(written(tmp_path, data, "endless.ulg"))
+        assert time.process_time() - begin < 8
 
 
 def test_names_that_a_terminal_would_obey(tmp_path):

@@ -1,5 +1,7 @@
 """A flight refuses what is no uniform, finite record."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,6 @@ def test_inputs_stay_between_samples_unless_told():
         Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"c": "linear"})
     with pytest.raises(ValueError, match="expected one of zero-order, linear, got 'auto'"):
         Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"a": "auto"})
+    bare: Any = "linear"
+    with pytest.raises(TypeError, match="hold: expected zero-order or linear by input"):
+        Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold=bare)

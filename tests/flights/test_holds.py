@@ -121,22 +121,6 @@ def test_units_and_signs_do_not_matter(name):
         assert decide(factor * values + offset) == decide(values)
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        (np.repeat(np.arange(30) % 7 * 1.37 % 2, 12), "stays for 12 samples at a time and jumps"),
-        (STEPS["one step"], "jumps once and stays"),
-        (multistep(2), "stays for 4 samples at a time and jumps"),
-        (STEPS["two values at random"], "jumps from sample to sample among few values"),
-        (np.full(9, 2.0), "never moves"),
-        (rng().standard_normal(N), "moves at 100 % of the samples"),
-        (MOVING["slow, one count at a time"], "moves by one count of the log at a time, 15 % of"),
-    ],
-)
-def test_the_reason_is_said(values, words):
-    assert decide(values).reason.startswith(words)
-
-
 def test_a_single_absurd_number_changes_no_hold():
     rng = np.random.default_rng(4)
     steps = np.repeat(rng.uniform(-0.2, 0.2, 40), 150)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import time
 import zipfile
 from pathlib import Path
 
@@ -78,6 +79,32 @@ def test_records_within_records_gaps_in_them_and_dates(tmp_path: Path) -> None:
     info = describe_log(path)
     assert info.time is not None
     assert (info.time.column, info.time.duration) == ("time", pytest.approx(T[-1]))
+
+
+def test_two_columns_of_one_name_are_listed_and_one_is_not_chosen(tmp_path: Path) -> None:
+    columns = [pa.array(T), pa.array([[1.0]] * N), pa.array(P), pa.array(2 * P)]
+    pyarrow.feather.write_feather(
+        pa.Table.from_arrays(columns, ["t", "p", "p", "p"]), tmp_path / "a.feather"
+    )
+    rows = "\n".join(f"{t},0,{p},{2 * p}" for t, p in zip(T, P, strict=True))
+    (tmp_path / "a.csv").write_text(f"t,p,p,p\n{rows}\n")
+    for name in ("a.feather", "a.csv"):
+        table = open_table(tmp_path / name)
+        last = table.survey()[-1].values
+        assert last is not None
+        np.testing.assert_allclose(last, 2 * P)
+        with pytest.raises(InputError):
+            table.numbers(["p"])
+
+
+def test_a_name_as_long_as_a_book_is_refused_at_once(tmp_path: Path) -> None:
+    for i, name in enumerate(("[" + "a" * 125_000, "_" * 125_000, "x" + " " * 125_000 + "y")):
+        path = tmp_path / f"{i}.csv"
+        path.write_text(f"t,{name}\n" + "".join(f"{t},1\n" for t in T))
+        begin = time.process_time()
+        with pytest.raises(InputError):
+            describe_log(path)
+        assert time.process_time() - begin < 5
 
 
 def test_no_object_of_python_is_made(tmp_path: Path) -> None:

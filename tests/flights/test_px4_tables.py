@@ -40,9 +40,3 @@ MOTORS = tuple(f"/actuator_motors/{n}" for n in (*TWO, "control.00"))
 def test_a_command_acts_from_when_it_was_published_in_a_table_too(tmp_path, file, names, clock):
     (info,) = describe_flights(_write(tmp_path / file, names))
     assert info.time.column == clock
-
-
-def test_info_says_which_of_two_clocks_it_took_for_commands_and_why(tmp_path):
-    path = _write(tmp_path / "l_actuator_servos_0.csv", (*TWO, "x"))
-    (info,) = describe_flights(path)
-    assert "commands act from when they are published" in " ".join(info.notes)

@@ -2,18 +2,19 @@
 exists. Records are made in NumPy."""
 
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Fit, Flight, Free, Model, Nuisance, Problem, cli, fit, models
-from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models
+from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
+from heli_jax.identification.validation.adequacy import Evidence, assess
 from heli_jax.identification.validation.advice import Record
+from heli_jax.identification.validation.held_out import worse_than_mean
 from heli_jax.identification.validation.metrics import metrics, whiteness
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
-from heli_jax.report import fit_content
 from tests.identification.bench import BENCH, vehicle
 from tests.identification.test_filter_error import FREE, made
 
@@ -73,80 +74,82 @@ def judged(measured, simulated, *, model=own, against=None, errors=None, ahead=N
     return assess(problem, params, evidence)
 
 
+UNMOVED = "adequacy.output-unmoved"
+
+
+def denied(found):
+    return [(f.code, f.subjects) for f in found.findings if f.denies]
+
+
 def test_white_residuals_are_adequate_whatever_is_explained():
     for measured, simulated in (
         (P + 0.05 * WHITE, P), (0.1 * P + 3.0 * WHITE, 0.1 * P), (WHITE, 0.01 * P),
     ):  # fmt: skip
         found = judged(measured, simulated)
-        assert found.adequate
-        assert found.summary == "yes"
-        assert found.sentences == ()
+        assert found.findings == ()
 
 
-def test_a_good_fit_with_coloured_residuals_is_adequate_in_size_only():
+def test_a_good_fit_with_coloured_residuals_is_adequate():
     found = judged(P + 0.14 * P.std() * SLOW, P)
     assert 0.97 < found.judged[0].vaf < 0.99
     assert not found.judged[0].white
-    assert found.adequate
-    assert found.summary == "in size only (the residuals of p are not white)"
-    worse = judged(P + 0.35 * P.std() * SLOW, P).summary
-    assert worse.startswith("in size only (the residuals of p are not white; VAF of p is 8")
-    filtered = judged(P + 0.14 * P.std() * SLOW, P, against=1.0)
-    assert filtered.summary == "in size only (the innovations of p are not white)"
+    assert found.findings == ()
+    worse = judged(P + 0.35 * P.std() * SLOW, P)
+    [low] = worse.findings
+    assert (low.code, low.severity, low.denies) == ("adequacy.below-gate", "note", False)
+    assert 0.8 < low.value < 0.9
+    assert judged(P + 0.14 * P.std() * SLOW, P, against=1.0).findings == ()
 
 
 def test_a_slow_rest_asks_for_filter_error_only_where_there_is_an_axis():
     drift = P + 2.0 * P.std() * SLOW
     found = judged(drift, P)
-    assert not found.adequate
-    assert "no axis to disturb" in " ".join(found.sentences)
-    assert "filter-error" not in " ".join(found.sentences)
+    assert denied(found) == [("adequacy.output-not-explained", ("p",))]
+    assert "filter-error" not in found.findings[0].sentence
     flown = judged(drift, 0.1 * P, model=models.roll_on_stand)
-    assert not flown.adequate
-    assert "filter-error with disturbance: {axis: roll, poles: 1}" in " ".join(flown.sentences)
+    assert denied(flown) == [("adequacy.output-not-explained", ("roll",))]
+    assert "filter-error" in flown.findings[0].sentence
 
 
 def test_a_wrong_sign_is_told_even_where_the_fit_has_shrunk():
     for simulated in (P, 0.001 * P):
         found = judged(-P + 0.01 * WHITE, simulated)
-        assert not found.adequate
-        [said] = [s for s in found.advice if "moves against" in s]
-        assert "signs and columns of p and d" in said
+        assert found.denied
+        assert "moves against" in found.findings[0].sentence
 
 
 def test_a_late_input_and_a_divergent_simulation_have_remedies_of_their_own():
+    def remedy(found):
+        assert found.denied
+        return found.findings[0].sentence
+
     late = np.concatenate([np.zeros(8), P[:-8]])
-    found = judged(late + 0.3 * SLOW, 0.4 * P)
-    assert not found.adequate
-    assert any("0.4 s later" in s and "nuisance.time_shift: true" in s for s in found.advice)
+    assert "nuisance.time_shift: true" in remedy(judged(late + 0.3 * SLOW, 0.4 * P))
     with_shift = judged(late + 0.3 * SLOW, 0.4 * P, nuisance=Nuisance(time_shift=True))
-    assert not any("time_shift" in s for s in with_shift.advice)
-    diverged = judged(P + 0.01 * WHITE, P + 1e-2 * np.exp(0.03 * np.arange(N)))
-    assert diverged.less_than_mean
-    assert "less than its mean" in diverged.summary
-    assert any("fit.shooting: {window: 2.0}" in s for s in diverged.advice)
-    within = judged(P + 0.01 * WHITE, P + 1e-2 * np.exp(0.03 * np.arange(N)), window=2.0)
-    assert not any("fit.shooting" in s for s in within.advice)
+    assert "time_shift" not in remedy(with_shift)
+    diverges = P + 1e-2 * np.exp(0.03 * np.arange(N))
+    found = judged(P + 0.01 * WHITE, diverges)
+    assert found.findings[0].value < 0.0
+    assert "fit.shooting: {window: 2.0}" in remedy(found)
+    assert "fit.shooting" not in remedy(judged(P + 0.01 * WHITE, diverges, window=2.0))
 
 
 def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
     disturbed = P + 1.3 * P.std() * SLOW
     small, as_expected = judged(disturbed, P, against=30.0), judged(P + 3.0 * WHITE, P, against=1.2)
-    assert not small.adequate
-    assert "5.5 times what the estimated disturbance explains" in small.reasons[0]
-    assert as_expected.adequate
+    assert small.denied
+    assert small.judged[0].against_disturbance == 30.0
+    assert not as_expected.denied
     # Innovations that are far from white: the filter does not predict what it says.
-    assert not judged(P + 3.0 * P.std() * SLOW, P, against=1.2).adequate
+    assert judged(P + 3.0 * P.std() * SLOW, P, against=1.2).denied
 
 
-def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_one_step_ahead_only():
+def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_by_what_gusts_make():
     # A simulation that has nothing of the measured output in it, with a difference that is white.
     other = np.random.default_rng(9).standard_normal(N)
     found = judged(WHITE, 0.9 * other, against=1.2, errors=WHITE)
-    assert found.adequate
-    assert not found.less_than_mean
-    assert found.summary.startswith("one step ahead only (VAF of p, simulated, is -")
-    assert "less than its mean" in found.summary
+    assert not found.denied
+    assert ("adequacy.disturbance-hides", ("p",)) in [(f.code, f.subjects) for f in found.findings]
 
 
 @pytest.mark.parametrize(("left", "named"), [(1.0, True), (0.95, True), (0.5, False)])
@@ -154,29 +157,24 @@ def test_a_filter_that_predicts_no_better_than_the_mean_explains_nothing(left, n
     # `left`: the error of the prediction over white noise, of which nothing can be foretold.
     measured = WHITE - WHITE.mean()
     found = judged(measured, 0.01 * np.roll(measured, 7), against=1.2, errors=left * measured)
-    assert found.adequate
-    assert ("but nothing of p is explained" in found.summary) == named
+    assert not found.denied
+    assert (UNMOVED in [f.code for f in found.findings]) == named
 
 
 def test_a_filter_that_only_repeats_the_sample_before_explains_nothing():
     walk = np.cumsum(WHITE)
     for ahead, named in ((np.diff(walk, prepend=0.0), True), (0.3 * WHITE, False)):
         found = judged(walk, np.zeros(N), against=1.2, errors=ahead)
-        assert ("nothing of p" in " ".join(found.sentences)) == (found.adequate and named)
+        assert (UNMOVED in [f.code for f in found.findings]) == (named and not found.denied)
         assert predicts_nothing([(walk, ahead)]) == named
 
 
 @pytest.mark.slow
 def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
     good = judged(P + 0.05 * WHITE, P, against=1.0, ahead=2.0)
-    assert good.adequate
-    assert good.summary == "yes"
+    assert [f.code for f in good.findings] == ["adequacy.judged-ahead"]
     assert good.ahead == 2.0
-    assert "predictions up to 2 s ahead" in good.sentences[0]
-    assert not any("Driven by the inputs alone" in sentence for sentence in good.sentences)
-    bad = judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0)
-    assert not bad.adequate
-    assert "predicted up to 2 s ahead misses" in bad.reasons[0]
+    assert judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0).denied
 
 
 @pytest.mark.slow
@@ -189,50 +187,41 @@ def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
         dt=flight.dt, inputs={"x_roll": -flight.inputs["x_roll"]}, outputs=flight.outputs
     )
     wrong = fit(Problem(model, start, [turned], FREE, method="filter-error"))
-    assert not wrong.adequate
-    assert any("moves against the measured one" in note for note in wrong.notes)
+    assert wrong.exit_code == 4
 
 
 @pytest.mark.parametrize(
-    ("status", "less", "held_out", "code"),
+    ("status", "adequate", "trusted", "code"),
     [
-        ("converged", False, (), 0), ("converged", True, (), 4), ("converged", False, ("p",), 4),
-        ("not-identifiable", True, ("p",), 3), ("not-converged", True, (), 4),
-        ("converged", False, "by another method", 3),
+        ("converged", True, True, 0), ("converged", True, False, 3), ("converged", False, True, 4),
+        ("not-identifiable", True, True, 3), ("not-identifiable", False, True, 4),
+        ("not-converged", True, True, 4),
     ],
 )  # fmt: skip
-def test_exit_codes(status, less, held_out, code):
-    adequacy = SimpleNamespace(reasons=("VAF of p is -586",) if less else (), less_than_mean=less)
-    borne_out = held_out != "by another method"
-    fitted = SimpleNamespace(
-        status=status,
-        adequacy=adequacy,
-        held_out_worse=held_out if borne_out else (),
-        not_borne_out=() if borne_out else ("Kr",),
-    )
-    assert cli._fit_code(fitted) == code
+def test_exit_codes(status, adequate, trusted, code):
+    distrusts = {} if trusted else {"Kr": Distrust("loop.feedback", None, "a loop")}
+    assert exit_code(status, adequate, distrusts) == code
+
+
+def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
+    estimates = {n: SimpleNamespace(sd=sd) for n, sd in (("a", 1.0), ("b", 1.0), ("c", None))}
+    small = Finding("x.small", "doubt", "", shifts={"a": -1.95, "b": 0.1, "c": 50.0})
+    large = Finding("x.large", "note", "", shifts={"a": -1.97, "b": 0.1}, brief="why")
+    assert distrusted([small], estimates) == {}
+    assert distrusted([small, large], estimates) == {"a": Distrust("x.large", -1.97, "why")}
+    # By an amount that is not known.
+    unsized = Finding("x.all", "doubt", "", distrusts=("b", "c"), brief="all")
+    assert distrusted([unsized], estimates) == {"b": Distrust("x.all", None, "all")}
+    # What takes none away is a note; what denies the model stays what it is.
+    denies = small._replace(denies=True)
+    assert [f.severity for f in weighed([small, large, unsized, denies], estimates)] == [
+        "note", "doubt", "doubt", "doubt",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("method", "vaf", "worse"),
-    [
-        ("output-error", -0.3, ("p",)), ("output-error", np.nan, ("p",)),
-        ("output-error", -0.05, ()), ("output-error", 0.4, ()),
-        ("filter-error", -0.3, ()), ("frequency-error", -0.3, ()),
-    ],
-)  # fmt: skip
-def test_flights_held_out_are_held_against_their_mean_by_output_error_alone(method, vaf, worse):
-    """Gusts and an unstable machine make a simulation in time what it is with the others."""
-    metrics = {"p": SimpleNamespace(vaf=vaf)}
-    fitted: Any = SimpleNamespace(method=method, validation=metrics, held_out_frequency=None)
-    assert Fit.held_out_worse.fget(fitted) == worse  # pyright: ignore[reportOptionalCall]
-
-
-def test_what_stopped_before_an_optimum_was_not_judged():
-    stopped = Adequacy(True, False, (), limited="some of it", at_optimum=False)
-    assert stopped.summary == "not judged"
-    written = fit_content.adequacy(stopped)
-    assert written["adequate"] is None
-    assert written["summary"] == "not judged"
-    # Nor is it where it looks bad: the numbers there are those of no model.
-    assert stopped.doubted(["p is off"]).summary == "not judged"
+    ("vaf", "worse"), [(-0.3, True), (np.nan, True), (-0.05, False), (0.4, False)]
+)
+def test_flights_held_out_are_held_against_their_mean(vaf, worse):
+    found = worse_than_mean({"p": SimpleNamespace(vaf=vaf)})
+    assert [(f.subjects, f.denies) for f in found] == worse * [(("p",), True)]

@@ -53,8 +53,8 @@ def test_a_search_that_has_not_moved_did_not_converge(monkeypatch):
     monkeypatch.setattr(multistart, "optimise", _stays)
     stuck = fit(problem)
     assert stuck.status == "not-converged"
-    [note] = [n for n in stuck.notes if "stuck" in n]
-    assert "windows" in note
+    [said] = [f for f in stuck.findings if f.code == "search.stuck"]
+    assert 0.0 < said.value <= 1.0
     assert SimpleNamespace(**{n: e.value for n, e in stuck.estimates.items()}) == SimpleNamespace(
         Lp=pytest.approx(-2.0), Lda=pytest.approx(9.0)
     )

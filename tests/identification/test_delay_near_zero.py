@@ -9,7 +9,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.estimates import delay_doubts, delay_notes
+from heli_jax.identification.uncertainty.estimates import delay_findings
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
 
@@ -80,27 +80,22 @@ def test_a_positive_delay_that_is_none_has_an_upper_limit(seed):
     assert tau.sd == pytest.approx(sd, rel=0.2)
     assert tau.upper95 == pytest.approx(tau.value + 1.96 * sd, rel=0.2)
     assert tau.upper95 < DT
-    told = [n for n in found.notes if "cannot be told from zero" in n]
+    told = [f for f in found.findings if f.code == "timing.delay-near-zero"]
     assert bool(told) == (tau.lower95 == 0.0)
-    if told:
-        assert f"below {tau.upper95:.3g} s" in told[0]
     assert abs(found.estimates["L"].value + 4.0) < 4 * found.estimates["L"].sd
 
 
 def test_a_delay_below_zero_is_told():
     flight = Flight(dt=DT, inputs={"d": STICK}, outputs={"p": STICK})
     problem = Problem(MODEL, START, [flight], {"tau": Free(0.03)})
-    for low, high, said in ((-0.05, -0.03, "is negative"), (-0.01, 0.002, "below 0.002 s")):
-        [note] = delay_notes(
-            problem, {"tau": Estimate(-0.04, 0.005, low, high, "s", 0.03, 0.0, False)}
-        )
-        assert said in note
-    assert (
-        delay_notes(problem, {"tau": Estimate(0.1, 0.01, 0.08, 0.12, "s", 0.03, 0.0, False)}) == []
-    )
-    # By more than a sample no hold explains it, and the model is not adequate.
-    clocks = "unless the clocks of stick and response differ"
-    doubt = f"by tau = -40 ms it answers before its input, {clocks}"
-    for high, doubts in ((-0.03, [doubt]), (-0.01, [])):
-        estimate = Estimate(-0.04, 0.005, -0.05, high, "s", 0.03, 0.0, False)
-        assert delay_doubts(problem, {"tau": estimate}) == doubts
+    for low, high, codes in (
+        (-0.05, -0.03, ["timing.delay-negative"]),
+        (-0.01, 0.002, ["timing.delay-near-zero"]),
+        (0.08, 0.12, []),
+    ):
+        estimate = Estimate(0.5 * (low + high), 0.005, low, high, "s", 0.03, 0.0, False)
+        found = delay_findings(problem, {"tau": estimate})
+        # Two logs whose clocks differ look like it, and then the other estimates are right.
+        assert [(f.code, f.severity, f.value) for f in found] == [
+            (code, "note", estimate.value) for code in codes
+        ]

@@ -13,7 +13,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
 from heli_jax.identification.frequency_start import frequency_error_start
 from heli_jax.identification.problem import MAX_TIME_SHIFT
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.estimates import bound_notes, with_limits
+from heli_jax.identification.uncertainty.estimates import with_limits
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
@@ -157,13 +157,17 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure(method):
     free = {"La": Free(-0.1, lower=-0.5), "K": Free(3.0)}
     found = fit(Problem(SUM, TRUTH, [FIRST], free, Nuisance(bias=False), method=method))
     assert found.status == "converged"
-    assert found.notes[0].startswith("La ended at its bound: the data want it beyond -0.5.")
+    bound = found.findings[0]
+    assert (bound.code, bound.subjects, bound.value) == ("fit.at-bound", ("La",), -0.5)
+    # What the others are is that of a bound which the data do not bear out.
+    assert "K" in found.untrusted
+    assert found.exit_code == 3
     assert "La is at its bound, -0.5" in found.verdict.text
     assert "determine La" not in found.verdict.text
     estimate = found.estimates["La"]
     assert estimate.at_bound
-    assert estimate.lower95 == -0.5
-    assert not any("stuck" in note for note in found.notes)
+    assert estimate.lower95 in (None, -0.5)
+    assert "search.stuck" not in {f.code for f in found.findings}
 
 
 def test_no_interval_of_a_time_shift_is_wider_than_its_search():
@@ -172,10 +176,6 @@ def test_no_interval_of_a_time_shift_is_wider_than_its_search():
     shift = Estimate(end, 0.18, 0.1, 0.85, "s", 0.0, 0.0, at_bound=True)
     found = with_limits({"time_shift": shift}, {"time_shift": (0.003, 1.26)})["time_shift"]
     assert (found.lower95, found.upper95) == (0.003, MAX_TIME_SHIFT)
-    [note] = bound_notes({"time_shift": found})
-    # No key widens that bound.
-    assert "widen the bound" not in note
-    assert "searched for no further" in note
 
 
 @pytest.mark.slow
@@ -213,8 +213,10 @@ def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate(method
     assert outputs_against_excitation(problem)["p"] > 0.01
     found = fit(problem)
     assert not found.adequate
-    assert "no output follows the inputs" in found.adequacy.summary
-    assert not any("somebody holds" in note for note in found.notes)
+    assert found.adequacy.by_chance
+    [none] = [f for f in found.findings if f.denies]
+    assert (none.code, none.severity) == ("excitation.no-output-follows", "refuse")
+    assert "loop.no-instrument" not in {f.code for f in found.findings}
     assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
 
 
@@ -230,5 +232,6 @@ def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
     )  # fmt: skip
     free = {"T1": Free(0.3), "K": Free(10.0)}
     found = fit(Problem(both, TRUTH, [record], free, Nuisance(bias=False)), starts=1)
-    assert not any("not finite" in note for note in found.notes)
-    assert any("The measured s never moves: its VAF is undefined" in n for n in found.notes)
+    [still] = [f for f in found.findings if f.code == "quality.never-moves"]
+    assert still.subjects == ("s",)
+    assert found.adequate

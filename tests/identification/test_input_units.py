@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight, Signal
 from heli_jax.flights.flight import Source
-from heli_jax.identification.validation.input_units import doubtful_inputs, wrong_units
+from heli_jax.identification.validation.input_units import doubtful_inputs
 
 N, DT, FULL = 500, 0.02, 0.5
 
@@ -28,24 +28,23 @@ def doubts(unit, si, per_full, off=1.5, stick="lat"):
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": read}, outputs={"p": p}, source=source)
     at_start = [("one", flight)], [{"p": start}], {"p": stick}
-    assert all(name == "lat" for name, _ in doubtful_inputs(*at_start))
-    return [f.sentence for f in wrong_units(*at_start)]
+    return doubtful_inputs(*at_start)
 
 
 @pytest.mark.parametrize("off", [0.5, 1.5])
 @pytest.mark.parametrize(
-    ("unit", "si", "per_full", "words"),
+    ("unit", "si", "per_full", "factor"),
     [
-        ("1", "1", 50.0, "'ail' looks like % read as plain numbers, with the effect of lat off by"),
-        ("%", "1", 0.5, "'ail' looks like plain numbers read as %"),
-        ("rad", "rad", np.degrees(FULL), "'ail' looks like deg read as rad"),
-        ("deg", "rad", FULL, "'ail' looks like rad read as deg"),
+        ("1", "1", 50.0, 0.01), ("%", "1", 0.5, 100.0),
+        ("rad", "rad", np.degrees(FULL), np.pi / 180.0), ("deg", "rad", FULL, 180.0 / np.pi),
     ],
-)
-def test_a_stick_in_another_unit_is_doubted(unit, si, per_full, words, off):
-    (said,) = doubts(unit, si, per_full, off)
-    assert words in said
-    assert "one: at the start values p moves" in said
+)  # fmt: skip
+def test_a_stick_in_another_unit_is_doubted(unit, si, per_full, factor, off):
+    [found] = doubts(unit, si, per_full, off)
+    assert (found.code, found.severity, found.denies) == ("units.in-doubt", "doubt", False)
+    assert found.subjects == ("lat",)
+    # How far p moves over what the start values make of the stick as it is read.
+    assert found.value == pytest.approx(factor / off, rel=0.05)
     # The effect of another stick is no evidence.
     assert doubts(unit, si, per_full, off, stick="lon") == []
 
@@ -66,4 +65,4 @@ def test_counts_that_a_model_is_made_for_are_no_per_cent():
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p}, source=source)
     for off in (0.2, 1.0, 5.0):
-        assert wrong_units([("one", flight)], [{"p": off * p}], {"p": "lat"}) == []
+        assert doubtful_inputs([("one", flight)], [{"p": off * p}], {"p": "lat"}) == []

@@ -10,7 +10,6 @@ import scipy.stats
 from heli_jax import Free, Prior, Problem, fit, models
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
-from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.identification.uncertainty.profile_likelihood import profile
 from tests.identification.bench import BENCH, record, vehicle
 
@@ -56,21 +55,6 @@ def test_the_profile_is_the_likelihood_of_the_others_at_their_best(white):
     assert found.deviance[1] == pytest.approx(lost, rel=0.05)
     assert np.all(np.diff(found.deviance[:3]) < 0)
     assert np.all(np.diff(found.deviance[2:]) > 0)
-
-
-def test_intervals_that_part_are_told_with_which_to_believe(white):
-    low, high = white.estimates["Ixx"].lower95, white.estimates["Ixx"].upper95
-    by = {"gaussian": (low, high), "profile": (low, high + 0.3 * (high - low))}
-    [said] = _sentences(white, {"Ixx": by}, None, None)
-    assert said.startswith("Ixx: profile differs from the Gaussian interval by more than 15 %")
-    assert "believe the profile" in said
-    [said] = _sentences(white, {"Ixx": by | {"profile": (low, np.inf)}}, None, None)
-    assert "to one side at most" in said
-    posterior = Posterior({}, 1.0, 1e4, 0)
-    [said] = _sentences(
-        white, {"Ixx": by | {"profile": (low, high), "nuts": (0.5 * low, high)}}, None, posterior
-    )
-    assert "NUTS is right if that prior is meant" in said
 
 
 @pytest.mark.slow

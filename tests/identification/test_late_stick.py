@@ -74,32 +74,37 @@ def problem(grid, *, shift=False, start=(-6.0, 20.0), filtered=False):
     return Problem(model, known, [flight], free, method="filter-error")
 
 
-def test_a_stick_that_is_late_is_no_plain_yes():
+def late_ones(found):
+    return [f for f in found.findings if f.code == "timing.late-input"]
+
+
+def test_a_stick_that_is_late_takes_the_interval_that_it_moves():
     found = fit(problem(1))
-    late = found.late_stick
-    assert late is not None
+    [late] = late_ones(found)
+    assert late.subjects == ("lat",)
     # Half of the logger's 20 ms on average, of the derivative at the optimum.
-    assert 0.005 < late.seconds < 0.014
-    assert "lat looks" in found.adequacy.summary
-    assert found.adequacy.summary.startswith("in size only")
-    assert found.interval == "95 % (stick late)"
-    [note] = [n for n in found.notes if "nuisance.time_shift: true, would move" in n]
-    assert "Lp by about" in note
+    assert 0.005 < late.value < 0.014
+    # True is -12: the shift is towards it.
+    lp = found.estimates["Lp"]
+    assert lp.value + late.shifts["Lp"] == pytest.approx(-12.0, rel=0.1)
+    assert abs(late.shifts["Lp"]) > 1.96 * lp.sd
+    assert found.distrusts["Lp"].shift == late.shifts["Lp"]
+    assert (lp.lower95, lp.upper95) == (None, None)
+    assert found.exit_code == 3
 
 
 def test_a_free_shift_leaves_what_each_step_was_late_by():
     found = fit(problem(1, shift=True))
     assert found.nuisance["time_shift"].value == pytest.approx(-0.01, abs=0.002)
-    assert found.late_stick is not None
-    assert found.late_stick.freed
-    assert "steps of lat fall between stamps" in found.adequacy.summary
-    assert found.interval == "95 % (stick late)"
+    [late] = [f for f in found.findings if f.code == "timing.steps-between-stamps"]
+    assert (late.severity, late.subjects) == ("note", ("lat",))
+    assert late.value == pytest.approx(0.01, abs=0.002)
 
 
 def test_a_stick_whose_steps_fall_on_samples_is_not():
     found = fit(problem(EVERY))
-    assert found.late_stick is None
-    assert found.adequacy.summary == "yes"
+    assert not late_ones(found)
+    assert found.exit_code == 0
     assert found.interval == "95 % interval"
     assert found.estimates["Lp"].value == pytest.approx(-12.0, rel=0.02)
 
@@ -107,21 +112,17 @@ def test_a_stick_whose_steps_fall_on_samples_is_not():
 @pytest.mark.slow
 @pytest.mark.parametrize("grid", [1, EVERY])
 def test_a_filter_says_it_too(grid):
-    late = fit(problem(grid, filtered=True)).late_stick
-    if grid == EVERY:
-        assert late is None
-    else:
-        assert late is not None
-        assert 0.004 < late.seconds < 0.016
+    late = late_ones(fit(problem(grid, filtered=True)))
+    assert len(late) == (grid != EVERY)
+    assert all(0.004 < one.value < 0.016 for one in late)
 
 
 def test_check_says_what_half_a_sample_of_the_stick_does():
-    [finding] = [
-        f for f in check(problem(1, start=(-14.0, 70.0))).findings if f.topic == "slow stick"
-    ]
+    found = check(problem(1, start=(-14.0, 70.0))).findings
+    [finding] = [f for f in found if f.code == "timing.slow-stick"]
     assert finding.severity == "doubt"
-    assert "lat moves in steps and was sampled at 50 Hz" in finding.sentence
-    assert "up to 20 ms late" in finding.sentence
+    # exp(Lp t) is as much off by 10 ms as Lp is by a tenth or two.
+    assert 0.1 < finding.value < 0.3
 
 
 def test_own_samples_of_a_slower_clock():

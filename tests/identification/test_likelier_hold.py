@@ -50,7 +50,7 @@ def test_an_input_is_held_where_the_record_says_so(tmp_path, held):
     asked, found = with_likelier_hold(problem, fit(problem), fit)
     taken = asked.flights[0].hold["da"]
     assert taken == ("zero-order" if held else "linear")
-    assert any("explains the record better" in note for note in found.notes) is held
+    assert ("timing.likelier-hold" in {f.code for f in found.findings}) is held
     for name, e in found.estimates.items():
         assert e.sd is not None
         assert e.value == pytest.approx(TRUTH[name], abs=3.5 * e.sd)

@@ -14,8 +14,8 @@ from heli_jax import models
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.identification.validation.late_angles import lateness
-from heli_jax.identification.validation.misread import clipped, dropouts, misread, record_doubts
-from heli_jax.identification.validation.signal_quality import facts_of
+from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
+from heli_jax.identification.validation.signal_quality import cut_off, facts_of
 from heli_jax.identification.validation.signal_signs import angle_over_rate
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
@@ -63,6 +63,14 @@ def flights(experiment):
     return read_flights(experiment)
 
 
+def denied(found):
+    """(code, subjects) of what shows that no model explains these flights."""
+    return [(f.code, f.subjects) for f in record_doubts(found) if f.denies]
+
+
+IN_DOUBT = ("units.in-doubt", ("p",))
+
+
 def of(found):
     """The parts of a problem that these questions ask for."""
     from heli_jax import linear_model
@@ -81,41 +89,35 @@ def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
 @pytest.mark.parametrize("size", [1.0, 20.0])
 def test_a_unit_against_that_of_the_file_is_doubted(load, size):
     found = of(flights(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s")))
-    first, *more = [one.finding.sentence for one in misread(found)]
-    assert "p is read as rad/s, as configured, where the file says 'deg/s' of 'p'" in first
-    assert "p is 57.3 times as large as it was" in first
-    assert len(more) == 1
-    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
+    assert [(f.code, f.subjects) for f in misread(found)] == [IN_DOUBT, IN_DOUBT]
+    assert denied(found) == [IN_DOUBT]
     # What is small either way is doubted, and no reason by itself.
     small = of(flights(load(0.1 * P, unit="deg/s", unit_of_p="rad/s")))
-    assert len(misread(small)) == 1
-    assert record_doubts(small).words == []
-    assert record_doubts(small).unsure == ["the file says 'deg/s' of p"]
+    [one] = misread(small)
+    assert (one.code, one.severity, one.denies) == ("units.in-doubt", "doubt", False)
     assert misread(of(flights(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s")))) == []
 
 
-def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_leaves_no_plain_yes(load):
+def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_is_only_doubted(load):
     fast = P * 12.0 / np.percentile(np.abs(P), 99)
-    doubts = record_doubts(of(flights(load(fast))))
-    assert doubts.words == []
-    assert doubts.unsure == ["p looks like deg/s read as rad/s"]
+    [one] = record_doubts(of(flights(load(fast))))
+    assert (one.code, one.subjects, one.denies) == (*IN_DOUBT, False)
+    assert one.value == pytest.approx(12.0, rel=1e-6)
 
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):
     found = of(flights(load(np.degrees(P))))
-    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
-    [one] = misread(found)
-    assert "state unit: deg/s" in one.finding.sentence
-    assert record_doubts(of(flights(load(P)))).words == []
+    assert denied(found) == [IN_DOUBT]
+    assert len(misread(found)) == 1
+    assert record_doubts(of(flights(load(P)))) == []
 
 
 def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
     found = of(flights(load(p)))
-    assert record_doubts(found).words == ["dropouts of p are taken for measurements"]
-    [one] = dropouts(found, facts(found))
-    assert "state missing: 0 beside its signal" in one.finding.sentence
+    assert denied(found) == [("quality.dropouts", ("p",))]
+    assert len(dropouts(found, facts(found))) == 1
     [flight] = flights(load(p, missing=0))
     assert np.isnan(flight.outputs["p"]).sum() == 20
     problem = of([flight])
@@ -136,12 +138,10 @@ def test_a_stick_that_drops_out():
 def test_flat_tops_are_no_measurements(load):
     rng = np.random.default_rng(2)
     noisy = P + 0.01 * rng.standard_normal(N)
-    for limit, reasons in ((0.4, ["p is cut off in "]), (np.inf, [])):
+    for limit, count in ((0.4, 1), (np.inf, 0)):
         problem = of(flights(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s")))
-        assert len(clipped(problem, facts(problem))) == len(reasons)
-        assert [
-            said[: len(reasons[0])] for said in record_doubts(problem).words if reasons
-        ] == reasons
+        assert len(cut_off([("one", *facts(problem))])) == count
+        assert [subjects for _, subjects in denied(problem)] == count * [("p",)]
 
 
 @pytest.mark.parametrize("every", [1, 10], ids=["every sample", "a tenth of them"])
@@ -158,7 +158,7 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
         "p": Signal("p", "rad/s", "rad/s"),
         "phi": Signal("phi", "rad", "rad"),
     }
-    for of_rate, sure in ((1.0, 0), (1 / 57.3, 1)):
+    for of_rate, sure in ((1.0, False), (1 / 57.3, True)):
         flight = Flight(
             dt=DT,
             inputs={"lat": U},
@@ -167,9 +167,9 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
         )
         problem = SimpleNamespace(training=[flight], model=linear_model("roll-flybarless").model)
         [found] = misread(problem)
-        assert "5.7" in found.finding.sentence
-        assert bool(found.words) is bool(sure)
-        assert ("upside down" in found.finding.sentence) is not bool(sure)
+        assert found.value == pytest.approx(5.7, rel=0.02)
+        assert found.denies is sure
+        assert found.code == ("units.in-doubt" if sure else "units.flown-or-degrees")
 
 
 @pytest.mark.skipif(not TREX.exists(), reason="the real logs are not at ../shared/data")
@@ -185,7 +185,7 @@ def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
 
 def test_the_shaft_of_a_motor_may_turn(load):
     found = of(flights(load(100.0 * P, unit_of_p="rad/s")))
-    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
+    assert denied(found) == [IN_DOUBT]
     [flight] = found.training
     renamed = dataclasses.replace(
         flight,

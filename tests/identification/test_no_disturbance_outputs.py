@@ -82,7 +82,7 @@ def fitted(seed: int, disturbance: float = 0.0):
 )
 def test_white_noise_of_four_outputs_has_no_disturbance(seed):
     found = fitted(seed)
-    assert any(note.startswith("No disturbance ") for note in found.notes)
+    assert "noise.no-disturbance" in {f.code for f in found.findings}
     assert found.nuisance["sigma_w"].value == 0.0
     assert found.status == "converged"
     for name, true in (("L", -2.0), ("B", 3.0)):
@@ -91,5 +91,5 @@ def test_white_noise_of_four_outputs_has_no_disturbance(seed):
 
 def test_a_disturbance_that_four_outputs_show_is_found():
     found = fitted(0, disturbance=0.5)
-    assert not any(note.startswith("No disturbance ") for note in found.notes)
+    assert "noise.no-disturbance" not in {f.code for f in found.findings}
     assert found.nuisance["sigma_w"].value == pytest.approx(0.5, rel=0.4)

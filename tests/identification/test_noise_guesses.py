@@ -70,11 +70,11 @@ def test_a_precise_output_does_not_have_all_the_say():
     assert found.status == "converged"
     assert found.estimates["w"].value == pytest.approx(W, rel=1e-3)
     assert found.estimates["b"].value == pytest.approx(1.0, rel=1e-3)
-    assert any("Weighing the outputs by their size" in note for note in found.notes)
+    assert "search.better-weights" in {f.code for f in found.findings}
 
 
 def test_what_is_explained_is_not_fitted_again():
     found = fit(problem(8, 4.1))
     assert found.estimates["w"].value == pytest.approx(W, rel=1e-3)
-    assert not any("Weighing" in note for note in found.notes)
+    assert "search.better-weights" not in {f.code for f in found.findings}
     assert found.steps <= 30

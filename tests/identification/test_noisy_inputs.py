@@ -73,9 +73,11 @@ def fitted(flight: Flight):
 
 def test_noise_of_a_sensor_is_said_with_what_it_does():
     found = fitted(record(felt=False))
-    assert "om is measured with noise, which moves Zo" in found.adequacy.summary
-    [note] = [n for n in found.notes if "om was measured, with a noise of 0.2" in n]
-    share = float(note.split("Zo by about ")[1].split(" %")[0]) / 100
+    [noisy] = [f for f in found.findings if f.code == "dynamics.noisy-input"]
+    assert noisy.subjects == ("om",)
+    # The motion itself is not all slow.
+    assert noisy.value == pytest.approx(NOISE, rel=0.2)
+    share = -noisy.shifts["Zo"] / found.estimates["Zo"].value
     # Of six records like this the mean of Zo is 0.83 % too small; a single one has an sd of 0.8 %.
     assert share == pytest.approx(-0.009, abs=0.004)
     one = found.estimates["Zo"]
@@ -85,7 +87,8 @@ def test_noise_of_a_sensor_is_said_with_what_it_does():
 @pytest.mark.parametrize("gain", [0.0, 3.0], ids=["open", "controller"])
 def test_noise_that_acts_is_none(gain):
     found = fitted(record(felt=not gain, gain=gain))
-    assert found.adequacy.summary == "yes"
+    assert not [f for f in found.findings if f.code == "dynamics.noisy-input"]
+    assert found.adequate
     for name, true in (("Zw", ZW), ("Zo", ZO)):
         one = found.estimates[name]
         assert abs(one.value - true) < 3.5 * one.sd

@@ -185,7 +185,7 @@ def test_a_slow_mode_leaves_the_offset_to_be_found():
     problem = Problem(slow, vehicle, [flight], {"Lp": Free(-1.0), "Ld": Free(5.0)})
     assert offset_inputs(problem) == ("d",)
     found = fit(problem)
-    assert found.adequacy.summary == "yes"
+    assert found.exit_code == 0
     for name, true in (("Lp", -3.0), ("Ld", 10.0)):
         one = found.estimates[name]
         assert abs(one.value - true) < 3.5 * one.sd

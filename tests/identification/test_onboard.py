@@ -12,7 +12,6 @@ from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.multistart import named_values
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.identification.validation.missing_dynamics import explained_by
 
 ROLL = linear_model("roll-flybarless")
 LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
@@ -68,7 +67,7 @@ def test_a_servo_and_two_delays_are_recovered():
         assert estimate.lower95 < value < estimate.upper95, name
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
-    assert not any("lacks dynamics" in note for note in found.notes)
+    assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
 
 @pytest.mark.slow
@@ -83,8 +82,8 @@ def test_a_servo_that_is_left_out_is_named():
     assert absorbed == pytest.approx(2.0 * ZETA / OMEGA, abs=4e-3)
     assert found.metrics["p"].vaf > 0.99
     assert not found.white
-    (note,) = (note for note in found.notes if "lacks dynamics" in note)
-    assert "lat still explains" in note
+    [left] = [f for f in found.findings if f.code == "dynamics.residual-follows-input"]
+    assert left.subjects == ("p", "lat")
     # Five starts, since a delay is free; all of them arrive.
     assert len(found.starts) == 5
     assert len({row.start["delay_lat"] for row in found.starts}) == 5
@@ -109,20 +108,3 @@ def test_the_starts_differ_in_the_delays_alone():
     np.testing.assert_allclose(
         sorted(row["delay_phi"] for row in rows), [0.02, 0.05, 0.1, 0.2, 0.4]
     )
-
-
-def test_noise_and_a_disturbance_are_not_taken_for_missing_dynamics():
-    said = 0
-    for seed in range(100):
-        rng = np.random.default_rng(seed)
-        u = np.repeat(rng.uniform(-1.0, 1.0, 60), 10)
-        # A disturbance: a lag of half a second driven by noise.
-        w = scipy.signal.lfilter([1.0], [1.0, -0.96], rng.standard_normal(600))
-        one = explained_by(w + 0.5 * rng.standard_normal(600), u, 0.02)
-        said += one.p_value < 1e-3
-    # One in a thousand is expected.
-    assert said <= 2
-    late = np.concatenate([np.zeros(4), u[:-4]])
-    one = explained_by(w + 2.0 * (late - u), u, 0.02)
-    assert one.p_value < 1e-9
-    assert explained_by(np.full(600, np.nan), u, 0.02) is None

@@ -18,6 +18,10 @@ from heli_jax.simulation.inputs import random_steps
 N, DT = 600, 0.02
 
 
+def of(found, code):
+    return [f for f in found.findings if f.code == code]
+
+
 class Params(NamedTuple):
     L: Annotated[Scalar, "1/s", "damping"]
     B: Annotated[Scalar, "1/s^2", "effectiveness"]
@@ -67,18 +71,24 @@ def test_noise_that_two_outputs_share_is_not_counted_twice():
     free = {"L": Free(-1.0), "B": Free(2.0)}
     found = fit(problem(record(0, 0.05, 1e-4), **free))
     assert found.coloured
-    assert any("correlated" in note for note in found.notes)
+    [one] = of(found, "noise.outputs-correlated")
+    assert len(one.subjects) == 1
     for e in found.estimates.values():
         assert e.sd == pytest.approx(2**0.5 * e.sd_white, rel=0.2)
     apart = fit(problem(record(0, 0.0, 0.05), **free))
-    assert not any("correlated" in note for note in apart.notes)
+    assert not of(apart, "noise.outputs-correlated")
 
 
 def test_an_estimate_that_leaves_its_prior_is_told():
     found = fit(problem(record(1, 0.0, 0.02), L=Free(-2.0, prior=Prior(-3.0, 0.1)), B=Free(2.0)))
-    assert any(note.startswith("L lies") and "contradict" in note for note in found.notes)
+    [one] = of(found, "fit.prior-contradicted")
+    assert (one.severity, one.subjects, found.untrusted) == ("doubt", ("L",), ("L",))
+    assert one.value == pytest.approx(abs(found.estimates["L"].value + 3.0) / 0.1)
+    assert found.estimates["L"].lower95 is None
+    assert found.exit_code == 3
     agreed = fit(problem(record(1, 0.0, 0.02), L=Free(-2.0, prior=Prior(-2.1, 0.1)), B=Free(2.0)))
-    assert not any("contradict" in note for note in agreed.notes)
+    assert not of(agreed, "fit.prior-contradicted")
+    assert agreed.exit_code == 0
 
 
 def test_an_effect_that_ends_with_the_other_sign_is_told():
@@ -87,12 +97,12 @@ def test_an_effect_that_ends_with_the_other_sign_is_told():
     free = {"L": Free(-1.0), "B": Free(2.0, sign="any")}
     found = fit(problem(turned, **free))
     assert found.estimates["B"].value == pytest.approx(-3.0, rel=0.1)
-    [note] = [n for n in found.notes if "the other sign than the start's" in n]
-    assert note.startswith("B (2 to -")
-    assert not any("the other sign" in n for n in fit(problem(flight, **free)).notes)
+    [one] = of(found, "signs.turned-from-start")
+    assert (one.severity, one.subjects) == ("note", ("B",))
+    assert not of(fit(problem(flight, **free)), one.code)
     # Next to zero a start says nothing of a sign.
     free["B"] = Free(0.1, sign="any")
-    assert not any("the other sign" in n for n in fit(problem(turned, **free)).notes)
+    assert not of(fit(problem(turned, **free)), one.code)
 
 
 def unknowns(*names: str, **priors: float) -> tuple[Unknown, ...]:
@@ -122,10 +132,9 @@ def test_who_takes_a_small_part_is_not_called_determined():
 
 
 def test_what_rests_on_its_prior_is_not_called_determined_by_the_data():
-    sensitivity = np.array([[1.0, 0.0], [0.0, 50.0]])
-    verdict = analyse(sensitivity, unknowns("a", "B", a=100.0))
+    verdict = analyse(np.array([[1.0, 0.0], [0.0, 50.0]]), unknowns("a", "B", a=100.0))
     assert "The data determine B." in verdict.text
-    assert "a rests on its prior" in verdict.text
+    assert verdict.prior_share["a"] > 0.99
 
 
 def test_parameters_that_are_correlated_as_a_group_have_one_sentence():
@@ -211,10 +220,15 @@ def test_a_time_shift_up_to_the_end_of_its_search_is_known_only_roughly():
         assert (where in verdict.text) == bool(said)
 
 
-def test_an_input_whose_unit_is_in_doubt_is_named_in_the_first_line():
+def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():
     flight = record(1, 0.0, 0.02)
     percent = {"d": 100.0 * flight.inputs["d"] / np.max(np.abs(flight.inputs["d"]))}
     source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
     read = Flight(dt=DT, inputs=percent, outputs=dict(flight.outputs), source=source)
     found = fit(problem(read, L=Free(-1.0), B=Free(2.0)))
-    assert "the unit of d is in doubt" in found.adequacy.summary
+    [one] = of(found, "units.in-doubt")
+    assert one.subjects == ("d",)
+    # Per cent or not, L is the same; B is a hundredth or not.
+    assert found.untrusted == one.distrusts == ("B",)
+    assert found.estimates["L"].lower95 is not None
+    assert found.exit_code == 3

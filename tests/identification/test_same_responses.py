@@ -150,4 +150,4 @@ def test_a_filter_begun_on_the_wrong_side_finds_the_right_one(flight):
         e = found.estimates[name]
         assert e.sd is not None, name
         assert abs(e.value - true) < 4.0 * e.sd, name
-    assert any("answer the inputs alike" in note for note in found.notes)
+    assert "search.same-responses" in {f.code for f in found.findings}

@@ -103,13 +103,15 @@ def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
         assert one.upper95 - one.value == pytest.approx(one.value - one.lower95, rel=1e-6)
 
 
-def test_a_signal_that_is_turned_is_no_plain_yes():
+def test_a_signal_that_is_turned_is_a_doubt():
     turned = Flight(dt=DT, inputs={"d": -FLIGHT.inputs["d"]}, outputs=FLIGHT.outputs)
     free = {"Ld": Free(10.0), "Nd": Free(-2.0)}
     right, wrong = fit(problem(free)), fit(problem(free, record=turned))
-    assert right.adequacy.summary == "yes"
-    assert wrong.adequacy.adequate
-    assert wrong.adequacy.summary != "yes"
+    doubts = [
+        [f for f in one.findings if f.code == "signs.turned-from-start"] for one in (right, wrong)
+    ]
+    assert doubts[0] == []
+    assert [(f.severity, f.subjects) for f in doubts[1]] == [("doubt", ("Ld", "Nd"))]
     assert wrong.estimates["Ld"].value == pytest.approx(-right.estimates["Ld"].value, rel=1e-4)
 
 
@@ -122,7 +124,7 @@ def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
     for name in ("Lp", "Ld"):
         one = found.estimates[name]
         assert abs(one.value - TRUTH[name]) < 4 * one.sd
-    assert any("diverges at the start values" in note for note in found.notes)
+    assert "search.by-windows" in {f.code for f in found.findings}
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from heli_jax.identification.validation.turned_sensors import turned_sensors
 N, DT = 2000, 0.02
 
 
-def said(degrees, seed, *, size=0.4, noise=0.03):
+def turn(degrees, seed, *, size=0.4, noise=0.03):
     """Of a flight in roll, pitch and yaw by the kinematics of Euler angles alone."""
     rng = np.random.default_rng(seed)
     smooth = np.ones(40) / 40
@@ -34,18 +34,18 @@ def said(degrees, seed, *, size=0.4, noise=0.03):
     inputs = {n: np.zeros(N) for n in ("lat", "lon", "ped", "col")}
     flight = Flight(dt=DT, inputs=inputs, outputs=outputs)
     problem = Problem(shipped.model, shipped.vehicle({}).params, [flight], {"Lb": Free(100.0)})
-    return [f.sentence for f in turned_sensors(problem)]
+    found = turned_sensors(problem)
+    assert all(f.code == "signs.sensors-askew" for f in found)
+    return [f.value for f in found]
 
 
 @pytest.mark.parametrize("degrees", [6.0, -10.0])
 def test_a_gyro_that_is_mounted_askew_is_told(degrees):
     for seed in range(5):
-        (words,) = said(degrees, seed)
-        turned = float(words.split("turned by ")[1].split(" deg")[0])
-        assert turned == pytest.approx(degrees, abs=1.5)
+        assert turn(degrees, seed) == [pytest.approx(degrees, abs=1.5)]
 
 
 def test_one_that_is_straight_is_not():
     for seed in range(15):
-        assert said(0.0, seed) == []
-        assert said(1.0, seed, noise=0.2) == []
+        assert turn(0.0, seed) == []
+        assert turn(1.0, seed, noise=0.2) == []

@@ -12,10 +12,9 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.identification.validation.adequacy import Adequacy, by_responses
+from heli_jax.identification.validation.adequacy import by_responses
 from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
-from heli_jax.identification.validation.unmodelled import Unmodelled, with_unmodelled
 
 N, DT = 1500, 0.02
 
@@ -105,14 +104,12 @@ def with_dry_friction(u):
     return out
 
 
-def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0, seen=slice(None)):
+def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0):
     rng = np.random.default_rng(seed)
     u = steps(rng)
     disturbed = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal(N)) * coloured
     p = made(u) + noise * rng.standard_normal(N) + disturbed
-    measured = np.full(N, np.nan)
-    measured[seen] = p[seen]
-    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": measured})
+    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p})
     return fit(
         Problem(
             roll, Params(-3.0, 15.0), [flight], {"Lp": Free(-3.0), "Ll": Free(15.0)}, method=method
@@ -120,13 +117,19 @@ def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0, seen=slice(None)):
     )
 
 
-def test_what_was_not_asked_leaves_no_plain_yes():
-    some = np.flatnonzero(np.random.default_rng(8).random(N) < 0.5)
-    right = fitted(lambda u: linear(np.array([[-4.0]]), np.array([[20.0]]), u), "output-error",
-                   seen=some)  # fmt: skip
-    assert right.adequacy.summary == (
-        "in size only (what p may lack was not asked, since samples are missing)"
-    )
+def misfit(found, code):
+    """The one finding of this code; it takes an interval away exactly where it moves the estimate
+    by more than half of it."""
+    [one] = [f for f in found.findings if f.code == code]
+    assert one.subjects[0] == "p"
+    assert one.value < 0.01
+    moved = {n: abs(by) > 1.96 * found.estimates[n].sd for n, by in one.shifts.items()}
+    assert (one.severity == "doubt") is any(moved.values())
+    for name, far in moved.items():
+        assert not far or name in found.untrusted
+        assert (found.estimates[name].lower95 is None) is (name in found.untrusted)
+    assert found.exit_code == (3 if found.untrusted else 0)
+    return one
 
 
 METHODS = ("output-error", "frequency-error", "frequency-response")
@@ -136,34 +139,25 @@ QUICK = [
 
 
 @pytest.mark.parametrize("method", QUICK)
-def test_a_mode_that_is_left_out_leaves_no_plain_yes(method):
+def test_a_mode_that_is_left_out_takes_the_intervals_that_it_moves(method):
     # Its residual is white, or nearly, and holds a few per cent of the output's power.
     found = fitted(with_payload, method, noise=0.3)
     assert found.status == "converged"
-    assert found.adequacy.summary.startswith("in size only")
-    assert "the residual of p still follows lat near" in found.adequacy.summary
-    (note,) = (n for n in found.notes if "follows lat through a mode" in n)
-    assert "Several starts" in note
-    assert "No interval allows" in note
+    assert misfit(found, "dynamics.residual-follows-input").subjects == ("p", "lat")
+    assert found.exit_code == 3
 
 
 @pytest.mark.parametrize("method", QUICK)
 def test_a_saturation_that_is_left_out_is_named(method):
     found = fitted(saturated, method, noise=0.02)
-    assert "the response of p depends on amplitude" in found.adequacy.summary
-    assert any("a saturation, a rate limit, a deadband" in note for note in found.notes)
+    misfit(found, "dynamics.depends-on-amplitude")
+    assert found.exit_code == 3
 
 
-def test_play_of_a_linkage_is_no_plain_yes():
-    # Powers of stick and response do not see it: the residual is whatever the stick came from.
-    found = fitted(through_play, "output-error", noise=0.02)
-    assert "the response of p depends on amplitude" in found.adequacy.summary
-
-
-@pytest.mark.parametrize("made", [to_one_side, with_dry_friction])
-def test_a_stick_that_does_more_to_one_side_and_dry_friction_are_no_plain_yes(made):
-    found = fitted(made, "output-error", noise=0.02)
-    assert "the response of p depends on amplitude" in found.adequacy.summary
+# Powers of stick and response do not see play: the residual is whatever the stick came from.
+@pytest.mark.parametrize("made", [through_play, to_one_side, with_dry_friction])
+def test_play_of_a_linkage_one_side_and_dry_friction_are_named(made):
+    misfit(fitted(made, "output-error", noise=0.02), "dynamics.depends-on-amplitude")
 
 
 @pytest.mark.slow
@@ -175,18 +169,20 @@ def test_a_flight_with_a_stick_of_another_scale_is_named():
         flights.append(Flight(dt=DT, inputs={"lat": scale * u}, outputs={"p": p}, name=name))
     free = {"Lp": Free(-3.0), "Ll": Free(15.0)}
     found = fit(Problem(roll, Params(-3.0, 15.0), flights, free))
-    assert "the response of p differs between two and the others" in found.adequacy.summary
+    one = misfit(found, "dynamics.flights-differ")
+    assert one.subjects == ("p", "two", "the others")
+    assert "Ll" in found.untrusted
 
 
 @pytest.mark.parametrize("method", QUICK)
-def test_a_machine_that_changes_over_the_record_leaves_no_plain_yes(method):
+def test_a_machine_that_changes_over_the_record_is_told(method):
     def slows_down(u):
         """p of a rotor that loses a fifth of its moment steadily."""
         return linear(np.array([[-4.0]]), np.array([[20.0]]), u * np.linspace(1.1, 0.9, N))
 
     found = fitted(slows_down, method, noise=0.02)
-    assert "the response of p changes over the record" in found.adequacy.summary
-    assert any("Fit shorter windows" in note for note in found.notes)
+    misfit(found, "dynamics.changes-over-record")
+    assert "Ll" in found.untrusted
 
 
 @pytest.mark.parametrize("coloured", [0.0, 0.02])
@@ -195,10 +191,8 @@ def test_nothing_is_missed_of_a_right_model(method, coloured):
     found = fitted(
         lambda u: linear(np.array([[-4.0]]), np.array([[20.0]]), u), method, coloured=coloured
     )
-    assert found.adequate
-    assert not found.adequacy.limited
-    if method != "output-error" or not coloured:
-        assert found.adequacy.summary == "yes"
+    assert found.exit_code == 0
+    assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
 
 def drawn(rng, noise):
@@ -296,31 +290,10 @@ def test_records_too_short_are_not_asked():
     assert lines_of(e, np.ones((40, 1)), np.ones((40, 1))) is None
 
 
-def lacking(moved, by_amplitude=False):
-    return Unmodelled("p", "lat", by_amplitude, 6.0, 0.1, 1e-6, 40.0, {"Lp": moved})
-
-
-def test_what_moves_no_estimate_is_said_and_takes_nothing_off_a_yes():
-    yes = Adequacy(True, False, ())
-    small = with_unmodelled(yes, (lacking(0.1),))
-    assert small.summary == "yes"
-    assert "moves no estimate by more than 0.5 sd" in small.sentences[0]
-    assert with_unmodelled(yes, (lacking(-2.0),)).summary.startswith("in size only (the residual")
-    # A response that depends on amplitude changes what the estimates mean.
-    assert with_unmodelled(yes, (lacking(0.1, True),)).summary != "yes"
-    assert with_unmodelled(yes, ()) is yes
-
-
-def test_chances_have_no_digits_where_they_are_none_to_speak_of():
-    # The tail of the F distribution is known to no such digits.
-    assert "p below 1e-6)" in lacking(0.1)._replace(p_value=2e-63).sentence
-    assert "p 0.0031)" in lacking(0.1)._replace(p_value=0.0031).sentence
-
-
-def test_squared_errors_of_responses_above_their_interval_are_no_plain_yes():
+def test_squared_errors_of_responses_above_their_interval_are_said():
     said = []
     for chi_squared in (1.0, 1.9, 2.1):
         found = by_responses(ResponseAgreement((), chi_squared, 0.75, 1.3, 100.0, 8.0, (), (), ()))
         assert found is not None
-        said.append(found.summary.split(" (")[0])
-    assert said == ["yes", "in size only", "no"]
+        said.append([(f.severity, f.value, f.denies) for f in found.findings])
+    assert said == [[], [("note", 1.9, False)], [("doubt", 2.1, True)]]

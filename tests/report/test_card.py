@@ -4,9 +4,8 @@ import dataclasses
 import math
 
 import numpy as np
-import pytest
 
-from heli_jax.identification.validation.adequacy import CHANCE, Adequacy
+from heli_jax.finding import Finding
 from heli_jax.report.card import card, failed, shown, summary
 from heli_jax.report.tables import prior_note
 
@@ -60,38 +59,15 @@ def test_what_is_not_determined_fails(not_identifiable):
     assert "failed: " in summary(card(problem, fit))
 
 
-NO = Adequacy(False, False, ())
-
-
-@pytest.mark.parametrize(
-    ("adequacy", "words"),
-    [
-        (NO, "no"),
-        (NO.doubted(["p looks like deg/s read as rad/s"]), "no: p looks like deg/s read as rad/s"),
-        (NO._replace(doubts=(CHANCE,), by_chance=True), f"no: {CHANCE}"),
-        (NO.doubted(["a (in b)", "c"]), "no: a (in b); c"),
-    ],
-)
-def test_a_card_is_never_passed_beside_a_no(sound, adequacy, words):
+def test_a_card_is_never_passed_beside_a_no(sound):
     fit, problem, _ = sound
-    lines = card(problem, dataclasses.replace(fit, adequacy=adequacy))
-    assert [(g.what, shown(g)) for g in failed(lines)] == [("adequacy", words)]
-    asked = len([g for g in lines if g.passed is not None])
-    assert summary(lines) == (
-        f"{asked - 1} of {asked} gates passed; failed: adequacy of the model ({words})"
-    )
-
-
-def test_what_is_adequate_with_a_remark_has_it_on_the_card(sound):
-    fit, problem, _ = sound
-    limited = fit.adequacy._replace(limited="the response of p depends on amplitude")
-    [line] = [
-        g for g in card(problem, dataclasses.replace(fit, adequacy=limited)) if g.of == "the model"
+    against = [
+        Finding("units.in-doubt", "doubt", "", brief=words, denies=True)
+        for words in ("a (in b)", "c")
     ]
-    assert (line.passed, shown(line)) == (
-        True,
-        "in size only: the response of p depends on amplitude",
-    )
+    lines = card(problem, dataclasses.replace(fit, findings=tuple(against)))
+    assert [(g.what, shown(g)) for g in failed(lines)] == [("adequacy", "no: a (in b); c")]
+    assert "failed: adequacy" in summary(lines)
 
 
 def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heli_jax import cli, compare_runs
+from heli_jax import cli, compare_runs, load_fit
 from heli_jax.errors import InputError
 from heli_jax.report import compared_page
 
@@ -52,7 +52,7 @@ def write_run(
         "intervals": None,
         "metrics": {"p": METRICS},
         "validation": {},
-        "notes": [],
+        "findings": [],
         "data": [{"flight": "flight 1", "hold_out": False, "sha256": folder.name[:1]}],
     } | more
     (folder / "fit.json").write_text(json.dumps(content))
@@ -114,7 +114,7 @@ def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window
 
 
 def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
-    summary = "in size only (the residual of p still follows lat)"
+    summary = "no (VAF of p is 20.0 %)"
     limited = {"adequacy": {"summary": summary}, "residuals": {"overconfident": True}}
     a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)}, **limited)
     b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)})
@@ -124,11 +124,12 @@ def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
 
 
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
-    sentence = "Not to be trusted: Ixx (closed loop without an instrument)."
+    sentence = "Not trusted: Ixx (closed loop without an instrument)."
+    brief = "closed loop without an instrument"
+    untrusted = {"Ixx": {"code": "loop.no-instrument", "shift": None, "brief": brief}}
     a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
-    b = write_run(
-        tmp_path / "b", {"Ixx": (0.03, 0.001)}, untrusted=["Ixx"], distrust=sentence, adequate=False
-    )
+    against = {"untrusted": untrusted, "distrust": sentence, "adequate": False}
+    b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)}, **against)
     compared = compare_runs([a, b])
     assert compared.verdicts.rows[1][4] == f"The data determine all. {sentence}"
     assert f"b: {sentence}" in compared.notes
@@ -204,6 +205,41 @@ def test_wrong_runs_end_in_a_sentence(
     assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(InputError, match="two runs"):
         compare_runs([tmp_path / "a"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"parameters": {"Ixx": 3}},
+        {"parameters": {"Ixx": {"value": "1e"}}},
+        {"metrics": {"p": {"vaf": []}}},
+        {"data": [{"flight": "flight 1", "sha256": "a", "window": 3}, 7]},
+        {"data": 7},
+        {"verdict": "all"},
+        {"notes": None},
+        {"untrusted": 5},
+        {"determined_combinations": [3]},
+        {"residuals": [1]},
+    ],
+)
+def test_a_damaged_run_ends_in_a_sentence(tmp_path: Path, change: dict[str, object]) -> None:
+    good = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
+    bad = write_run(tmp_path / "b", {"Ixx": (0.02, 0.001)}, **change)
+    with pytest.raises(InputError):
+        compare_runs([good, bad])
+    with pytest.raises(InputError):
+        compare_runs([bad, good])
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [b"", b"flight,time\n\n", b"flight,time,p\na,1\n", b"flight,time,p\na,x,y\n", b"\xff"],
+)
+def test_damaged_signals_end_in_a_sentence(tmp_path: Path, signals: bytes) -> None:
+    run = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)})
+    (run / "signals.csv").write_bytes(signals)
+    with pytest.raises(InputError):
+        load_fit(run)
 
 
 def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None:

@@ -5,8 +5,9 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
-from distributed import CancelledError
+from distributed import CancelledError, Client, LocalCluster, wait
 from distributed.comm.core import CommClosedError
 
 from heli_jax import models, sweep
@@ -27,6 +28,7 @@ def pids(client):
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing(bench30, record):
     pytest.importorskip("distributed")
+    pytest.importorskip("cryptography")
     from heli_jax.sweeps.cluster import connected
 
     design = sobol({"Ixx": Range(0.02, 0.05), "a": Range(4.0, 6.0)}, 600)
@@ -34,6 +36,13 @@ def test_a_worker_that_dies_costs_nothing(bench30, record):
     options = {"chunk": 32, "lanes": 16}
     alone = sweep(ROLL, bench30, record, design, reduce, **options)
     with connected(workers=2) as client:
+        # Of the scheduler, each worker and each nanny one, all encrypted, and none of HTTP.
+        of_all = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = [c.laddr for p in of_all for c in p.net_connections() if c.status == "LISTEN"]
+        assert len(listening) == 5
+        for at in listening:
+            with pytest.raises((OSError, CommClosedError)):
+                Client(f"tcp://{at.ip}:{at.port}", timeout=1)
         killed = []
 
         def kill(progress):
@@ -80,7 +89,11 @@ def test_what_dask_says_ends_in_one_sentence(error, words):
         raise RuntimeError("another")
 
 
-def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch):
+@pytest.mark.parametrize("state", [None, "paused"])
+def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch, state):
+    class Future:
+        status = "finished"
+
     class Running:
         """Tasks that wait for a worker."""
 
@@ -94,25 +107,45 @@ def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch):
             return bool(self.done)
 
         def __next__(self):
-            return self.done.pop()
+            return Future(), self.done.pop()
 
     class Scheduler:
-        """Its workers by time; the last look finds none."""
+        """Its workers by time; the last look finds none, or one that is short of memory."""
 
         def __init__(self, *looks):
             self.looks = list(looks)
 
-        def nthreads(self):
-            return self.looks.pop(0) if self.looks else {}
+        def scheduler_info(self):
+            there = {} if state is None else {"tcp://a": {"status": state}}
+            return {"workers": self.looks.pop(0) if self.looks else there}
 
     monkeypatch.setattr(cluster, "_ALONE_S", 0.2)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.05)
-    scheduler = Scheduler({}, {}, {"tcp://a": 1})
+    busy = {"status": "paused", "metrics": {"task_counts": {"executing": 1}}}
+    scheduler = Scheduler({}, {"tcp://a": busy}, {"tcp://a": {"status": "running"}})
     ended = cluster._as_they_end(scheduler, Running(["a", "b"]))
-    assert [next(ended), next(ended)] == ["b", "a"]
-    with pytest.raises(InputError, match=r"no worker for \d+ s.*--resume goes on"):
+    assert [next(ended)[1](), next(ended)[1]()] == ["b", "a"]
+    with pytest.raises(InputError, match=r"\d+ s.*--resume"):
         next(ended)
     assert scheduler.looks == []
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_result_whose_worker_has_died_is_not_waited_for_without_end(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "_ALONE_S", 1.0)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
+    local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    with local, Client(local) as client:
+        future = client.submit(int, 7)
+        wait(future)
+        # Done there, and gone with the worker before it is fetched.
+        local.scale(0)
+        while client.scheduler_info()["workers"]:
+            pass
+        with pytest.raises(InputError):
+            list(cluster._as_they_end(client, cluster._gathered([future])))
 
 
 @pytest.mark.slow

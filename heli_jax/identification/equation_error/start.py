@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.dynamics.model import Model, needed_but_missing
+from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error import errors, records
 from heli_jax.identification.equation_error.first_guess import (
@@ -137,9 +137,7 @@ def _setup(
     for flight in flights:
         # Generic numbers stand for what is free, so that NaN is left only where a constant that
         # somebody has to give is missing.
-        missing = needed_but_missing(model, model.Params(**{**base, **some, **flight.known}))
-        if missing:
-            raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
+        require_constants(model, model.Params(**{**base, **some, **flight.known}))
     # One structure a flight: what is measured may differ from flight to flight, and with it which
     # states are shown.
     structures = []

@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.multistart import gauss_newton_gain
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
@@ -85,11 +86,12 @@ def unless_stuck(
     share = gain_left(r, J, len(layout.free), at_bound)
     if share is None:
         return optimum
-    note = (
+    words = (
         "The optimiser is stuck: by their slopes a modest step of the unknowns would take away "
         f"{percent(share, 0)} of the squares, and it went no further. So it is where a simulation "
         "grows by orders of magnitude, or parameters have a wrong sign. Remedy: windows (multiple "
         "shooting), a shorter record, or other starts. What the data determine is not known there."
     )
     best = optimum.best._replace(converged=np.asarray(False))
-    return optimum._replace(best=best, notes=(note, *optimum.notes))
+    stuck = Finding("search.stuck", "doubt", words, share, "part of the squares")
+    return optimum._replace(best=best, notes=(stuck, *optimum.notes))

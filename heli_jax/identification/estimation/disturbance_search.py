@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
+from heli_jax.finding import note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.measured_signals import measured_count
@@ -218,8 +219,11 @@ def _from_nested(
     notes = ()
     if other > NO_DISTURBANCE:
         notes = (
-            "The first search ended in a worse optimum, below what the model without a disturbance "
-            "reaches: this fit was begun anew from that model's parameters.",
+            note(
+                "search.begun-anew",
+                "The first search ended in a worse optimum, below what the model without a "
+                "disturbance reaches: this fit was begun anew from that model's parameters.",
+            ),
         )
     return again._replace(trace=(*optimum.trace, *again.trace), notes=notes), other
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.measured_signals import (
@@ -429,16 +430,13 @@ class Estimator(abc.ABC):
         """
         return None
 
-    def notes(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
-    ) -> list[str]:
+    def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
         """What a reader should know of the method's own assumptions.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that `e` was evaluated with.
-            e: at the optimum.
+            at: the optimum.
+            e: the evaluation there.
+            names: of the flights.
             ill: whether it is ill-conditioned.
         """
         return []

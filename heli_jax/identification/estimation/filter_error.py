@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import Model
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.disturbed_records import disturbed_records
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
@@ -258,21 +259,34 @@ class FilterError(Estimator):
             or ratios.max() > _DIGITS
         )
 
-    def notes(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
-    ) -> list[str]:
+    def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
         """What is wrong with the filter, and the remedy."""
         if ill:
-            return [_ILL + (_of_noiseless(data) or _OF_LITTLE_NOISE)]
-        if layout.concentrated:
+            words = _ILL + (_of_noiseless(at.data) or _OF_LITTLE_NOISE)
+            return [Finding("search.ill-conditioned", "doubt", words)]
+        if at.layout.concentrated:
             return []
-        size = float(np.sqrt(innovation_sums(e, noise)[0] / measured_count(data)))
+        size = float(np.sqrt(innovation_sums(e, at.noise)[0] / measured_count(at.data)))
         # The intervals are too narrow, or too wide, by the same factor.
         if 0.8 < size < 1.25:
             return []
-        return [
+        words = (
             f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
             "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
+        )
+        brief = "the fixed noise is not that of the record"
+        criterion = "innovations over what is expected, 0.8 to 1.25"
+        everything = at.layout.of_interest
+        return [
+            Finding(
+                "noise.innovations-size",
+                "doubt",
+                words,
+                size,
+                criterion,
+                brief=brief,
+                distrusts=everything,
+            )
         ]
 
 

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import least_share
@@ -311,23 +312,20 @@ class FrequencyError(Estimator):
         """None that is counted: a smooth spectrum, and that of each candidate model its own."""
         return 0
 
-    def notes(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
-    ) -> list[str]:
+    def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
         """How much of flights with missing samples is used, where models were linearised, and what
         there is not by instrument.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that `e` was evaluated with.
-            e: at the optimum.
+            at: the optimum.
+            e: the evaluation there.
+            names: of the flights.
             ill: whether it is ill-conditioned.
         """
         return [
-            *cut_notes(layout, data),
-            *linearisation_notes(layout, data, noise, e),
-            *instrument_notes(data),
+            *cut_notes(at.layout, at.data, names),
+            *linearisation_notes(at, e, names),
+            *instrument_notes(at.data),
         ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:

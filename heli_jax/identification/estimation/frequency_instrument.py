@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.errors import nearest
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations
@@ -203,7 +204,7 @@ def inputs_by_instrument(data: Data) -> tuple[str, ...]:
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
 
 
-def instrument_notes(data: Data) -> list[str]:
+def instrument_notes(data: Data) -> list[Finding]:
     """What there is not of an estimate by instrument.
 
     Args:
@@ -211,8 +212,9 @@ def instrument_notes(data: Data) -> list[str]:
     """
     if data.flights[0].by_instrument is None:
         return []
-    return [
+    words = (
         f"By instrument ({', '.join(inputs_by_instrument(data))}): the estimates solve equations "
         "and have no likelihood, so that there is no AIC or BIC; a profile is that of the "
         "equations' sum of squares, which has the same limits."
-    ]
+    )
+    return [note("frequency.by-instrument", words, *inputs_by_instrument(data))]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from heli_jax.analysis.trim import Condition
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import FEWEST, SHORTEST, spans
 from heli_jax.identification.unknowns.layout import Data, Layout
@@ -132,12 +133,13 @@ def other_outputs(flights: Sequence[Flight]) -> str | None:
     return None
 
 
-def cut_notes(layout: Layout, data: Data) -> list[str]:
+def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]:
     """By flight that was cut, how much of it is used.
 
     Args:
         layout: says which parts there are.
         data: with sample times and lengths.
+        names: of the flights.
     """
     notes = []
     for i, (flight, facts) in enumerate(zip(data.flights, layout.of_flights, strict=True)):
@@ -149,9 +151,10 @@ def cut_notes(layout: Layout, data: Data) -> list[str]:
         dt = float(flight.dt)
         lacking = [name for name, y in flight.outputs.items() if not np.isfinite(y).all()]
         several = len(data.flights) > 1
-        notes.append(
-            f"{f'Flight {i + 1}' if several else 'The flight'} was cut where samples of "
+        words = (
+            f"{names[i] if several else 'The flight'} was cut where samples of "
             f"{', '.join(lacking)} are missing: {used * dt:.4g} of {n * dt:.4g} s are used, in "
             f"{len(parts)} {'parts' if len(parts) > 1 else 'part'} with ends of their own."
         )
+        notes.append(note("frequency.flight-cut", words, *lacking))
     return notes

@@ -5,6 +5,7 @@ is an error of the linear model that no noise explains, and moves the estimates 
 outputs does.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,20 +18,17 @@ from heli_jax import naming
 from heli_jax.analysis.mean_flight import flown
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.linearised import linearised, point
+from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import driven
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, unpack
 from heli_jax.simulation.simulate import simulate
 
 # Params, State and Inputs are a model's own classes: they are annotated Any.
 
-_DOUBTFUL = 0.05
-"""of an output's motion, above which what the linear model leaves out of it is doubtful"""
-_MOVED = 1.0
-"""standard deviations by which it moves an estimate, above which that is"""
 _TOLD = 0.3
 """standard deviations from which on an estimate is named"""
 _TIMES = 3.0
@@ -65,38 +63,44 @@ class _LeftOut(NamedTuple):
     rest: bool
 
 
-def linearisation_notes(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> list[str]:
+def linearisation_notes(at: Solution, e: Evaluation, names: Sequence[str]) -> list[Finding]:
     """By flight where its model was linearised, how far the flight goes from there, and how much
     of the motion that leaves out; then what that does to the estimates.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: that `e` was evaluated with.
-        e: at the optimum.
+        at: the optimum.
+        e: the evaluation there.
+        names: of the flights.
     """
+    layout, data, noise, _ = at
     if layout.model.linear:
         return []
     z = jnp.asarray(e.z)
     left = [_flight(layout, data, z, i) for i in range(len(data.flights))]
-    notes = [_note(layout, data, i, flight) for i, flight in enumerate(left)]
+    notes = [
+        note("frequency.linearised", f"{names[i]}: {_note(layout, data, i, flight)}", names[i])
+        for i, flight in enumerate(left)
+    ]
     moved = _moved(layout, data, noise, e, left)
     if moved is None:
         return notes
+    sds = dict(zip(layout.of_interest, deviations(e.J) * np.abs(e.slopes), strict=False))
     notable = {n: v for n, v in moved.items() if abs(v) >= _TOLD}
-    words = ", ".join(f"{n} by {v:+.2g}" for n, v in notable.items())
-    notes.append(
-        f"What the linear model leaves out moves {words} standard deviations."
-        if notable
-        else f"What the linear model leaves out moves no estimate by {_TOLD} standard deviations."
-    )
+    words = ", ".join(f"{n} by {v:+.2g}" for n, v in notable.items()) or "no estimate by 0.1"
     share = max(float(np.max(flight.share)) for flight in left)
-    if share > _DOUBTFUL or max(map(abs, moved.values())) > _MOVED:
-        notes.append(
-            "Linearisation is doubtful: no interval allows for that; expected smaller inputs, or "
-            "method: output-error with start: frequency-error."
-        )
-    return notes
+    return [
+        *notes,
+        Finding(
+            "dynamics.linearised",
+            "note",
+            f"What the linear model leaves out moves {words} standard deviations. Use smaller "
+            "inputs, or method: output-error with start: frequency-error.",
+            share,
+            "part of an output's motion that the linear model leaves out",
+            shifts={n: float(v * sds[n]) for n, v in moved.items()},
+            brief="the linearised model leaves out a part of the motion",
+        ),
+    ]
 
 
 @eqx.filter_jit
@@ -194,7 +198,7 @@ def _note(layout: Layout, data: Data, i: int, left: _LeftOut) -> str:
         where = f"the trim {flown(condition)}"
     elif left.rest:
         where = "the equilibrium at the mean of its inputs"
-    said = f"Flight {i + 1}: linearised about {where}; {_reach(layout, data, i)}. "
+    said = f"linearised about {where}; {_reach(layout, data, i)}. "
     if not np.isfinite(left.share).all():
         return said + "A simulation from there is not finite: how far that holds is not known."
     runs = "a run" if left.samples == n else f"runs of {left.samples * dt:.2g} s from there"

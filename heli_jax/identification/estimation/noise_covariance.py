@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -63,14 +64,14 @@ class RelaxedOptimum(NamedTuple):
     """(steps, cost) of every round of the optimiser"""
     ratio: float | None = None
     """twice the log-likelihood that a disturbance gained, where that was asked"""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     """what a reader should know of how the optimum was reached"""
     absent: tuple[str, ...] = ()
     """the parameters of those of several disturbances that do not show"""
     as_likely: tuple[OtherValues, ...] = ()
     """other values of the free parameters that explain the record as well"""
 
-    def after(self, earlier: "RelaxedOptimum", *notes: str) -> "RelaxedOptimum":
+    def after(self, earlier: "RelaxedOptimum", *notes: Finding) -> "RelaxedOptimum":
         """The same with the rounds and notes of an earlier one before its own."""
         return self._replace(
             trace=(*earlier.trace, *self.trace), ratio=earlier.ratio, notes=(*earlier.notes, *notes)
@@ -133,16 +134,18 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     return RelaxedOptimum(best, noise, (*trace, *rounds), notes=notes)
 
 
-def _not_settled(best: Optimum, rounds: int) -> tuple[str, ...]:
+def _not_settled(best: Optimum, rounds: int) -> tuple[Finding, ...]:
     """In words that a spectrum still moved the optimum in the last of all its rounds."""
     moved = float(best.moved)
     if rounds < _ROUNDS_OF_SPECTRA or not bool(best.converged) or not _SETTLED <= moved < np.inf:
         return ()
-    return (
+    words = (
         f"The noise's spectrum had not settled after {rounds} rounds, which are all there are: the "
         f"last one moved the estimates by {moved**0.5:.2g} joint standard deviations, and further "
-        "ones may move them on, by several times as much together.",
+        "ones may move them on, by several times as much together."
     )
+    limit = f"joint standard deviations, {_SETTLED**0.5:.2g}"
+    return (Finding("search.noise-not-settled", "doubt", words, moved**0.5, limit),)
 
 
 def _alternated(
@@ -280,9 +283,12 @@ def better_of_two_guesses(
         return optimum._replace(trace=(*optimum.trace, *other.trace))
     return other.after(
         optimum,
-        "Weighing the outputs by their size first led to a better optimum than the noise of their "
-        f"differences did (log-likelihood {second:.1f} for {first:.1f}): this fit is the better "
-        "one.",
+        note(
+            "search.better-weights",
+            "Weighing the outputs by their size first led to a better optimum than the noise of "
+            f"their differences did (log-likelihood {second:.1f} for {first:.1f}): this fit is the "
+            "better one.",
+        ),
     )
 
 

@@ -9,7 +9,7 @@ from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
-from heli_jax.numerics.stored import stored
+from heli_jax.numerics.jitted import jitted
 
 _DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
 """by which the coarse search moves sigma_w"""
@@ -127,7 +127,7 @@ def noise_guesses_by_tau(
     return [jnp.asarray(best[i], z0.dtype) for i in np.argsort(costs.min(axis=1))]
 
 
-@stored
+@jitted
 def costs_at(
     layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
 ) -> Float[Array, " s"]:

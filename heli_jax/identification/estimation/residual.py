@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.jacobian_coloring import seeded, spread_
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import SimulatedOutputs, outputs_of
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
-from heli_jax.numerics.stored import stored
+from heli_jax.numerics.jitted import jitted
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
@@ -70,7 +70,7 @@ class ResidualAndJacobian(NamedTuple):
     """what output error simulates on its way; None where nothing is simulated"""
 
 
-@stored
+@jitted
 def differentiate(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:

@@ -18,6 +18,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
+from heli_jax.finding import note
 from heli_jax.identification.estimation.disturbance_search import (
     NO_DISTURBANCE,
     begun_at,
@@ -98,7 +99,7 @@ def better_of_same_responses(search: Search, optimum: RelaxedOptimum) -> Relaxed
                 "alike: begun from these the filter found a better optimum (log-likelihood "
                 f"{other:.1f} for {likelihood:.1f}), and this fit is the better one."
             )
-            again, best = best, again.after(best, said)
+            again, best = best, again.after(best, note("search.same-responses", said))
             other, likelihood = likelihood, other
         if other > likelihood - _AS_LIKELY:
             best = best._replace(as_likely=_other_values(search, again, best, likelihood - other))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
+from heli_jax.finding import note
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation
@@ -30,9 +31,10 @@ _PER_STATE = 5
 _STEPS = 60
 """of the optimiser over the windows: what has not arrived by then is only a start"""
 
-SAID = (
+BY_WINDOWS = note(
+    "search.by-windows",
     "The simulation diverges at the start values, so the parameters were first fitted to short "
-    "windows of the record (multiple shooting), and the fit began from there."
+    "windows of the record (multiple shooting), and the fit began from there.",
 )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
-from heli_jax.numerics.stored import stored
+from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.delays import Delays, at, delays_of
 from heli_jax.simulation.simulate import Trajectory, simulate
 
@@ -223,7 +223,7 @@ def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
     return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
 
 
-@stored
+@jitted
 def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
     """What is simulated at z, without any derivative.
 

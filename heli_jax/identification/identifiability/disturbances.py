@@ -3,10 +3,12 @@
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.directions import projected
 from heli_jax.identification.unknowns.layout import Layout
 
+_EXCHANGEABLE = "identifiability.disturbances-exchangeable"
 _NULL = 1e-4
 """part of the largest singular value of columns of equal size below which a direction is open: a
 factor of e changes the likelihood by less than a hundred-millionth of what one parameter would"""
@@ -20,7 +22,7 @@ _VAGUE = 0.7
 """sd of a logarithm, a factor of two, below which a correlated parameter is known all the same"""
 
 
-def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -> list[str]:
+def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -> list[Finding]:
     """Sentences about those parameters of several disturbances that the data do not determine.
 
     Args:
@@ -41,7 +43,11 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
     norms = np.linalg.norm(J[:, at], axis=0)
     shown = norms > _NO_EFFECT
     notes = [
-        f"{n} changes nothing in these data and cannot be estimated."
+        note(
+            "identifiability.disturbance-without-effect",
+            f"{n} changes nothing in these data and cannot be estimated.",
+            n,
+        )
         for n, seen in zip(names, shown, strict=True)
         if not seen
     ]
@@ -51,7 +57,7 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
 
 def _of_columns(
     names: list[str], rows: Float[np.ndarray, "n k"], norms: Float[np.ndarray, " k"]
-) -> list[str]:
+) -> list[Finding]:
     """The same where every parameter has an effect.
 
     Args:
@@ -66,19 +72,31 @@ def _of_columns(
     _, sizes, right = np.linalg.svd(rows / norms)
     open_ = sizes < _NULL * max(sizes[0], 1e-300)
     if open_.any():
-        return [
-            "Exchangeable without a trace in these data: "
-            + " and ".join(n for n, w in zip(names, v, strict=True) if abs(w) > _TAKES_PART)
-            + ". Disturb one place less, or fix one of them."
+        together = [
+            tuple(n for n, w in zip(names, v, strict=True) if abs(w) > _TAKES_PART)
             for v in right[open_]
+        ]
+        return [
+            note(
+                _EXCHANGEABLE,
+                f"{' and '.join(those)} are exchangeable in these data. Disturb one place less, or "
+                "fix one of them.",
+                *those,
+            )
+            for those in together
         ]
     # The unknowns are logarithms, so these sds are relative and one limit serves sizes and times.
     covariance = (right.T / sizes**2) @ right / np.outer(norms, norms)
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sds, sds)
     return [
-        f"{a} and {b} are hardly told apart (correlation {correlation[i, j]:+.2f}): disturb one "
-        "place less, or fix one of them."
+        note(
+            _EXCHANGEABLE,
+            f"{a} and {b} are hardly told apart (correlation {correlation[i, j]:+.2f}): disturb "
+            "one place less, or fix one of them.",
+            a,
+            b,
+        )
         for i, a in enumerate(names)
         for j, b in enumerate(names[:i])
         if abs(correlation[i, j]) > _TOGETHER and min(sds[i], sds[j]) > _VAGUE

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.sensor_noise import sensor_noise
+from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.sensitivity import references_of, unknowns_of
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
@@ -107,7 +108,7 @@ def _searched(name: str, ends: tuple[float, float]) -> tuple[float, float]:
     return low, high
 
 
-def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[str]:
+def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[Finding]:
     """Which intervals are those of the likelihood, by name lower and upper end."""
     if not limits:
         return []
@@ -116,10 +117,11 @@ def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[str]:
         if len(limits) == 1
         else ("intervals of " + ", ".join(limits) + " are")
     )
-    return [
+    words = (
         f"The {those} by the profile likelihood: it is not quadratic here, and the standard "
         "deviations alone would claim too much. More excitation would make them narrower."
-    ]
+    )
+    return [note("uncertainty.profile-interval", words, *limits)]
 
 
 def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
@@ -153,96 +155,99 @@ def _unit(problem: Problem, name: str) -> str:
     return naming.unit(problem.model.Params, name) or ""
 
 
-def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
-    """Where an estimate ended at its bound."""
+def bound_findings(estimates: dict[str, Estimate]) -> list[Finding]:
+    """Estimates that ended at their bounds: all estimates are those of a bound that the data do not
+    bear out."""
     return [
-        f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. Its interval "
-        "ends there and does not hold, and the other estimates are those of a bound that the data "
-        f"do not bear out. Remedy: {_remedy(name)}."
+        Finding(
+            "fit.at-bound",
+            "doubt",
+            f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. "
+            + (
+                # No key widens that one.
+                "Mend what makes the data want that: an input or an output of another column or "
+                "sign, or two logs whose clocks differ."
+                if name == "time_shift"
+                else "Widen the bound, or mend what makes the data want that."
+            ),
+            estimate.value,
+            "the bound",
+            (name,),
+            brief=f"{name} is at its bound",
+            distrusts=tuple(estimates),
+        )
         for name, estimate in estimates.items()
         if estimate.at_bound
     ]
 
 
-def _remedy(name: str) -> str:
-    if name == "time_shift":
-        # No key widens that one.
-        return (
-            "it is searched for no further, so mend what makes the data want that: an input or an "
-            "output of another column or sign, or two logs whose clocks differ"
-        )
-    return "widen the bound, or mend what makes the data want that"
+def delay_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Finding]:
+    """Delays, and the shift of the inputs, that may be none, or are negative.
 
-
-def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
-    """Where a delay may be none, or is negative.
+    A negative one makes up for an input that was logged late: the other estimates are right with
+    it.
 
     Args:
         problem: its model says which parameters are delays.
-        estimates: of the free parameters.
+        estimates: of interest, by name.
     """
-    notes = []
-    for name in problem.model.delay_parameters:
+    findings = []
+    for name in (*problem.model.delay_parameters, "time_shift"):
         estimate = estimates.get(name)
         if estimate is None or estimate.lower95 is None or estimate.upper95 is None:
             continue
+        value, limit = estimate.value, "seconds"
         if estimate.upper95 < 0:
-            notes.append(
-                f"{name} is negative: its signal acts before the log has it. The clocks of inputs "
-                "and outputs differ (two logs on one clock: also.align), or the input does "
-                "something else between samples than was stated (hold)."
+            words = (
+                f"{name} is {1e3 * value:.3g} ms: the response comes before the log has its input. "
+                "The input is logged late, or the clocks of inputs and outputs differ (two logs on "
+                "one clock: also.align)."
             )
-        elif estimate.lower95 <= 0:
-            notes.append(
+            findings.append(Finding("timing.delay-negative", "note", words, value, limit, (name,)))
+        elif estimate.lower95 <= 0 and name != "time_shift":
+            words = (
                 f"{name} cannot be told from zero: with 95 % probability it is below "
                 f"{estimate.upper95:.3g} s."
             )
-    return notes
-
-
-def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
-    """Delays by which the model answers before its input, by more than a sample of every flight.
-
-    Within a sample that may be how the input was held; beyond it no machine does so, but two logs
-    whose clocks differ look like it.
-
-    Args:
-        problem: its model says which parameters are delays.
-        estimates: of the free parameters.
-    """
-    sample = max(f.dt for f in problem.training)
-    delays = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
-    return [
-        f"by {n} = {1e3 * e.value:.3g} ms it answers before its input, unless the clocks of stick "
-        "and response differ"
-        for n, e in delays
-        if e.upper95 is not None and e.upper95 < -sample
-    ]
+            findings.append(Finding("timing.delay-near-zero", "note", words, value, limit, (name,)))
+    return findings
 
 
 FAR = 3.0
 """standard deviations of a prior at which an estimate contradicts it"""
 
 
-def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
-    """Where an estimate has left its prior."""
-    notes = []
+def prior_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Finding]:
+    """Estimates that have left their priors."""
+    findings = []
     for name, estimate in estimates.items():
         prior = problem.free[name].prior
         if prior is None:
             continue
         away = abs(estimate.value - prior.mean) / prior.sd
         if away > FAR:
-            notes.append(
-                f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and priors "
-                "contradict each other, and the interval does not know it."
+            words = (
+                f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and prior "
+                "contradict each other. Check the prior, and what was measured."
             )
-    return notes
+            findings.append(
+                Finding(
+                    "fit.prior-contradicted",
+                    "doubt",
+                    words,
+                    away,
+                    f"standard deviations of the prior, {FAR:g}",
+                    (name,),
+                    brief=f"{name} contradicts its prior",
+                    distrusts=(name,),
+                )
+            )
+    return findings
 
 
 def extreme_noise_notes(
     layout: Layout, data: Data, z: Float[Array, " q"], absent: tuple[str, ...] = ()
-) -> list[str]:
+) -> list[Finding]:
     """Where a parameter of the disturbance ran to the end of what a record can show.
 
     Args:
@@ -265,20 +270,25 @@ def extreme_noise_notes(
             (False, False): "in this record the disturbance cannot be told from a random walk",
         }.get((name in layout.sigmas, at <= low), "the record bounds it to one side at most")
         unit = naming.unit(layout.model.Params, name) or ""
-        notes.append(f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}.")
+        words = f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}."
+        notes.append(note("noise.disturbance-open", words, name))
     return notes
 
 
-def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
+def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[Finding]:
     """Where the estimated noise, sd by 'flight/output', is not the stated one."""
     notes = []
     for flight, label in zip(problem.training, labels(problem.training), strict=True):
         for name, stated in flight.sd.items():
             ratio = sds[f"{label}/{name}"] / stated
             if not 0.5 < ratio < 2.0:
-                notes.append(
+                words = (
                     f"{label}: the residual of {name} has {ratio:.2g} times the stated noise; the "
                     "intervals go by the residual."
+                )
+                limit = "residual over stated noise, 0.5 to 2"
+                notes.append(
+                    Finding("noise.not-as-stated", "note", words, ratio, limit, (label, name))
                 )
     return notes
 

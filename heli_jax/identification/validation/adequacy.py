@@ -9,21 +9,22 @@ flights in that region). A model is called inadequate only where it misses that 
 leaves more than a fifth of what is not white noise unexplained, twice what the gate allows.
 Between the two there is doubt, and the same advice. White
 residuals are adequate whatever the VAF: then all that is left is measurement noise.
-Enough explained with residuals that are not white is adequate in size only, and is said so.
 With filter error the simulation does not know the disturbance, so it is judged against what the
 estimated disturbance lets expect.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding, note
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
+    GATE,
     OutputAdequacy,
     Record,
     advice_for,
@@ -37,6 +38,8 @@ from heli_jax.numerics.white_noise import white_part
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
+NOT_EXPLAINED, UNEXPLAINED = "adequacy.output-not-explained", "adequacy.output-unmoved"
+BY_CHANCE = "adequacy.by-chance"
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
 NEARLY_WHITE = 0.1
@@ -51,118 +54,20 @@ three standard deviations where the disturbance is so slow that the record holds
 
 
 class Adequacy(NamedTuple):
-    """Whether a model is adequate, why not, and what to do."""
+    """How well the fitted outputs are explained, and what speaks against the model."""
 
-    adequate: bool
-    less_than_mean: bool
-    """whether some output is followed worse than by its mean"""
-    # Its name is a key of fit.json.
-    judged: tuple[OutputAdequacy, ...]
-    reasons: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    """what looks bad and is as expected"""
-    unexplained: tuple[str, ...] = ()
-    """the outputs of which the model explains no more than chance does of noise, though their
-    residuals are white and others carry the fit"""
-    doubts: tuple[str, ...] = ()
-    """what forbids to call it adequate, however well it fits"""
+    # The names of the fields but `findings` are keys of fit.json.
+    judged: tuple[OutputAdequacy, ...] = ()
+    findings: tuple[Finding, ...] = ()
     by_chance: bool = False
     """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
-    limited: str = ""
-    """what keeps an adequate model from a plain yes beside residuals that are not white"""
-    at_optimum: bool = True
-    """whether the optimiser arrived"""
     ahead: float | None = None
     """[s] that is predicted at most where that, and no simulation, was judged"""
 
-    def doubted(self, doubts: Sequence[str]) -> "Adequacy":
-        """The same with such doubts, each in a few words: not adequate where there is one."""
-        doubts = (*self.doubts, *doubts)
-        return self._replace(adequate=False, doubts=doubts) if doubts else self
-
-    def only_if(self, words: Sequence[str]) -> "Adequacy":
-        """The same, no plain yes where there are such reasons, each in a few words."""
-        return self._replace(limited="; ".join([*filter(None, [self.limited]), *words]))
-
     @property
-    def unjudged(self) -> bool:
-        """Whether the optimiser stopped before an optimum: how a model looks there says nothing."""
-        return not self.at_optimum
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether some output misses the card's gate, though not by far."""
-        return any(output.doubtful for output in self.judged)
-
-    @property
-    def coloured(self) -> tuple[str, ...]:
-        """The outputs whose residuals (innovations) are not white."""
-        return tuple(output.output for output in self.judged if not output.white)
-
-    @property
-    def summary(self) -> str:
-        """`yes`, `in size only (the residuals of p are not white)`, `not judged`, or
-        `no (VAF of p is -41.0 %, less than its mean)`."""
-        if self.unjudged:
-            return "not judged"
-        if self.adequate:
-            limited = [self.limited] if self.limited else []
-            left = "; ".join([*limited, *(self._left_over if self.coloured else [])])
-            words = f"in size only ({left})" if left else "yes"
-            if self.one_step_only:
-                left = "; ".join([*limited, *self._left_over, *self._simulated_worse])
-                words = f"one step ahead only ({left})"
-            if self.unexplained:
-                words += f", but nothing of {' and '.join(self.unexplained)} is explained"
-            return words
-        bad = [output for output in self.judged if not output.adequate]
-        words = list(self.doubts) + [
-            f"VAF of {output.output} is {vaf_text(output.vaf)}"
-            + (", less than its mean" if output.vaf < 0 else "")
-            for output in bad
-        ]
-        return f"no ({'; '.join(words)})" if words else "no"
-
-    @property
-    def one_step_only(self) -> tuple[str, ...]:
-        """The outputs that an adequate model predicts one step ahead (filter error), though driven
-        by the inputs alone it follows them worse than their mean does."""
-        # Of what is predicted further ahead the VAF is no simulation's, and a remark gives it.
-        if self.ahead is not None:
-            return ()
-        return tuple(o.output for o in self.judged if o.disturbed_below_mean)
-
-    @property
-    def _simulated_worse(self) -> list[str]:
-        return [
-            f"VAF of {o.output}, simulated, is {vaf_text(o.vaf)}, less than its mean"
-            for o in self.judged
-            if o.disturbed_below_mean
-        ]
-
-    @property
-    def _left_over(self) -> list[str]:
-        """What keeps an adequate model from a plain yes."""
-        filtered = any(output.against_disturbance is not None for output in self.judged)
-        what = "innovations" if filtered else "residuals"
-        coloured = [f"the {what} of {', '.join(self.coloured)} are not white"]
-        words = coloured if self.coloured else []
-        # Between what is adequate and what the acceptance card asks for.
-        return words + [
-            f"VAF of {output.output} is {vaf_text(output.vaf)}"
-            for output in self.judged
-            if output.doubtful
-        ]
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """For the notes of a fit."""
-        return (*self.reasons, *self.advice, *self.remarks)
-
-
-UNJUDGED = Adequacy(True, False, ())
-"""what a Fit has that nobody judged"""
+    def denied(self) -> bool:
+        """True if a finding shows that the model does not explain the record."""
+        return any(f.denies for f in self.findings)
 
 
 class Evidence(NamedTuple):
@@ -209,63 +114,66 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     doubted = [*bad, *(output for output in outputs if output.doubtful)]
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
     apart = len(doubted) < len(outputs)
-    advice = [
-        text
-        for output in doubted
-        for text in advice_for(problem, output, evidence.records, unstable, apart)
-    ]
+    findings = []
+    for output in doubted:
+        # One remedy, the most telling.
+        ways = advice_for(problem, output, evidence.records, unstable, apart)[:1]
+        findings.append(_not_explained(output, evidence.ahead, ways))
     return Adequacy(
-        not bad,
-        # Written so that a VAF that is no number counts as less than the mean.
-        any(not output.vaf >= 0 for output in bad),
         outputs,
-        tuple(_reason(output, evidence.ahead) for output in bad),
-        tuple(dict.fromkeys(advice)),
         (
+            *findings,
             *_as_expected(outputs, evidence.ahead),
             *(_unexplained(output) for output in unexplained),
             *(_stays(n) for n in evidence.agreement if _still(n, evidence.records)),
         ),
-        tuple(output.output for output in unexplained),
         ahead=evidence.ahead,
     )
 
 
-def by_responses(
-    agreement: ResponseAgreement | None, simulated: Mapping[str, Metrics] | None = None
-) -> Adequacy | None:
+def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
     """Whether a model is adequate to measured frequency responses: by the squared errors over their
     variance, which gusts do not change, while a simulation in time knows nothing of gusts.
 
     Args:
         agreement: of the model's responses with the measured ones; None where none were fitted.
-        simulated: by output the model driven by the inputs alone.
     """
     if agreement is None:
         return None
-    misfit = (agreement.misfit,) if agreement.misfit else ()
-    if agreement.doubt:
-        remarks, doubts = agreement.sentences, (agreement.doubt,)
-        less = any(m.vaf < 0 for m in (simulated or {}).values())
-        return Adequacy(False, less, (), misfit, remarks=remarks, doubts=doubts)
-    return Adequacy(
-        True, False, (), remarks=(*misfit, *agreement.sentences), limited=agreement.limit
-    )
+    findings = [note("frequency.left-out", s) for s in agreement.sentences]
+    if agreement.misfit:
+        criterion = f"95 %: {agreement.lower95:.3g} to {agreement.upper95:.3g}"
+        misfit = Finding(
+            "adequacy.response-errors",
+            "doubt" if agreement.doubt else "note",
+            agreement.misfit,
+            agreement.chi_squared,
+            criterion,
+            brief=agreement.doubt,
+            denies=bool(agreement.doubt),
+        )
+        findings.insert(0, misfit)
+    return Adequacy((), tuple(findings))
 
 
-def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[str]:
+def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[Finding]:
     """What looks bad and is what the estimated disturbance makes."""
     if ahead is not None:
         vafs = ", ".join(f"{output.output} {vaf_text(output.vaf)}" for output in outputs)
-        return [
+        words = (
             "No simulation of the model can follow the record, since it is unstable over its "
             "length or the disturbance moves it beyond where it is nearly linear: it is judged by "
             f"predictions up to {ahead:g} s ahead from the filter's state (VAF: {vafs})."
-        ]
+        )
+        return [note("adequacy.judged-ahead", words)]
     return [
-        f"Driven by the inputs alone, the model follows {output.output} worse than its mean does "
-        f"(VAF {vaf_text(output.vaf)}), as the estimated disturbance lets expect. If none acted, "
-        "are the columns, signs and units the right ones?"
+        note(
+            "adequacy.disturbance-hides",
+            f"Driven by the inputs alone, the model follows {output.output} worse than its mean "
+            f"does (VAF {vaf_text(output.vaf)}), as the estimated disturbance lets expect. If none "
+            "acted, are the columns, signs and units the right ones?",
+            output.output,
+        )
         for output in outputs
         if output.disturbed_below_mean
     ]
@@ -309,26 +217,32 @@ def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
     return bool(scipy.special.chdtrc(unknowns, max(gain, 0.0)) >= _BY_CHANCE)
 
 
-def _unexplained(output: OutputAdequacy) -> str:
+def _unexplained(output: OutputAdequacy) -> Finding:
+    name = output.output
     if output.against_disturbance is not None:
-        return (
-            f"The model explains nothing of {output.output}: simulated VAF "
+        words = (
+            f"The model explains nothing of {name}: simulated VAF "
             f"{vaf_text(output.vaf)}, and one step ahead the filter predicts it hardly "
             "better than its mean or the sample before. Either nothing moves it, or what "
             "the log has there is noise or vibration."
         )
-    return (
-        f"The model explains nothing of {output.output} (VAF {vaf_text(output.vaf)}), no "
-        "more than as many unknowns explain of noise alone; the other outputs carry the fit. Its "
-        "residuals are white: either the inputs do not move it, or what the log has there is no "
-        "measurement."
-    )
+    else:
+        words = (
+            f"The model explains nothing of {name} (VAF {vaf_text(output.vaf)}), no "
+            "more than as many unknowns explain of noise alone; the other outputs carry the fit. "
+            "Its residuals are white: either the inputs do not move it, or what the log has there "
+            "is no measurement."
+        )
+    return Finding(UNEXPLAINED, "doubt", words, output.vaf, "VAF", (name,))
 
 
-def _stays(name: str) -> str:
-    return (
+def _stays(name: str) -> Finding:
+    return Finding(
+        "quality.never-moves",
+        "doubt",
         f"The measured {name} never moves: its VAF is undefined, and nothing of it is judged. Is "
-        "it the right column, and does the sensor work?"
+        "it the right column, and does the sensor work?",
+        subjects=(name,),
     )
 
 
@@ -339,18 +253,20 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
     words = " and ".join(f"{output.output} (VAF {vaf_text(output.vaf)})" for output in outputs)
-    return Adequacy(
-        False,
-        False,
-        tuple(output._replace(adequate=False) for output in outputs),
-        (
-            f"The response does not stand out of the noise in {words}: as many unknowns explain "
-            "as much of noise alone.",
-        ),
-        ("Use larger or more inputs, a longer record, or an output with less noise.",),
-        doubts=(CHANCE,),
-        by_chance=True,
+    found = Finding(
+        BY_CHANCE,
+        "refuse",
+        f"The response does not stand out of the noise in {words}: as many unknowns explain "
+        "as much of noise alone. Use larger or more inputs, a longer record, or an output with "
+        "less noise.",
+        max(o.vaf for o in outputs),
+        "VAF",
+        tuple(o.output for o in outputs),
+        brief=CHANCE,
+        denies=True,
     )
+    outputs = tuple(output._replace(adequate=False) for output in outputs)
+    return Adequacy(outputs, (found,), by_chance=True)
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
@@ -404,7 +320,27 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
+def _not_explained(output: OutputAdequacy, ahead: float | None, ways: list[str]) -> Finding:
+    vaf = f"VAF of {output.output} is {vaf_text(output.vaf)}"
+    if output.adequate:
+        words = f"{vaf}, below {percent(GATE, 0)}, and its residuals are not white."
+        code, severity = "adequacy.below-gate", "note"
+    else:
+        code, severity, words = NOT_EXPLAINED, "doubt", _reason(output, ahead)
+    return Finding(
+        code,
+        severity,
+        " ".join([words, *ways]),
+        output.vaf,
+        f"VAF, {GATE:g}",
+        (output.output,),
+        brief=f"{vaf}, less than its mean" if output.vaf < 0 else vaf,
+        denies=not output.adequate,
+    )
+
+
 def _reason(output: OutputAdequacy, ahead: float | None) -> str:
+    """Why an output is not explained."""
     name, vaf, ratio = output.output, output.vaf, output.against_disturbance
     if ahead is not None:
         return (

@@ -52,12 +52,6 @@ class FastMode(NamedTuple):
     turning: tuple[tuple[str, float], ...] = ()
     """those that can, whether it shows or not, each with the factor that takes it there"""
 
-    @property
-    def words(self) -> str:
-        """What it is, in a few words."""
-        where = "past" if self.frequency >= self.nyquist else "near"
-        return f"{self.flight} has a mode {where} its Nyquist frequency"
-
 
 def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]

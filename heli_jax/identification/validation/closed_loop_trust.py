@@ -36,6 +36,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.frequency_gusts import machine_of
 from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
@@ -47,6 +48,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.follows_response import Feedback
 
+CLOSED_LOOP = "loop.no-instrument"
 TRUSTED = 1.4
 """stated standard deviations by which feedback may have moved an estimate that is trusted: its
 interval then covers two thirds of the time"""
@@ -372,8 +374,8 @@ def information(
     return J.T @ J
 
 
-def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
-    """Which parameters a fit cannot be trusted on, in words; nothing where no loop is closed.
+def feedback_trust(moved: Mapping[str, Moved], loop: Loop) -> list[Finding]:
+    """The parameters that feedback may have moved; nothing where no loop is closed.
 
     Args:
         moved: of `moved_by_feedback`.
@@ -384,23 +386,34 @@ def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
     doubted = untrusted(moved, loop)
     of = f" for {' and '.join(loop.inputs)}" if loop.instruments else ""
     if not any(one.present for one in loop.found):
-        of += " (the model is unstable, and the record does not grow: somebody holds the machine)"
+        of += " (the model is unstable, and the record does not grow: somebody holds the vehicle)"
+    brief = "closed loop without an instrument"
+    criterion = f"part of the input that feedback may have brought in, {MAY_BE:g}"
+    most = max(m.part for m in (moved[n] for n in doubted or moved))
     if not doubted:
-        most = 100 * max(m.part for m in moved.values())
-        share = f"up to {most:.0f}" if most >= 1 else "less than 1"
-        return [
+        share = f"up to {100 * most:.0f}" if most >= 0.01 else "less than 1"
+        words = (
             f"Closed loop without an instrument{of}: {share} % of the input may be "
             "gusts that feedback brought in, where these parameters show; no interval allows for "
             "that. Nothing shows that it moved them, and nothing that it did not."
-        ]
-    words = ", ".join(f"{n} ({100 * moved[n].part:.0f} %)" for n in doubted)
-    rest = [n for n in moved if n not in doubted]
+        )
+        return [Finding(CLOSED_LOOP, "note", words, most, criterion, tuple(loop.inputs))]
+    each = ", ".join(f"{n} ({100 * moved[n].part:.0f} %)" for n in doubted)
     inputs = " and ".join(loop.inputs) if loop.instruments else "the inputs"
+    words = (
+        f"Closed loop without an instrument{of}: so much of {inputs} may be gusts that feedback "
+        f"brought in, where these parameters show: {each}. Log the excitation and name it "
+        "(signals.instruments), or use method: filter-error with a disturbance."
+    )
     return [
-        f"Closed loop without an instrument{of}: this fit cannot be trusted on "
-        f"{', '.join(doubted)}. Where these show, so much of {inputs} may be gusts that feedback "
-        f"brought in: {words}; no interval allows for that. "
-        + (f"There is less of it for {', '.join(rest)}. " if rest else "")
-        + "Remedy: log the excitation and name it (signals.instruments), or method: filter-error "
-        "with a disturbance."
+        Finding(
+            CLOSED_LOOP,
+            "doubt",
+            words,
+            most,
+            criterion,
+            tuple(loop.inputs),
+            brief=brief,
+            distrusts=doubted,
+        )
     ]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -11,12 +12,15 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, untested, why_untested
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Feedback
-from heli_jax.identification.validation.input_units import wrong_units
+from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
-from heli_jax.identification.validation.logging_rate import logging_rate
+from heli_jax.identification.validation.logging_rate import (
+    LOGGING_RATE,
+    logging_rate,
+    loop_between_samples,
+)
 from heli_jax.identification.validation.misread import misread
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
@@ -60,6 +64,7 @@ def is_it_enough(
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [
         *logging_rate(problem, flights, at.noise.sd),
+        *loop_between_samples(flights, feedback),
         *bands(problem.training),
         *_of_feedback(problem, feedback),
         *saturation(flights),
@@ -67,19 +72,19 @@ def is_it_enough(
         *strays(flights),
         *quantisation(flights, at.noise.sd),
         *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
-        *(one.finding for one in misread(problem)),
+        *misread(problem),
         *rate_against_angle(problem),
         *turned_sensors(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated, sticks_of(problem.model)),
-        *wrong_units(flights, e.simulated, sticks_of(problem.model)),
+        *doubtful_inputs(flights, e.simulated, sticks_of(problem.model)),
         *late_inputs(flights, feedback),
     ]
     if compare:
         findings += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
     else:
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
-        findings.append(Finding("next flight", "note", words))
+        findings.append(Finding("excitation.next-flight", "note", words))
     return tuple(sorted(findings, key=lambda f: _ORDER[f.severity]))
 
 
@@ -96,25 +101,24 @@ def judged_again(
     """
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
-    kept = [f for f in findings if f.topic != "logging rate"]
+    kept = [f for f in findings if f.code != LOGGING_RATE]
     return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:
     # What is not tested is said: "no input follows" would be taken for all outputs.
-    aside = [Finding("feedback", "note", words) for words in untested(problem)]
+    aside = untested(problem)
     if not feedback:
         why = why_untested(problem)
         # Steps that somebody commanded follow nothing; of the rest nothing is known.
         severity = "note" if why == STEPS else "doubt"
         words = f"whether an input follows the response was not tested: {why}."
-        return [Finding("feedback", severity, words)] if why else aside
+        return [Finding("loop.not-tested", severity, words)] if why else aside
     least = min(feedback, key=lambda f: f.p_value)
     criterion = f"p value of the surest input, {LEVEL:g}"
     present = feedback_notes(problem, feedback)
     if present:
-        doubts = [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
-        return [*doubts, *aside]
+        return [*present, *aside]
     words = (
         "no input follows what is unforeseen of the response (p-value "
         f"{p_value(least.p_value)} for {least.input})."
@@ -128,4 +132,4 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
             f"{p_value(least.p_value)} for {least.input}): the loop is closed, which the logged "
             "excitation (instrument) allows for."
         )
-    return [Finding("feedback", "ok", words, least.p_value, criterion), *aside]
+    return [Finding("loop.feedback", "ok", words, least.p_value, criterion), *aside]

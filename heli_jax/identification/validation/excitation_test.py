@@ -19,30 +19,24 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
+from heli_jax.identification.validation.adequacy import EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import p_value
 
-WRONG_OPTIMUM = (
-    "An unstable model whose residual follows the inputs is a wrong optimum, or feedback made it: "
-    "start with other signs or from several points (fit.starts); where somebody held the machine, "
-    "log the excitation (signals.instruments)."
-)
-MOVED_BY_FEEDBACK = (
-    "An unstable model that explains nearly all, and whose residual follows the inputs all the "
-    "same, was moved by feedback, or is a wrong optimum: where somebody held the machine, log the "
-    "excitation (signals.instruments); else start with other signs or from several points "
-    "(fit.starts)."
-)
+WRONG_OPTIMUM, FOLLOWS = "search.wrong-optimum", "dynamics.residual-follows-excitation"
+NO_ANSWER = "excitation.no-output-follows"
 _NEARLY_ALL = 0.9
 """part explained of each output whose residual follows the inputs, from which on a wrong optimum is
 the less likely cause"""
+_SURE = 1e-4
+"""p value below which a residual that follows the excitation takes all intervals away"""
 LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
@@ -86,35 +80,41 @@ def by_excitation(
         return None
     failed = {n: f for n, f in followed.items() if f.p_value < LEVEL / len(followed)}
     bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
+    diverged = _diverged(agreement)
+    if not failed:
+        return Adequacy((), tuple(diverged))
     direct = at.data.flights[0].by_instrument is None
     what = "the inputs" if direct else "the excitation"
     numbers = ", ".join(f"{n} ({_in_words(f)})" for n, f in failed.items())
-    said = (
-        f"The residual still follows {what} in {numbers}: the model, or its estimates, are wrong "
-        "there, and no interval allows for that."
-    )
-    remarks = _diverged(agreement)
-    if failed and remarks and direct and not bad:
-        # An unstable model fits at its frequencies whatever the ends of the record let it: that its
-        # simulation leaves the record is excused only where nothing else speaks against it.
-        doubt = (
-            f"the residual of {' and '.join(failed)} follows {what}, and simulated the model "
-            "leaves the record"
-        )
+    words = f"The residual still follows {what} in {numbers}: the model, or its estimates, are "
+    code, remedy = FOLLOWS, "wrong there, and no interval allows for that."
+    # An unstable model fits at its frequencies whatever the ends of the record let it: that its
+    # simulation leaves the record is excused only where nothing else speaks against it.
+    astray = bool(diverged) and direct and not bad
+    if astray:
         nearly = all(f.explained >= _NEARLY_ALL for f in failed.values())
-        advice = MOVED_BY_FEEDBACK if nearly else WRONG_OPTIMUM
-        return Adequacy(False, False, (), (said,), (advice,), remarks, doubts=(doubt,))
-    if bad:
-        doubt = f"the residual of {' and '.join(bad)} follows {what}"
-        worse = any(not followed[n].explained >= 0.0 for n in bad)
-        return Adequacy(False, worse, (), (said,), remarks=remarks, doubts=(doubt,))
-    limited = f"some of the residual of {', '.join(failed)} follows {what}" if failed else ""
-    notes = (said, *remarks) if failed else remarks
-    return Adequacy(True, False, (), remarks=notes, limited=limited)
+        code = FOLLOWS if nearly else WRONG_OPTIMUM
+        remedy = (
+            "wrong there. Feedback made it, or it is a wrong optimum: log the excitation "
+            "(signals.instruments), or start with other signs or from several points (fit.starts)."
+        )
+    least = min(f.p_value for f in failed.values())
+    found = Finding(
+        code,
+        "doubt",
+        words + remedy,
+        least,
+        f"probability of as much by chance, {LEVEL / len(followed):.2g}",
+        tuple(failed),
+        brief=f"the residual of {' and '.join(failed)} follows {what}",
+        denies=bool(bad) or astray,
+        distrusts=at.layout.of_interest if least < _SURE else (),
+    )
+    return Adequacy((), (found, *diverged))
 
 
 def unless_unrelated(problem: Problem, adequacy: Adequacy) -> Adequacy:
-    """The adequacy of a fit in frequency, none where no output follows what excites the machine.
+    """The adequacy of a fit in frequency, none where no output follows what excites the vehicle.
 
     Residuals that do not follow the excitation are no merit where the output does not either.
 
@@ -127,21 +127,19 @@ def unless_unrelated(problem: Problem, adequacy: Adequacy) -> Adequacy:
         return adequacy
     what = "excitation" if instruments_of(problem) else "inputs"
     numbers = ", ".join(f"{n} (p {p_value(p)})" for n, p in p_values.items())
-    return Adequacy(
-        False,
-        False,
-        (),
-        (
-            f"No output follows the {what} beyond chance: {numbers}. So these data say nothing of "
-            "the model, and any optimum is one of noise.",
-        ),
-        (
-            "Is it the right column, and the same clock? Else use larger or more inputs, or a "
-            "longer record.",
-        ),
-        doubts=(f"no output follows the {what}: {CHANCE}",),
-        by_chance=True,
+    found = Finding(
+        NO_ANSWER,
+        "refuse",
+        f"No output follows the {what} beyond chance: {numbers}. So these data say nothing of the "
+        "model. Is it the right column, and the same clock? Else use larger or more inputs, or a "
+        "longer record.",
+        min(p_values.values()),
+        f"p value, {LEVEL / len(p_values):.2g}",
+        tuple(p_values),
+        brief=f"no output follows the {what}",
+        denies=True,
     )
+    return Adequacy((), (found,), by_chance=True)
 
 
 def outputs_against_excitation(problem: Problem) -> dict[str, float]:
@@ -180,15 +178,16 @@ def _between_ends(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     return y - np.linspace(y[0], y[-1], y.size)
 
 
-def _diverged(agreement: Mapping[str, Metrics]) -> tuple[str, ...]:
+def _diverged(agreement: Mapping[str, Metrics]) -> list[Finding]:
     names = [n for n, m in agreement.items() if not m.vaf >= _DIVERGED]
     if not names:
-        return ()
-    return (
+        return []
+    words = (
         f"Simulated in time from its initial state the model leaves the record in "
         f"{', '.join(names)}: it is unstable, or nearly, and an error of its start grows. The fit "
-        "simulates nothing, and is judged at its frequencies.",
+        "simulates nothing, and is judged at its frequencies."
     )
+    return [note("adequacy.simulation-leaves-record", words, *names)]
 
 
 def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:

@@ -9,8 +9,8 @@ import scipy.special
 from jaxtyping import Bool, Complex, Float
 
 from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.hardly_moving import hardly_moving
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
@@ -36,7 +36,8 @@ _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
-NOTHING_FOLLOWS = (
+NOTHING_FOLLOWS = "excitation.nothing-follows"
+_NOTHING = (
     "no output follows any input coherently over a band of frequencies: noise, disturbances or "
     "something else moves the machine more than the sticks do."
 )
@@ -70,7 +71,7 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
     if not moving:
         words = "no input moves: nothing is excited."
-        return [Finding("excited band", "refuse", words, 0.0, "inputs that move, 1")]
+        return [Finding("excitation.excited-band", "refuse", words, 0.0, "inputs that move, 1")]
     seen = seen_parts(alike)
     barely = hardly_moving(alike, moving)
     pooled = _pooled(seen, moving, alike[0].dt)
@@ -158,13 +159,13 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
                 f"{limit:.2f}.{left}"
             )
             # No pass: this input alone moves nothing, though several together may.
-            findings.append(Finding("excited band", "note", words, None, criterion))
+            findings.append(Finding("excitation.excited-band", "note", words, None, criterion))
             continue
         followed = True
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
-        findings.append(Finding("excited band", "ok", words, best.peak, criterion))
+        findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        findings.append(Finding("excited band", "doubt", NOTHING_FOLLOWS, None, criterion))
+        findings.append(Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, None, criterion))
     return findings
 
 
@@ -282,12 +283,12 @@ def _pair_findings(
             f"{a} and {b} move together{where} (coherence {mean:.2f}, other inputs taken out): "
             f"their effects cannot be told apart there, and {wider}; move one at a time."
         )
-        findings.append(Finding("inputs together", "doubt", words, mean, criterion))
+        findings.append(Finding("excitation.inputs-together", "doubt", words, mean, criterion))
     if findings:
         return findings
     mean, a, b, _ = pairs[0]
     words = f"no two inputs move together (most {a} and {b}: coherence {mean:.2f})."
-    return [Finding("inputs together", "ok", words, mean, criterion)]
+    return [Finding("excitation.inputs-together", "ok", words, mean, criterion)]
 
 
 def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Finding]:
@@ -303,7 +304,7 @@ def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Fin
             f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; whether an output "
             f"follows it was not computed: {why}."
         )
-        findings.append(Finding("excited band", "doubt", words))
+        findings.append(Finding("excitation.excited-band", "doubt", words))
     return findings
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import Finding, note
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution, unpack
@@ -71,9 +72,8 @@ def unstated_gusts(problem: Problem) -> list[str]:
     return [n for n in sizes if not _is_stated(float(getattr(problem.vehicle, n)))]
 
 
-def guessed_gusts(problem: Problem, at: Solution) -> str:
-    """A sentence where the disturbances' size is what the record says at the start values; else
-    empty.
+def guessed_gusts(problem: Problem, at: Solution) -> list[Finding]:
+    """A note where the disturbances' size is what the record says at the start values.
 
     Args:
         problem: with its vehicle, where a size may be stated.
@@ -81,15 +81,16 @@ def guessed_gusts(problem: Problem, at: Solution) -> str:
     """
     guessed = unstated_gusts(problem)
     if not guessed:
-        return ""
+        return []
     taken = unpack(at.layout, at.data, at.z).noise
     units = {n: naming.unit(problem.model.Params, n) or "" for n in guessed}
     sizes = " and ".join(f"{n} of {float(taken[n]):.2g} {units[n]}".rstrip() for n in guessed)
-    return (
+    words = (
         f"Nobody stated {' and '.join(guessed)}: the expected sds are for {sizes}, the likeliest "
         "at the start values, where whatever these do not explain is taken for gusts. A fit "
         "estimates it; method: output-error shows the other end, no gusts at all."
     )
+    return [note("noise.gusts-guessed", words, *guessed)]
 
 
 def _is_stated(value: float) -> bool:

@@ -18,7 +18,7 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
     # A disturbance, or predictions ahead, let a good model's simulation be as poor.
     judged = [o for o in adequacy.judged if o.against_disturbance is None]
     worse = bool(judged) and all(o.vaf < 0 for o in adequacy.judged)
-    if adequacy.adequate or adequacy.ahead is not None or not worse:
+    if not adequacy.denied or adequacy.ahead is not None or not worse:
         return verdict
     outputs = listed([o.output for o in adequacy.judged])
     sentence = (

@@ -7,12 +7,14 @@ import numpy as np
 
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import axes_of
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.follows_response import (
+    LEVEL,
     RATE,
     SEEN,
     Feedback,
@@ -22,6 +24,8 @@ from heli_jax.identification.validation.follows_response import (
     tested_at,
 )
 from heli_jax.numbers import percent
+
+FEEDBACK = "loop.feedback"
 
 
 def why_untested(problem: Problem) -> str:
@@ -80,7 +84,7 @@ def _delay(
     return delay, math.sqrt(variance), estimated
 
 
-def untested(problem: Problem) -> list[str]:
+def untested(problem: Problem) -> list[Finding]:
     """A sentence for the outputs of which feedback cannot be told, since too much is missing."""
     flights, lacking = problem.training, {}
     for label, flight in zip(labels(flights), flights, strict=True):
@@ -90,16 +94,20 @@ def untested(problem: Problem) -> list[str]:
             # Flights that lack the same in one sentence: parts of a run do.
             lacking.setdefault((tuple(gappy), not tested), []).append(label)
     return [
-        f"{', '.join(those)}: whether the inputs follow {' or '.join(outputs)} was not tested, "
-        f"since more than {percent(1 - SEEN, 0)} of the samples are missing"
-        + (", and no other output was measured." if alone else ".")
+        note(
+            "loop.not-tested",
+            f"{', '.join(those)}: whether the inputs follow {' or '.join(outputs)} was not tested, "
+            f"since more than {percent(1 - SEEN, 0)} of the samples are missing"
+            + (", and no other output was measured." if alone else "."),
+            *outputs,
+        )
         for (outputs, alone), those in lacking.items()
     ]
 
 
 def feedback_notes(
     problem: Problem, feedback: Sequence[Feedback], white: bool | None = None
-) -> list[str]:
+) -> list[Finding]:
     """What a closed loop does to the estimates, and what to do; nothing where there is none.
 
     Args:
@@ -113,16 +121,22 @@ def feedback_notes(
     # estimate is unbiased in a closed loop too.
     if not present or (filtered and white):
         return []
+    least = min(one.p_value for one in present)
+    criterion, names = f"p value, {LEVEL:g}", tuple(dict.fromkeys(one.input for one in present))
+    # Before a fit it is a doubt about the record; after one the residuals say whether it harms.
+    severity = "doubt" if white is None else "note"
     begun = f"{_what_follows(problem, present)} unbiased only if the noise model is right. "
     if filtered:
         doubt = "" if white is None else ", and they are not: disturbances or dynamics are missing"
-        return [f"{begun}Filter error asks for white innovations{doubt}."]
+        words = f"{begun}Filter error asks for white innovations{doubt}."
+        return [Finding(FEEDBACK, severity, words, least, criterion, names)]
     if _by_instrument(problem, present):
         return []
-    return [
+    words = (
         f"{begun}That of {problem.method} knows no gusts, which feedback brings into the inputs: "
         f"in gusts its estimates are biased, and {_advised(problem, present)} is advised."
-    ]
+    )
+    return [Finding(FEEDBACK, severity, words, least, criterion, names)]
 
 
 def _by_instrument(problem: Problem, present: Sequence[Feedback]) -> bool:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 
 _FEW = 8
 """samples away from the value that an input mostly has: fewer are a spike rather than a stick"""
@@ -36,7 +36,9 @@ def hardly_moving(flights: Sequence[Flight], moving: Sequence[str]) -> list[Find
         else:
             continue
         criterion = f"samples in which it is away from its usual value, {_FEW}"
-        findings.append(Finding("excited band", "doubt", f"{text}.", float(away), criterion))
+        findings.append(
+            Finding("excitation.excited-band", "doubt", f"{text}.", float(away), criterion)
+        )
     return findings
 
 

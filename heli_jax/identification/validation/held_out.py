@@ -1,5 +1,6 @@
 """Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
@@ -18,6 +20,9 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.adequacy import WORSE
+from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import vaf_text
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -30,7 +35,7 @@ class Validation(NamedTuple):
     free_run: tuple[dict[str, np.ndarray], ...] | None
     """with windows: by flight and output the simulation (N,) in one piece from the initial state of
     the first window, with the bias; None without windows"""
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def validate(
@@ -128,18 +133,44 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
 
 
-def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[str]:
+def worse_than_mean(agreement: Mapping[str, Metrics]) -> list[Finding]:
+    """Outputs of flights held out that the model follows worse than their mean, by more than chance
+    makes of one that does not respond.
+
+    Args:
+        agreement: by output, over all flights held out.
+    """
+    return [
+        Finding(
+            "held-out.worse-than-mean",
+            "doubt",
+            f"Held out: the model follows {name} worse than its mean does (VAF {vaf_text(m.vaf)}): "
+            "it does not predict flights that it was not fitted to.",
+            m.vaf,
+            f"VAF, {WORSE:g}",
+            (name,),
+            brief=f"held out, VAF of {name} is {vaf_text(m.vaf)}",
+            denies=True,
+        )
+        for name, m in agreement.items()
+        if not m.vaf >= WORSE
+    ]
+
+
+def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Finding]:
     notes = []
     for label, simulated in zip(labels(held), e.simulated, strict=True):
         if not all(np.isfinite(v).all() for v in simulated.values()):
-            notes.append(
+            words = (
                 f"{label}, held out: with the estimates the model's simulation of it is not "
                 "finite, so no agreement is given."
             )
+            notes.append(note("held-out.not-finite", words, label))
     # Where a simulation is not finite no search can end well: the one sentence is enough.
     if not converged and not notes:
-        notes.append(
+        words = (
             "Held out: the initial states, biases and offsets that suit the flights best were not "
             f"found (after {_STEPS} steps at most), so the agreement given is a lower bound."
         )
+        notes.append(note("held-out.nuisances-not-found", words))
     return notes

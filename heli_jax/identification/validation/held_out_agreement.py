@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding, note
 from heli_jax.numbers import number, p_value, percent, plain_words
 
-_FAR_OFF = 10.0
-"""times what is expected, from which on squared errors are beyond what another day's gusts are"""
 LEVEL = 0.01
 """of the test whether a flight's own estimates are those of the fit"""
 
@@ -94,33 +93,58 @@ class HeldOutFlight(NamedTuple):
         return "; ".join(known)
 
     @property
-    def sentences(self) -> tuple[str, ...]:
+    def findings(self) -> list[Finding]:
         """What speaks against the fit, or keeps the flight from speaking for it."""
-        where, said = f"{self.flight}, held out", []
+        where, found = f"{self.flight}, held out", []
         if self.worse:
             names = " and ".join(self.worse)
-            said.append(f"{where}: of {names} the model explains less than no model at all would.")
-        if self.differs:
-            assert self.estimates_p_value is not None
-            f = self.furthest
-            most = (
-                ""
-                if f is None
-                else (
-                    f"; by itself {f.parameter} is the furthest, from {f.values[1]} to about "
-                    f"{f.values[0]} ({f.sds:.1f} joint standard deviations)"
+            words = f"{where}: of {names} the model explains less than no model at all would."
+            brief = f"held out, the model is worse than none for {names}"
+            found.append(
+                Finding(
+                    "held-out.worse-than-none",
+                    "doubt",
+                    words,
+                    subjects=(self.flight, *self.worse),
+                    brief=brief,
+                    denies=True,
                 )
             )
-            said.append(
-                f"{where}: what it says of the parameters is further from the estimates than the "
-                f"errors of both allow (p {p_value(self.estimates_p_value)}){most}: the model "
-                "lacks something, or the flight differs: mass, rotor speed, battery, or the scale, "
-                "sign or clock of a column of its log. The intervals speak for the fitted flights "
-                "alone."
-            )
+        if self.differs:
+            found.append(self._differing)
         elif not self.worse and not self.lower95 <= self.chi_squared <= self.upper95:
-            said.append(f"{where}: {self._size}.")
-        return tuple(said)
+            words, limit = f"{where}: {self._size}.", f"squared errors, {self._expected}"
+            size = Finding("held-out.size", "note", words, self.chi_squared, limit, (self.flight,))
+            found.append(size)
+        return found
+
+    @property
+    def _differing(self) -> Finding:
+        assert self.estimates_p_value is not None
+        f, most, shifts = self.furthest, "", {}
+        if f is not None:
+            most = (
+                f"; by itself {f.parameter} is the furthest, from {f.values[1]} to about "
+                f"{f.values[0]} ({f.sds:.1f} joint standard deviations)"
+            )
+            shifts = {f.parameter: f.own - f.fitted}
+        p = p_value(self.estimates_p_value)
+        words = (
+            f"{self.flight}, held out: its own estimates are further from those of the fit than "
+            f"the errors of both allow (p {p}){most}: the model lacks something, or the flight "
+            "differs: mass, rotor speed, battery, or the scale, sign or clock of a column of its "
+            "log."
+        )
+        return Finding(
+            "held-out.other-estimates",
+            "doubt",
+            words,
+            self.estimates_p_value,
+            f"p value, {LEVEL:g}",
+            (self.flight,),
+            shifts,
+            f"{self.flight} asks for other estimates (p {p})",
+        )
 
     @property
     def _expected(self) -> str:
@@ -153,31 +177,7 @@ class HeldOutFrequency(NamedTuple):
     """why a flight is not judged"""
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """What a reader has to know."""
-        return (*self.notes, *(s for f in self.flights for s in f.sentences))
-
-    @property
-    def worse(self) -> tuple[str, ...]:
-        """The outputs that the model explains worse than none at all in some flight."""
-        return tuple(dict.fromkeys(n for f in self.flights for n in f.worse))
-
-    @property
-    def doubt(self) -> str:
-        """What belongs beside the verdict of the fit, in a few words; empty where nothing."""
-        words = []
-        if self.worse:
-            words.append(f"the model is worse than none for {', '.join(self.worse)}")
-        if differing := [f for f in self.flights if f.differs]:
-            p = min(f.estimates_p_value or 0.0 for f in differing)
-            names, ask = (
-                ", ".join(f.flight for f in differing),
-                "asks" if len(differing) == 1 else "ask",
-            )
-            words.append(f"{names} {ask} for other estimates (p {p_value(p)})")
-        words += [
-            f"squared errors of {f.flight} are {f.chi_squared:.3g} times what is expected"
-            for f in self.flights
-            if f.chi_squared > _FAR_OFF and not (f.differs or f.worse)
-        ]
-        return "; ".join(words)
+    def findings(self) -> list[Finding]:
+        """All that the flights have to say."""
+        notes = [note("held-out.not-judged", words) for words in self.notes]
+        return [*notes, *(found for f in self.flights for found in f.findings)]

@@ -10,13 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax import units
+from heli_jax import naming, units
+from heli_jax.finding import UNIT_IN_DOUBT, Finding
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.table import shown
-from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.validation.other_hold import pseudoinverse
 
 _NEAR = 3.0
 """factor by which start values may be off beside the unit"""
+_STEP, _SCALED = 1.001, 0.2
+"""factor on a signal, and the relative change of a parameter over its own, from which on the unit
+of the signal decides what the parameter is"""
 _FULL = 1.2
 """of a stick's or a surface's full travel: 1, or a radian"""
 
@@ -29,7 +35,7 @@ class _Other(NamedTuple):
     """of the stated unit over this one"""
 
 
-def wrong_units(
+def doubtful_inputs(
     flights: Sequence[tuple[str, Flight]],
     simulated: Sequence[Mapping[str, np.ndarray]],
     sticks: Mapping[str, str] | None = None,
@@ -42,15 +48,6 @@ def wrong_units(
         simulated: at the start values, by flight and output (N,), SI.
         sticks: by output the input that moves it, of `signal_signs.sticks_of`; without it any.
     """
-    return [finding for _, finding in doubtful_inputs(flights, simulated, sticks)]
-
-
-def doubtful_inputs(
-    flights: Sequence[tuple[str, Flight]],
-    simulated: Sequence[Mapping[str, np.ndarray]],
-    sticks: Mapping[str, str] | None = None,
-) -> list[tuple[str, Finding]]:
-    """The same, each with the name of its input."""
     findings = []
     for (label, flight), run in zip(flights, simulated, strict=True):
         for name, signal in (flight.source.inputs if flight.source else {}).items():
@@ -62,8 +59,35 @@ def doubtful_inputs(
             if other is None or not sizes:
                 continue
             if all(s and other.factor / _NEAR < s < other.factor * _NEAR for s in sizes):
-                findings.append((name, _said(label, name, signal, other, moved, sizes)))
+                findings.append(_said(label, name, signal, other, moved, sizes))
     return findings
+
+
+def scaled_by(at: Solution, name: str) -> tuple[str, ...]:
+    """The parameters that another unit of a signal would change by a good part of its factor.
+
+    Args:
+        at: where the fit ended.
+        name: of the input or output.
+    """
+    layout, data = at.layout, at.data
+    flights = []
+    for flight in data.flights:
+        outputs = {n: y * _STEP if n == name else y for n, y in flight.outputs.items()}
+        inputs = {n: u * _STEP if n == name else u for n, u in naming.asdict(flight.inputs).items()}
+        flights.append(
+            flight._replace(outputs=outputs, inputs=naming.replace(flight.inputs, **inputs))
+        )
+    e = evaluate(*at)
+    other = evaluate(layout, data._replace(flights=tuple(flights)), at.noise, at.z)
+    step = pseudoinverse(np.asarray(e.J)) @ (np.asarray(e.r) - np.asarray(other.r))
+    values, slopes = np.asarray(e.named), np.asarray(e.slopes)
+    change = step[: slopes.size] * slopes / (_STEP - 1.0)
+    return tuple(
+        n
+        for n, c, v in zip(layout.of_interest, change, values, strict=True)
+        if abs(c) > _SCALED * abs(v)
+    )
 
 
 def _other(signal: Signal, values: np.ndarray) -> _Other | None:
@@ -111,4 +135,12 @@ def _said(
         f'{max(other.factor, 1.0 / other.factor):.3g}; state unit: "{other.unit}" if so.'
     )
     criterion = f"within a factor of {_NEAR:g} of {other.factor:.3g}"
-    return Finding("signs and units", "doubt", words, max(sizes), criterion)
+    return Finding(
+        UNIT_IN_DOUBT,
+        "doubt",
+        words,
+        max(sizes),
+        criterion,
+        (name,),
+        brief=f"the unit of {name} is in doubt",
+    )

@@ -11,10 +11,10 @@ from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.finding import Finding
 from heli_jax.flights.align import NotAligned, correlations, other_peak
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import autocorrelation
 from heli_jax.identification.validation.signal_signs import (
     PARTS,
@@ -99,13 +99,13 @@ def _finding(label: str, rate: str, angle: str, lateness: Lateness) -> Finding:
             f"later than {rate} (negative: earlier). State the delay if it is known, or leave one "
             "of the two out."
         )
-        return Finding("late output", "doubt", words, late, criterion)
+        return Finding("timing.late-output", "doubt", words, late, criterion)
     words = (
         f"{label}: {first} is logged {abs(late):.2g} s later than {second}, with which it goes "
         f"together then (sd {lateness.sd:.1g} s): a fit of both takes that for the machine's; "
         f"state it ({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
     )
-    return Finding("late output", "doubt", words, late, criterion)
+    return Finding("timing.late-output", "doubt", words, late, criterion)
 
 
 def lateness(

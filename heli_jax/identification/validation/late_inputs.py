@@ -11,8 +11,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.numbers import percent
 
@@ -138,4 +138,4 @@ def _finding(label: str, name: str, share: float, lead: float, output: str) -> F
         "(feedback)."
     )
     criterion = f"part of what the past leaves that the later input explains, {_CLEAR:g}"
-    return Finding("late input", "doubt", words, share, criterion)
+    return Finding("timing.late-input", "doubt", words, share, criterion)

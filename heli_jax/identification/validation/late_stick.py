@@ -8,7 +8,6 @@ they are, and what it has in common with them by how much that moves the estimat
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,20 +15,18 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
-from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
 from heli_jax.identification.validation.signal_quality import facts_of
 
+LATE_INPUT = "timing.late-input"
 _CLEAR = 5.0
 """sds from zero, from which on a shift is spoken of"""
-_MATTERS = 1.0
-"""sds of an estimate by which it has to move it"""
 _LARGE = 0.1
 """of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
 _NULL = 1e-8
@@ -44,48 +41,13 @@ _SEEN = 1e-3
 """of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
 
 
-class LateStick(NamedTuple):
-    """A shift of the inputs that the residuals ask for."""
-
-    inputs: tuple[str, ...]
-    seconds: float
-    """by which they look late"""
-    sd: float
-    moved: Mapping[str, tuple[float, float]]
-    """by parameter how far a free shift moves it: part of its value, and sds"""
-    freed: bool = False
-    """whether a shift was free, and is what stands here"""
-
-    @property
-    def words(self) -> str:
-        """For the verdict."""
-        verb = "look" if len(self.inputs) > 1 else "looks"
-        return f"{' and '.join(self.inputs)} {verb} {1e3 * self.seconds:.2g} ms late"
-
-    @property
-    def sentence(self) -> str:
-        """For the notes of a fit."""
-        if self.freed:
-            return (
-                f"By {1e3 * self.seconds:.2g} ms {', '.join(self.inputs)} acted before it was "
-                "logged: a step stands at the stamp after it. The shift makes up for the mean of "
-                "that alone; each step was late by a time of its own, for which no interval allows."
-            )
-        each = [f"{n} by about {100 * part:+.2g} %" for n, (part, _) in _largest(self.moved)]
-        return (
-            f"{self.words} (sd {1e3 * self.sd:.2g} ms): the response comes earlier than the model "
-            f"makes it. A free shift, nuisance.time_shift: true, would move {', '.join(each)}; "
-            "no interval allows for that."
-        )
-
-
 def late_stick(
     problem: Problem,
     at: Solution,
     e: Evaluation,
     estimates: Mapping[str, tuple[float, float | None]],
-) -> LateStick | None:
-    """The inputs' lateness where it is clear and matters; None where it does not show.
+) -> list[Finding]:
+    """The inputs' lateness where it is clear and moves an estimate; nothing where it does not show.
 
     Args:
         problem: what was fitted.
@@ -97,14 +59,14 @@ def late_stick(
         return _freed(problem, *estimates["time_shift"])
     slope = _by_shift(problem, at)
     if slope is None:
-        return None
+        return []
     names, s = slope
     J, r = np.asarray(e.J), np.asarray(e.r)
     Q = _basis(J)
     left = s - Q @ (Q.T @ s)
     power = float(left @ left)
     if not power > _LEFT**2 * float(s @ s):
-        return None  # a free delay stands for it already
+        return []  # a free delay stands for it already
     # The residuals are s times the lateness, and fall by as much with a shift of that size.
     seconds = float(left @ r) / power
     own = left * (r - left * seconds)
@@ -112,28 +74,33 @@ def late_stick(
     sums = np.add.reduceat(own, np.arange(0, own.size, count))
     # Rows that are not white tell less than as many that are.
     sd = max(1.0 / np.sqrt(power), float(np.linalg.norm(sums)) / power)
-    moved = _moved(at, e, pseudoinverse(J) @ s * seconds, estimates)
-    matters = any(abs(by) > _MATTERS for _, by in moved.values())
-    if not (seconds > _CLEAR * sd and matters):
-        return None
-    return LateStick(names, seconds, sd, moved)
+    if not seconds > _CLEAR * sd:
+        return []
+    moved = _moved(at, e, pseudoinverse(J) @ s * seconds)
+    verb = "look" if len(names) > 1 else "looks"
+    brief = f"{' and '.join(names)} {verb} {1e3 * seconds:.2g} ms late"
+    each = [f"{n} by about {100 * part:+.2g} %" for n, part in _largest(moved)]
+    words = (
+        f"{brief} (sd {1e3 * sd:.2g} ms): the response comes earlier than the model makes it. "
+        f"nuisance.time_shift: true would move {', '.join(each)}."
+    )
+    values = dict(zip(at.layout.of_interest, np.asarray(e.named).tolist(), strict=True))
+    shifts = {n: part * values[n] for n, part in moved.items()}
+    criterion = f"seconds, {_CLEAR:g} sd"
+    return [Finding(LATE_INPUT, "doubt", words, seconds, criterion, names, shifts, brief)]
 
 
-def _freed(problem: Problem, value: float, sd: float | None) -> LateStick | None:
+def _freed(problem: Problem, value: float, sd: float | None) -> list[Finding]:
     """A free shift [s] that says that inputs in steps acted before they were logged."""
     names = _stepped(problem.training)
     if not names or not sd or not -value > _CLEAR * sd:
-        return None
-    return LateStick(names, -value, sd, {}, freed=True)
-
-
-def with_late_stick(adequacy: Adequacy, late: LateStick | None) -> Adequacy:
-    """The adequacy, no plain yes where inputs look late."""
-    if late is None:
-        return adequacy
-    between = f"steps of {', '.join(late.inputs)} fall between stamps" if late.freed else ""
-    adequacy = adequacy.only_if([between or late.words])
-    return adequacy._replace(remarks=(late.sentence, *adequacy.remarks))
+        return []
+    words = (
+        f"{', '.join(names)} acted {-1e3 * value:.2g} ms before it was logged: a step stands at "
+        "the stamp after it. The shift makes up for the mean of that; each step was late by a time "
+        "of its own, for which no interval allows."
+    )
+    return [Finding("timing.steps-between-stamps", "note", words, -value, "seconds", names)]
 
 
 def slow_sticks(
@@ -155,12 +122,12 @@ def slow_sticks(
         return []
     longest = max(periods.values())
     change = pseudoinverse(np.asarray(e.J)) @ slope[1] * (0.5 * longest)
-    moved = {n: one for n, one in _moved(at, e, change, {}).items() if n not in skip}
+    moved = {n: one for n, one in _moved(at, e, change).items() if n not in skip}
     # What is late makes an estimate wrong by as much as a shift would have to take back.
-    most = max((abs(part) for part, _ in moved.values()), default=0.0)
+    most = max((abs(part) for part in moved.values()), default=0.0)
     if most < _LARGE:
         return []
-    each = [f"{n} by about {-100 * part:+.2g} %" for n, (part, _) in _largest(moved)]
+    each = [f"{n} by about {-100 * part:+.2g} %" for n, part in _largest(moved)]
     words = (
         f"{', '.join(periods)} moves in steps and was sampled at {1 / longest:.3g} Hz: a step "
         f"stands at the sample after it, up to {1e3 * longest:.2g} ms late. Half of that moves "
@@ -168,13 +135,13 @@ def slow_sticks(
         "nuisance.time_shift: true makes up for the mean of it."
     )
     criterion = f"part of a parameter that half a sample of the stick moves, {_LARGE:g}"
-    return [Finding("slow stick", "doubt", words, most, criterion)]
+    return [Finding("timing.slow-stick", "doubt", words, most, criterion)]
 
 
-def _largest(moved: Mapping[str, tuple[float, float]]) -> list[tuple[str, tuple[float, float]]]:
+def _largest(moved: Mapping[str, float]) -> list[tuple[str, float]]:
     """Those that move most, and none that stay where they are but for rounding."""
-    first, *others = sorted(moved.items(), key=lambda item: -abs(item[1][0]))[:_MOST]
-    return [first, *(item for item in others if abs(item[1][0]) >= _SEEN)]
+    first, *others = sorted(moved.items(), key=lambda item: -abs(item[1]))[:_MOST]
+    return [first, *(item for item in others if abs(item[1]) >= _SEEN)]
 
 
 def _stepped(flights: Sequence[Flight]) -> tuple[str, ...]:
@@ -239,21 +206,14 @@ def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
     return data._replace(flights=jax.device_put(tuple(flights)))
 
 
-def _moved(
-    at: Solution,
-    e: Evaluation,
-    step: np.ndarray,
-    estimates: Mapping[str, tuple[float, float | None]],
-) -> dict[str, tuple[float, float]]:
-    """By parameter what a step of the unknowns (q,) does to it: part of its value, and sds."""
+def _moved(at: Solution, e: Evaluation, step: np.ndarray) -> dict[str, float]:
+    """By parameter what a step of the unknowns (q,) does to it, as a part of its value."""
     values, slopes = np.asarray(e.named), np.asarray(e.slopes)
-    moved = {}
-    for k, name in enumerate(at.layout.of_interest):
-        change, value = float(step[k] * slopes[k]), float(values[k])
-        sd = estimates.get(name, (value, None))[1]
-        if name in at.layout.free and name not in at.layout.disturbance and value:
-            moved[name] = (change / value, change / sd if sd else 0.0)
-    return moved
+    return {
+        name: float(step[k] * slopes[k] / values[k])
+        for k, name in enumerate(at.layout.of_interest)
+        if name in at.layout.free and name not in at.layout.disturbance and values[k]
+    }
 
 
 def _basis(J: np.ndarray) -> Float[np.ndarray, "n k"]:

@@ -16,13 +16,15 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.finding import Finding, Severity
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
-from heli_jax.identification.validation.finding import Finding, Severity
+from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
 
+LOGGING_RATE = "timing.logging-rate"
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
 _SETTLED = 1.0
@@ -32,6 +34,9 @@ _PART = 0.1
 guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
+_FAST_SHARE, _FALLS = 0.005, 0.5
+"""part of an input's power above a quarter of its rate, and its density there over that of the
+octave below: an input with more of both moves between its samples"""
 _LEVELS, _STEPS = 10, 20
 """distinct values and steps of a staircase at least: a commanded sequence of steps has fewer"""
 
@@ -80,6 +85,60 @@ def logging_rate(
     return findings if findings or not every else [min(every, key=_value)]
 
 
+def loop_between_samples(
+    flights: Sequence[tuple[str, Flight]], feedback: Sequence[Feedback]
+) -> list[Finding]:
+    """Doubts about inputs of a closed loop that act faster than they are logged.
+
+    A controller that runs faster than the log moves its input between the samples, by what it saw
+    of the response there. The power of such an input does not fall off before half of its rate.
+
+    Args:
+        flights: by what each is called.
+        feedback: whether inputs follow the response.
+    """
+    followed = {(one.flight, one.input) for one in feedback if one.present}
+    findings = []
+    for label, flight in flights:
+        for name, u in flight.inputs.items():
+            # Held because somebody said so: then it is known between its samples.
+            if (label, name) not in followed or name not in flight.hold_reason:
+                continue
+            rate = input_rate(flight, name, u)
+            if rate is None:
+                continue
+            v = u[:: max(round(1.0 / (rate * flight.dt)), 1)]
+            power = np.abs(np.fft.rfft(np.diff(v) * np.hanning(v.size - 1))) ** 2
+            # Differences take off what is slow; the power itself is that over their gain.
+            power = power[1:] / np.sin(0.5 * np.pi * np.arange(1, power.size) / power.size) ** 2
+            quarter, half = power.size // 4, power.size // 2
+            last, before = (float(np.mean(x)) for x in (power[half:], power[quarter:half]))
+            share = float(np.sum(power[half:]) / np.sum(power))
+            if not (share > _FAST_SHARE and last > _FALLS * before):
+                continue
+            words = (
+                f"{label}: {name} closes a loop, and its power does not fall off before half of "
+                f"its rate of {rate:.3g} Hz ({100 * share:.2g} % above a quarter): it moved "
+                "between samples by what it saw of the response there, which biases the estimates. "
+                "Log at the controller's rate and state hold: zero-order, or use an excitation "
+                "(signals.instruments)."
+            )
+            criterion = f"part of the power above a quarter of the rate, {_FAST_SHARE:g}"
+            brief = f"{name} moves between its samples in a closed loop"
+            findings.append(
+                Finding(
+                    "timing.loop-between-samples",
+                    "doubt",
+                    words,
+                    share,
+                    criterion,
+                    (name,),
+                    brief=brief,
+                )
+            )
+    return findings
+
+
 def _value(finding: Finding) -> float:
     assert finding.value is not None
     return finding.value
@@ -102,7 +161,7 @@ def _not_judged(label: str, hz: float) -> Finding:
         f"{label}: whether the rate is enough was not judged: at the start values no mode of the "
         f"model (the fastest has {hz:.3g} Hz) moves an output by {SHOWS:g} times its noise."
     )
-    return Finding("logging rate", "doubt", words)
+    return Finding(LOGGING_RATE, "doubt", words)
 
 
 def _modes_that_show(
@@ -195,7 +254,7 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
             f": {number(ratio, 2)} samples in a period hardly show it, and what happened "
             f"between them biases the estimates; log at {ENOUGH * hz:.3g} Hz."
         )
-    return Finding("logging rate", severity, f"{begun}{ending}", ratio, criterion)
+    return Finding(LOGGING_RATE, severity, f"{begun}{ending}", ratio, criterion)
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:

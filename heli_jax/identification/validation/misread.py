@@ -6,19 +6,18 @@ are in them, with every estimate off by 57. Their size is the only evidence.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.finding import UNIT_IN_DOUBT, Finding
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.flights.table import shown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.signal_quality import (
     Facts,
@@ -26,7 +25,7 @@ from heli_jax.identification.validation.signal_quality import (
     dropout_words,
     facts_of,
 )
-from heli_jax.identification.validation.signal_signs import contradictions, rate_against_angle
+from heli_jax.identification.validation.signal_signs import rate_against_angle
 from heli_jax.identification.validation.turned_sensors import turned_sensors
 from heli_jax.vehicle import of_helicopter
 
@@ -44,17 +43,8 @@ _MOST = 99.0
 """percentile of the size that is held against them: no single spike counts"""
 
 
-class Misread(NamedTuple):
-    """One doubt, and in a few words why no model of it is adequate; empty where it is not sure."""
-
-    finding: Finding
-    words: str = ""
-    unsure: str = ""
-    """where it is not sure: why an adequate model is so under a condition alone"""
-
-
-def misread(problem: Problem) -> list[Misread]:
-    """What of the fitted flights is hardly what it is taken for.
+def misread(problem: Problem) -> list[Finding]:
+    """Doubts about what the signals of the fitted flights are.
 
     Args:
         problem: the flights, and the model, whose axes name headings.
@@ -71,17 +61,7 @@ def misread(problem: Problem) -> list[Misread]:
     ]
 
 
-class RecordDoubts(NamedTuple):
-    """What is wrong with the records themselves."""
-
-    findings: list[Finding]
-    words: list[str]
-    """why no model of these numbers is adequate, each reason in a few words"""
-    unsure: list[str]
-    """what keeps a fit of them from a plain yes, likewise"""
-
-
-def record_doubts(problem: Problem) -> RecordDoubts:
+def record_doubts(problem: Problem) -> list[Finding]:
     """All that is doubtful of the fitted flights, apart from any model's fit.
 
     Args:
@@ -89,22 +69,17 @@ def record_doubts(problem: Problem) -> RecordDoubts:
     """
     # Of both questions once: sorting long records is what takes the time.
     facts = [facts_of(flight) for flight in problem.training]
-    doubts = [*misread(problem), *dropouts(problem, facts), *clipped(problem, facts)]
-    odd = odd_flights(problem.training)
-    words = dict.fromkeys(one.words for one in doubts if one.words)
-    return RecordDoubts(
-        [
-            *(one.finding for one in doubts),
-            *rate_against_angle(problem),
-            *turned_sensors(problem),
-            *(one.finding for one in odd),
-        ],
-        [*words, *contradictions(problem), *(one.words for one in odd)],
-        list(dict.fromkeys(one.unsure for one in doubts if one.unsure)),
-    )
+    return [
+        *misread(problem),
+        *dropouts(problem, facts),
+        *cut_off(list(zip(labels(problem.training), facts, strict=True))),
+        *rate_against_angle(problem),
+        *turned_sensors(problem),
+        *(one.finding for one in odd_flights(problem.training)),
+    ]
 
 
-def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
+def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Finding]:
     """The signals whose dropouts are taken for values.
 
     Args:
@@ -113,9 +88,14 @@ def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
     """
     flights = problem.training
     return [
-        Misread(
-            Finding("stuck outputs", "doubt", dropout_words(label, flight, (name, kind), one)),
-            f"dropouts of {name} are taken for {'commands' if kind == 'input' else 'measurements'}",
+        Finding(
+            "quality.dropouts",
+            "doubt",
+            dropout_words(label, flight, (name, kind), one),
+            subjects=(name,),
+            brief=f"dropouts of {name} are taken for "
+            + ("commands" if kind == "input" else "measurements"),
+            denies=True,
         )
         for label, flight, of_signals in zip(labels(flights), flights, facts, strict=True)
         for (name, kind), one in of_signals.items()
@@ -123,18 +103,7 @@ def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
     ]
 
 
-def clipped(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
-    """The outputs whose flat tops are taken for measurements.
-
-    Args:
-        problem: the flights.
-        facts: of each fitted flight.
-    """
-    cut = cut_off(list(zip(labels(problem.training), facts, strict=True)))
-    return [Misread(finding, words) for finding, words in cut]
-
-
-def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
+def _contradicted(label: str, flight: Flight) -> Iterator[Finding]:
     """The signals of which the file states another unit than the configuration."""
     source = flight.source
     for name, signal in ({**source.inputs, **source.outputs} if source else {}).items():
@@ -151,11 +120,11 @@ def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
             f"{shown(signal.contradicted)} of {shown(signal.name)}: if the file is right, {off}, "
             "and the estimates are wrong with it; without unit the file's is taken."
         )
-        unsure = f"the file says {shown(signal.contradicted)} of {name}"
-        yield Misread(Finding("signs and units", "doubt", words), unsure=unsure)
+        brief = f"the file says {shown(signal.contradicted)} of {name}"
+        yield Finding(UNIT_IN_DOUBT, "doubt", words, subjects=(name,), brief=brief)
 
 
-def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Misread]:
+def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
     """Angles and rates that are too large to be in the unit that they are read in.
 
     Args:
@@ -203,10 +172,12 @@ def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Mi
                 "rad, with every estimate off by 57; state unit: deg if so."
             )
         certain = (size > impossible and not flown) or signal.contradicted == unit
-        short = f"{name} looks like {unit} read as {signal.unit}"
-        finding = Finding("signs and units", "doubt", words, size, criterion)
+        brief = f"{name} looks like {unit} read as {signal.unit}"
         # What was flown upside down is in its own unit as likely as not.
-        yield Misread(finding, short if certain else "", "" if certain or flown else short)
+        code = "units.flown-or-degrees" if flown and not certain else UNIT_IN_DOUBT
+        yield Finding(
+            code, "doubt", words, size, criterion, (str(name),), brief=brief, denies=certain
+        )
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
@@ -234,7 +205,7 @@ def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
     return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < 0.3
 
 
-def _sticks(label: str, flight: Flight) -> Iterator[Misread]:
+def _sticks(label: str, flight: Flight) -> Iterator[Finding]:
     for name, signal in (flight.source.inputs if flight.source else {}).items():
         if signal.constant is not None:
             continue
@@ -245,5 +216,11 @@ def _sticks(label: str, flight: Flight) -> Iterator[Misread]:
                 "a motion that is taken for the stick makes numbers that mean nothing; name the "
                 "stick's channel."
             )
-            sure = f"{name} is {what} by its name"
-            yield Misread(Finding("signs and units", "doubt", words), sure)
+            yield Finding(
+                "signs.no-stick",
+                "doubt",
+                words,
+                subjects=(name,),
+                brief=f"{name} is {what} by its name",
+                denies=True,
+            )

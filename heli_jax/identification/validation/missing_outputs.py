@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.measured_signals import signal_numbers, signals
@@ -24,7 +25,6 @@ from heli_jax.identification.identifiability.expected import (
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution, layout_of
-from heli_jax.identification.validation.finding import Finding
 
 _WORTH = 0.9
 """of an interval's width, below which an output is spoken of"""
@@ -72,7 +72,15 @@ def missing_outputs(problem: Problem, at: Solution) -> list[Finding]:
             f"of the model's outputs that are not used none would narrow an interval by more than "
             f"{100 * (1 - _WORTH):.0f} % (most {missing[0].name})."
         )
-        return [Finding("missing output", "ok", words, float(np.min(missing[0].ratios)), criterion)]
+        return [
+            Finding(
+                "excitation.missing-output",
+                "ok",
+                words,
+                float(np.min(missing[0].ratios)),
+                criterion,
+            )
+        ]
     return [_finding(problem, unknowns, m, criterion) for m in worth]
 
 
@@ -95,7 +103,7 @@ def _finding(
     # What is known well already need not be known better.
     missed = bool(np.any((m.ratios < _DOUBT) & ~(m.before < _KNOWN)))
     severity = "doubt" if missed else "ok"
-    return Finding("missing output", severity, words, least, criterion)
+    return Finding("excitation.missing-output", severity, words, least, criterion)
 
 
 def look_at_missing(

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -37,7 +38,6 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
 )
 from heli_jax.identification.validation.chosen_windows import DETERMINES
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
 _STEPS = (0.2, 0.5, 1.0)
@@ -120,7 +120,7 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
         )
     if plan.left_out:
         words += f" Not compared: {', '.join(plan.left_out)}, which the record does not move."
-    return [Finding("next flight", "note", words, ratio, criterion)]
+    return [Finding("excitation.next-flight", "note", words, ratio, criterion)]
 
 
 def _sd(relative: float) -> str:

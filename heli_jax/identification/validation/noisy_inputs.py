@@ -8,17 +8,16 @@ noise of a sensor is in it with the response that the model has to it, that of a
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
-from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.numerics.white_noise import white_part
 
@@ -38,42 +37,12 @@ _MOST = 3
 """parameters that are named"""
 
 
-class NoisyInput(NamedTuple):
-    """An input whose noise no machine felt."""
-
-    name: str
-    unit: str | None
-    noise: float
-    """its sd, in the input's unit"""
-    moved: Mapping[str, tuple[float, float]]
-    """by parameter how far it moves the estimate: part of its value, and sds"""
-
-    @property
-    def words(self) -> str:
-        """For the verdict."""
-        return f"{self.name} is measured with noise, which moves {_largest(self.moved)[0][0]}"
-
-    @property
-    def sentence(self) -> str:
-        """For the notes of a fit."""
-        each = [
-            f"{n} by about {100 * part:+.2g} % ({abs(sds):.2g} sd)"
-            for n, (part, sds) in _largest(self.moved)
-        ]
-        return (
-            f"{self.name} was measured, with a noise of {self.noise:.2g} {self.unit or ''}".rstrip()
-            + f" that the machine did not feel and the model is driven by: it moves "
-            f"{', '.join(each)}, and no interval allows for that. A lower rate of the flight "
-            "averages it out; where what is commanded was logged, that is the better input."
-        )
-
-
 def noisy_inputs(
     problem: Problem,
     at: Solution,
     e: Evaluation,
     estimates: Mapping[str, tuple[float, float | None]],
-) -> tuple[NoisyInput, ...]:
+) -> list[Finding]:
     """The inputs whose noise is a sensor's and moves an estimate by half its sd or more.
 
     Args:
@@ -84,17 +53,9 @@ def noisy_inputs(
     """
     layout = at.layout
     if is_kinematic(layout.model) or layout.estimator.noise_spectrum or problem.window is not None:
-        return ()
+        return []
     inputs = [_of_input(problem, at, e, estimates, n) for n in naming.names(layout.model.Inputs)]
-    return tuple(one for one in inputs if one is not None)
-
-
-def with_noisy_inputs(adequacy: Adequacy, noisy: tuple[NoisyInput, ...]) -> Adequacy:
-    """The adequacy, no plain yes where the noise of an input moves an estimate."""
-    for one in noisy:
-        remarks = (one.sentence, *adequacy.remarks)
-        adequacy = adequacy.only_if([one.words])._replace(remarks=remarks)
-    return adequacy
+    return [one for one in inputs if one is not None]
 
 
 def _of_input(
@@ -103,7 +64,7 @@ def _of_input(
     e: Evaluation,
     estimates: Mapping[str, tuple[float, float | None]],
     name: str,
-) -> NoisyInput | None:
+) -> Finding | None:
     flights = problem.training
     # A command in steps has no noise of a sensor; of short flights little is known.
     if any(f.hold[name] != "linear" or f.n_samples < _FEWEST for f in flights):
@@ -117,7 +78,21 @@ def _of_input(
     moved = _moved(problem, at, e, estimates, name, noise)
     if not any(abs(sds) > _MATTERS for _, sds in moved.values()):
         return None
-    return NoisyInput(name, naming.unit(at.layout.model.Inputs, name), max(noise), moved)
+    size = f"{max(noise):.2g} {naming.unit(at.layout.model.Inputs, name) or ''}".rstrip()
+    each = [f"{n} by about {100 * part:+.2g} %" for n, (part, _) in _largest(moved)]
+    words = (
+        f"{name} was measured with a noise of {size}, which the vehicle did not feel but which "
+        f"drives the model: it moves {', '.join(each)}. Use the logged command if there is one, or "
+        "a lower rate of the flight."
+    )
+    values = dict(zip(at.layout.of_interest, np.asarray(e.named).tolist(), strict=True))
+    # The noise has moved the estimate: without it the estimate lies on the other side.
+    shifts = {n: -part * values[n] for n, (part, _) in moved.items()}
+    brief = f"{name} is measured with noise"
+    criterion = "sd of the noise, in the unit of the input"
+    return Finding(
+        "dynamics.noisy-input", "doubt", words, max(noise), criterion, (name,), shifts, brief
+    )
 
 
 def _moved(

@@ -13,9 +13,9 @@ import scipy.special
 from jaxtyping import Complex
 
 from heli_jax.analysis.spectra import segment_transforms
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.seen_parts import seen_parts
 from heli_jax.numbers import percent
 
@@ -54,11 +54,6 @@ class OddFlight(NamedTuple):
     """those of the outputs that answer as in the others with the other sign"""
 
     @property
-    def words(self) -> str:
-        """Why no model is adequate, in a few words."""
-        return f"{self.label} does not answer its inputs as the other flights do"
-
-    @property
     def finding(self) -> Finding:
         """What was found and what to do, as a doubt."""
         names = " and ".join(self.outputs)
@@ -81,7 +76,16 @@ class OddFlight(NamedTuple):
             "leave it out."
         )
         criterion = f"part of the power that the response of the others leaves, {_LEFT:g}"
-        return Finding("odd flight", "doubt", words, self.left, criterion)
+        return Finding(
+            "agreement.odd-flight",
+            "doubt",
+            words,
+            self.left,
+            criterion,
+            (self.label, *self.outputs),
+            brief=f"{self.label} does not answer its inputs as the other flights do",
+            denies=True,
+        )
 
 
 class _Spectra(NamedTuple):

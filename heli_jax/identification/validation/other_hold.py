@@ -10,6 +10,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
@@ -34,8 +35,8 @@ def other_hold(
     *,
     skip: Collection[str] = (),
     in_doubt: bool = False,
-) -> list[str]:
-    """A sentence where the other hold of the inputs that move would change an estimate by more
+) -> list[Finding]:
+    """A finding where the other hold of the inputs that move would change an estimate by more
     than its standard deviation; nothing where it would not.
 
     Args:
@@ -70,7 +71,7 @@ def other_hold(
         for n, c in zip(names, change, strict=True)
         if n not in skip and sd.get(n, 0.0) > 0
     }
-    return _sentence(problem.training, moving, at.layout, e, changes)
+    return _finding(problem.training, moving, at.layout, e, changes)
 
 
 class LikelierHold(NamedTuple):
@@ -232,23 +233,35 @@ def pseudoinverse(J: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(J / norms[None, :], rcond=_NULL) / norms[:, None]
 
 
-def _sentence(
+def _finding(
     flights: tuple[Flight, ...],
     moving: list[set[str]],
     layout: Layout,
     e: Evaluation,
     changes: dict[str, tuple[float, float]],
-) -> list[str]:
+) -> list[Finding]:
     """What would change; `changes` by name, SI and in sds."""
     large = sorted((n for n in changes if changes[n][1] > 1.0), key=lambda n: -changes[n][1])
     if not large:
         return []
     values = dict(zip(layout.of_interest, np.asarray(e.named).tolist(), strict=True))
     words = [_changed(n, values[n], *changes[n]) for n in large[:_MOST]]
-    return [
+    sentence = (
         f"Between samples {', '.join(_taken(flights, moving))}: with the other hold "
         f"{', '.join(words)}. An input that was commanded in steps has hold: zero-order, one "
         "that was sampled while it moved has hold: linear."
+    )
+    names = tuple(dict.fromkeys(n for of_flight in moving for n in sorted(of_flight)))
+    # Nothing shows that the other hold is the right one: a note, whatever it moves.
+    return [
+        Finding(
+            "timing.other-hold",
+            "note",
+            sentence,
+            changes[large[0]][1],
+            "standard deviations, 1",
+            (*names, *large),
+        )
     ]
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -32,7 +33,6 @@ from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.chosen_windows import Choice, Window, chosen
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.usable_windows import Exclusions
 from heli_jax.identification.validation.window_states import (
     begins_on_record,

@@ -18,11 +18,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.identification.validation.missing_dynamics import ORDER, across, whitening
-
+ORDER = 10
+"""of the autoregression that whitens"""
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
 BROAD = NARROW[2:]
@@ -73,6 +74,8 @@ class Strongest(NamedTuple):
     """by which the unknowns move where the filter is in the model"""
     step: Float[np.ndarray, " q"]
     """of the unknowns to where the whitened residual is least without it"""
+    amount: float
+    """of the drive that the residual asks for, counted as a step of an unknown is"""
 
 
 def lines_of(
@@ -110,6 +113,29 @@ def lines_of(
     q = J.shape[1]
     angles = 2.0 * np.pi * np.arange(1, len(v) + 1) / n
     return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles, size)
+
+
+def across(holes: Sequence[int], size: int) -> np.ndarray:
+    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    after = np.zeros(size, bool)
+    for first in holes:
+        after[first : first + ORDER] = True
+    return after
+
+
+def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
+    """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
+
+    Args:
+        e: the signal (N,), of mean zero.
+        holes: the samples before which others are missing.
+    """
+    # With zeros between no sample is compared with one beyond a hole.
+    e = np.insert(e, np.repeat(np.asarray(holes, int), ORDER), 0.0)
+    c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(ORDER + 1)]) / e.size
+    # A little white noise, so that a residual without any has a filter too.
+    c[0] *= 1.0 + 1e-9
+    return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])
 
 
 def strongest(
@@ -152,7 +178,8 @@ def strongest(
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > max(_AT_LEAST, least):
-        return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])))
+        nothing = np.zeros(J.shape[1])
+        return Strongest(gain, 1.0, drive, *one, nothing, nothing, 0.0)
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
@@ -199,6 +226,17 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
         return 1.0
     rank = basis.shape[1]
     return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
+
+
+def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
+    """The step of the unknowns to where the whitened residual is least.
+
+    Args:
+        records: of all outputs.
+    """
+    e = _real(np.concatenate([record.e for record in records])[:, None])
+    J = _real(np.concatenate([record.J for record in records]))
+    return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
 class _Asked(NamedTuple):
@@ -309,17 +347,19 @@ def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray
 
 def _steps(
     J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
-) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
-    """The step of the unknowns beside further columns less that without, and that without."""
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], float]:
+    """The step of the unknowns beside further columns less that without, that without, and the sum
+    of the steps along the last two columns: a drive and the drive one sample later."""
     columns = np.concatenate([J, more], axis=1)
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
     q = J.shape[1]
     # e falls by J times the step.
     alone = -np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-6)[0]
-    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0][:q]
-    over = np.where(sizes[:q] > 0, sizes[:q], np.inf)
-    return (beside - alone) / over, alone / over
+    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0]
+    over = np.where(sizes > 0, sizes, np.inf)
+    amount = float(np.sum(beside[-2:] / over[-2:]))
+    return (beside[:q] - alone) / over[:q], alone / over[:q], amount
 
 
 def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.marks import mark_words
 from heli_jax.flights.signal_facts import (
@@ -25,7 +26,6 @@ from heli_jax.flights.signal_facts import (
 )
 from heli_jax.flights.strays import stray_words
 from heli_jax.flights.table import sample_count
-from heli_jax.identification.validation.finding import Finding
 
 __all__ = [
     "Rails",
@@ -99,29 +99,26 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
                 saturated.append((sum(facts.shares), label, kind, name, facts))
     if not saturated:
         words = "no signal piles up at an end of its range."
-        return [Finding("saturation", "ok", words, 0.0, _RAIL_LIMIT)]
+        return [Finding("quality.saturation", "ok", words, 0.0, _RAIL_LIMIT)]
     saturated.sort(key=lambda f: -f[0])
     return [_saturated(*f) for f in saturated[:_MOST_NAMED]]
 
 
-def cut_off(flights: Sequence[tuple[str, Facts]]) -> list[tuple[Finding, str]]:
-    """Outputs that rest at an end of their range, each with a few words where it is enough of them
-    to move the estimates.
+def cut_off(flights: Sequence[tuple[str, Facts]]) -> list[Finding]:
+    """Outputs that rest at an end of their range; enough of them denies any model.
 
     Args:
         flights: what each is called, and the facts of its signals.
     """
-    return [
-        (
-            _saturated(sum(facts.shares), label, kind, name, facts),
-            f"{name} is cut off in {100 * sum(facts.shares):.2g} % of its samples"
-            if sum(facts.shares) >= _CUT_OFF
-            else "",
-        )
-        for label, of_signals in flights
-        for (name, kind), facts in of_signals.items()
-        if kind == "output" and sum(facts.shares) > 0
-    ]
+    findings = []
+    for label, of_signals in flights:
+        for (name, kind), facts in of_signals.items():
+            share = sum(facts.shares)
+            if kind == "output" and share > 0:
+                brief = f"{name} is cut off in {100 * share:.2g} % of its samples"
+                found = _saturated(share, label, kind, name, facts)
+                findings.append(found._replace(brief=brief, denies=share >= _CUT_OFF))
+    return findings
 
 
 def _near(rail: Rail) -> str:
@@ -146,7 +143,7 @@ def _saturated(total: float, label: str, kind: str, name: str, facts: SignalFact
     if kind == "input" and len(ends) < 2:
         does = "if it was cut off there after it was logged, or the stick went on, inputs are wrong"
     text = f"{label}: {name} is {' and '.join(ends)}: {does}; leave these parts out."
-    return Finding("saturation", "doubt", text, round(total, 6), _RAIL_LIMIT)
+    return Finding("quality.saturation", "doubt", text, round(total, 6), _RAIL_LIMIT, (name,))
 
 
 def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
@@ -170,10 +167,10 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
             ]
     if not doubts:
         words = "no output stays at one value while others change."
-        return [Finding("stuck outputs", "ok", words, 0.0, _STUCK_LIMIT)]
+        return [Finding("quality.stuck-output", "ok", words, 0.0, _STUCK_LIMIT)]
     doubts.sort(key=lambda f: -f[0])
     return [
-        Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
+        Finding("quality.stuck-output", "doubt", words, round(length, 6), _STUCK_LIMIT)
         for length, words in doubts[:_MOST_NAMED]
     ]
 
@@ -228,11 +225,11 @@ def strays(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     ]
     if not stray:
         words = "no sample stands far outside of all others."
-        return [Finding("stray samples", "ok", words, 0.0, _STRAY_LIMIT)]
+        return [Finding("quality.stray-samples", "ok", words, 0.0, _STRAY_LIMIT)]
     stray.sort(key=lambda f: -f[0])
     remedy = "empty these cells of the log, or give a window without them."
     return [
-        Finding("stray samples", "doubt", words + remedy, float(count), _STRAY_LIMIT)
+        Finding("quality.stray-samples", "doubt", words + remedy, float(count), _STRAY_LIMIT)
         for count, words in stray[:_MOST_NAMED]
     ]
 
@@ -266,10 +263,12 @@ def quantisation(
         words = "no output is logged in steps that show."
         if worst > 0:
             words = f"steps of the log are fine: rounding is at most {worst:.2g} of the noise."
-        return [Finding("quantisation", "ok", words, worst, "rounding rms over noise sd, 1")]
+        return [
+            Finding("quality.quantisation", "ok", words, worst, "rounding rms over noise sd, 1")
+        ]
     doubts.sort(key=lambda d: -d[0])
     return [
-        Finding("quantisation", "doubt", words, ratio, "rounding rms over noise sd, 1")
+        Finding("quality.quantisation", "doubt", words, ratio, "rounding rms over noise sd, 1")
         for ratio, words in doubts[:_MOST_NAMED]
     ]
 

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
@@ -41,6 +41,7 @@ _DEGREE = 180.0 / np.pi
 _NEARLY = 1.3
 """factor about 57.3 that is still degrees taken for radians"""
 
+AGAINST_START, RATE_AGAINST_ANGLE = "signs.against-start", "signs.rate-against-angle"
 AGAINST = -0.3
 """correlation below which a simulated output moves against the measured one"""
 _SURE = 3.0
@@ -76,25 +77,6 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
     return list(dict.fromkeys([*axes, *_PAIRS]))
 
 
-def contradictions(problem: Problem) -> list[str]:
-    """In a few words each angle that runs against its integrated rate, or is in other units: no
-    model follows both."""
-    sentences = []
-    for flight in problem.training:
-        for rate, angle in rates_and_angles(problem.model):
-            if rate not in flight.outputs or angle not in flight.outputs:
-                continue
-            ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
-            if ratio is None:
-                continue
-            size = abs(ratio[0] * ratio[1]) ** 0.5
-            if ratio[0] < 0:
-                sentences.append(f"{angle} runs against the integral of {rate}")
-            elif 1.0 / _NEARLY < max(size, 1.0 / size) / _DEGREE < _NEARLY:
-                sentences.append(f"{angle} moves {size:.3g} times as far as the integral of {rate}")
-    return list(dict.fromkeys(sentences))
-
-
 def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
     ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
     if ratio is None:
@@ -117,7 +99,17 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
         f"{' and '.join(reasons)}."
     )
     criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
-    return [Finding("signs and units", "doubt", words, size, criterion)]
+    # No model follows an angle that runs against its rate, or is in other units.
+    degrees = 1.0 / _NEARLY < max(abs(size), 1.0 / abs(size)) / _DEGREE < _NEARLY
+    brief = (
+        f"{angle} runs against the integral of {rate}"
+        if backward
+        else f"{angle} moves {abs(size):.3g} times as far as the integral of {rate}"
+    )
+    code, denies = RATE_AGAINST_ANGLE, backward or degrees
+    return [
+        Finding(code, "doubt", words, size, criterion, (rate, angle), brief=brief, denies=denies)
+    ]
 
 
 def _of_scale(
@@ -141,7 +133,7 @@ def _of_scale(
         "the scale or the unit of one of the two is off, and a fit puts it into the machine."
     )
     criterion = f"the integrated rate's change over that of the angle, 1 within {most:g}"
-    return [Finding("signs and units", "doubt", words, size, criterion)]
+    return [Finding("units.rate-scale", "doubt", words, size, criterion, (rate, angle))]
 
 
 def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
@@ -356,11 +348,11 @@ def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Findin
             f"(invert: true) or is another column, or the effect of {stick} has the wrong sign at "
             f"the start values. {_or_held(names)}"
         )
-        return [Finding("signs and units", "doubt", words, size, criterion)]
+        return [Finding(AGAINST_START, "doubt", words, size, criterion, (*turned, stick))]
     others = [n for n in signs if n not in turned]
     return [
         Finding(
-            "signs and units",
+            AGAINST_START,
             "doubt",
             f"{label}: at the start values the simulated {name} moves against the measured one "
             f"(correlation {c:+.2f}), though {' and '.join(others)} "
@@ -368,6 +360,7 @@ def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Findin
             f"(invert: true) or is another column. {_or_held(name)}",
             c,
             criterion,
+            (name,),
         )
         for name, c in turned.items()
     ]

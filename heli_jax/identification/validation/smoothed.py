@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.noiseless_outputs import (
     REMEDY,
     noiseless,
     noiseless_words,
 )
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.numerics.white_noise import noise_guess
 
 _LIMIT = "white part over the output's sd, 1e-4"
@@ -33,6 +33,6 @@ def smoothed(flights: Sequence[tuple[str, Flight]], *, process_noise: bool) -> l
         if process_noise:
             words = f"{words} {REMEDY}"
         findings.append(
-            Finding("smoothed", "doubt" if process_noise else "note", words, part, _LIMIT)
+            Finding("quality.smoothed", "doubt" if process_noise else "note", words, part, _LIMIT)
         )
     return findings

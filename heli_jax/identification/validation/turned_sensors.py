@@ -7,10 +7,10 @@ one with the sign opposite to the other's, as nothing but a turn makes it.
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.signal_signs import (
     PARTS,
     WITHIN,
@@ -46,7 +46,7 @@ def turned_sensors(problem: Problem) -> list[Finding]:
                 "and a fit takes that for coupling of roll and pitch. Turn the columns of one."
             )
             criterion = f"{np.degrees(_TURNED):.2g} deg"
-            findings.append(Finding("signs and units", "doubt", words, float(size), criterion))
+            findings.append(Finding("signs.sensors-askew", "doubt", words, float(size), criterion))
     return findings
 
 

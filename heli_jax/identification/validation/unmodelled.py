@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.residual_drives import (
     changing,
@@ -39,6 +40,8 @@ from heli_jax.identification.validation.score_test import (
     NARROW,
     Strongest,
     lines_of,
+    pulled_away,
+    step_to_least,
     strongest,
 )
 from heli_jax.numbers import p_value
@@ -46,104 +49,20 @@ from heli_jax.numbers import p_value
 LEVEL, IN_COLOUR = 0.01, 1e-3
 """of all outputs and questions together; and where residuals in time are autocorrelated, as in
 strong gusts: what whitens them is then too short to leave nothing"""
-_MATTERS = 0.5
-"""standard deviations of an estimate by which a significant misfit has to move it to count: with
-less a 95 % interval still holds the truth in 92 of 100 cases"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
 _ENOUGH = 1.0
 """of twice the log-likelihood, by which a further step says nothing else"""
 
 
-class Unmodelled(NamedTuple):
-    """What the residual of one output follows beyond chance."""
-
-    output: str
-    input: str
-    """that drives it; empty of what the output itself drives"""
-    by_amplitude: bool
-    """whether it is an answer that depends on amplitude; else one that is linear"""
-    frequency: float
-    """of the filter that explains most [rad/s]; 0 of none"""
-    damping: float
-    p_value: float
-    gain: float
-    """of twice the log-likelihood"""
-    moved: Mapping[str, float]
-    """by estimate how far it moves where that is in the model, in its standard deviations"""
-    over_time: bool = False
-    """whether it is an answer that changes over the record"""
-    between: str = ""
-    """the flights between which it differs"""
-
-    @property
-    def matters(self) -> bool:
-        """Whether some estimate moves by a good part of its interval, or none has one."""
-        # What depends on amplitude or time changes what an estimate means, whatever the fit makes
-        # of it.
-        if self.by_amplitude or self.over_time or self.between or not self.moved:
-            return True
-        return max(abs(v) for v in self.moved.values()) > _MATTERS
-
-    @property
-    def words(self) -> str:
-        """What is missing, in a few words."""
-        if self.by_amplitude:
-            return f"the response of {self.output} depends on amplitude"
-        if self.over_time:
-            return f"the response of {self.output} changes over the record"
-        if self.between:
-            return f"the response of {self.output} differs between {self.between}"
-        return f"the residual of {self.output} still follows {self.input}{self._where}"
-
-    @property
-    def _where(self) -> str:
-        return f" near {self.frequency:.2g} rad/s" if self.damping < 1.0 else ""
-
-    @property
-    def sentence(self) -> str:
-        """For the notes of a fit."""
-        chance = f"twice the log-likelihood gains {self.gain:.3g}, p {p_value(self.p_value)}"
-        if self.by_amplitude:
-            said = (
-                f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
-                "rate limit, a deadband, play, friction, another slope to one side or another "
-                "nonlinearity is missing."
-            )
-        elif self.over_time:
-            said = (
-                f"The response of {self.output} changes over the record ({chance}): rotor speed, "
-                "mass or speed did, or the log's clock, and the estimates are means of what they "
-                "were. Fit shorter windows, and compare (heli-jax compare)."
-            )
-        elif self.between:
-            said = (
-                f"The response of {self.output} differs between {self.between} ({chance}): mass, "
-                "rotor speed or speed does, or the scale, sign or clock of a column, and the "
-                "estimates are means. Fit the flights by themselves, and compare (heli-jax "
-                "compare)."
-            )
-        else:
-            what = "a mode or a lag" if self.damping < 1.0 else "dynamics"
-            said = (
-                f"The residual of {self.output} follows {self.input} through {what}"
-                f"{self._where} ({chance}), which the model lacks; if it has them, is this a poor "
-                "optimum? Several starts (fit.starts) tell."
-            )
-        if not self.matters:
-            return f"{said} It moves no estimate by more than {_MATTERS:g} sd."
-        return f"{said} No interval allows for what that does to the estimates."
-
-
 def unmodelled(
     at: Solution,
     e: Evaluation,
-    sds: Mapping[str, float | None],
     *,
     coloured: bool = False,
     flights: Sequence[str] = (),
-) -> tuple[Unmodelled, ...]:
-    """What the residuals follow beyond chance, by output at most one.
+) -> tuple[Finding, ...]:
+    """Findings of what the residuals follow beyond chance, at most one an output.
 
     An output that is slower than the grid is asked at its own samples. Of others with gaps, of a
     simulation that left the record, of windows and of sensors compared with each other nothing is
@@ -153,7 +72,6 @@ def unmodelled(
     Args:
         at: where the fit ended.
         e: what that tells.
-        sds: of the estimates of interest, as they are reported.
         coloured: whether the residuals in time are autocorrelated.
         flights: what each is called.
     """
@@ -170,8 +88,49 @@ def unmodelled(
         asked = _of_output(at, e, name, J)
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            lacking.append(_said(at, e, name, one, sds, flights))
-    return tuple(lacking)
+            lacking.append(_said(at, e, name, one, J, flights))
+    return (*lacking, *_asked_otherwise(at, e, names, J))
+
+
+def _asked_otherwise(
+    at: Solution, e: Evaluation, names: Sequence[str], J: Mapping[tuple[int, str], np.ndarray]
+) -> list[Finding]:
+    """A finding where the whitened answer to the inputs asks for other values of the parameters.
+
+    Output error takes slow drift for slow modes; filter error learns also from how its disturbance
+    goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
+    """
+    k, lines, chances = len(at.layout.of_interest), [], []
+    for name in names:
+        of_output = []
+        for i, own in of_one_clock(at, e, name):
+            left, slopes = np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows]
+            of_output.append(lines_of(left, slopes, np.zeros((left.size, 0)), own.holes))
+        of_output = [one for one in of_output if one is not None]
+        if of_output:
+            chances.append(pulled_away(of_output, k))
+            lines += of_output
+    if not chances or min(chances) * len(chances) > IN_COLOUR:
+        return []
+    p = min(1.0, min(chances) * len(chances))
+    shifts = step_to_least(lines)[:k] * np.asarray(e.slopes)
+    words = (
+        f"The answer to the inputs asks for other values (p {p_value(p)}): a disturbance, drift or "
+        "the assumed place or spectrum of the gusts has moved the estimates. Compare method: "
+        "frequency-error (fit.also), or another disturbance (on, poles)."
+    )
+    return [
+        Finding(
+            "agreement.inputs-ask-otherwise",
+            "doubt",
+            words,
+            p,
+            f"probability of as much by chance, {IN_COLOUR:g}",
+            tuple(at.layout.of_interest),
+            dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
+            "the answer to the inputs asks for other values",
+        )
+    ]
 
 
 class _Asked(NamedTuple):
@@ -186,6 +145,8 @@ class _Asked(NamedTuple):
     """the flight that it is of, where it is an answer that only one gives"""
     flights: tuple[int, ...]
     """that were looked at"""
+    columns: int
+    """drives before those of a changing parameter"""
 
 
 def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked:
@@ -228,25 +189,6 @@ def unasked(at: Solution) -> tuple[str, ...]:
     return tuple(n for n, could in asked.items() if not could)
 
 
-def with_unmodelled(
-    adequacy: Adequacy, lacking: tuple[Unmodelled, ...], gappy: tuple[str, ...] = ()
-) -> Adequacy:
-    """The adequacy, no plain yes where something that matters is missing, or was not asked for.
-
-    Args:
-        adequacy: as judged by size and whiteness, or in frequency.
-        lacking: of `unmodelled`.
-        gappy: the outputs of which that was not asked.
-    """
-    if gappy:
-        words = f"what {', '.join(gappy)} may lack was not asked, since samples are missing"
-        adequacy = adequacy.only_if([words])
-    if not lacking:
-        return adequacy
-    adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in lacking)))
-    return adequacy.only_if([f.words for f in lacking if f.matters])
-
-
 def _of_output(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> _Asked | None:
@@ -287,7 +229,8 @@ def _of_output(
     odd = those[(best.drive - columns) // k][0] if best.drive >= columns else None
     by_amplitude, over = best is curved, best is changed and odd is None
     asked = tuple(i for i, _ in those)
-    return _Asked(best, by_amplitude, over, float(deviance), odd, asked)
+    before = columns if odd is not None else constant
+    return _Asked(best, by_amplitude, over, float(deviance), odd, asked, before)
 
 
 def _said(
@@ -295,33 +238,97 @@ def _said(
     e: Evaluation,
     name: str,
     one: _Asked,
-    sds: Mapping[str, float | None],
+    J: Mapping[tuple[int, str], np.ndarray],
     flights: Sequence[str],
-) -> Unmodelled:
-    strong = one.strong
-    moving, moved = moving_inputs(at), {}
-    for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
-        sd = sds.get(parameter)
-        if sd:
-            moved[parameter] = float(strong.shift[k] * slope / sd)
+) -> Finding:
+    strong, moving, slopes = one.strong, moving_inputs(at), np.asarray(e.slopes)
+    k = slopes.size
+    shifts = strong.shift[:k] * slopes
+    if one.over_time or one.odd is not None:
+        # The drive is the sensitivity of one parameter, which is off by the change itself as well.
+        changed = (strong.drive - one.columns) % k
+        change = strong.amount * slopes[changed]
+        there = shifts[changed] + change
+        shifts[changed] = max((shifts[changed], there, -change), key=abs)
     first, own = of_one_clock(at, e, name)[0]
-    dt = float(at.data.flights[first].dt) * own.every
-    odd = ""
-    if one.odd is not None:
-        called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
-        # Of two nobody knows which one is odd.
-        two = len(called) == 2
-        odd = " and ".join(called) if two else called[one.flights.index(one.odd)]
-        odd += "" if two else " and the others"
-    return Unmodelled(
-        name,
-        moving[strong.drive] if strong.drive < len(moving) else "",
-        one.by_amplitude,
-        strong.frequency / dt,
-        strong.damping,
+    frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
+    where = f" near {frequency:.2g} rad/s" if strong.damping < 1.0 else ""
+    chance = f"twice the log-likelihood gains {strong.statistic:.3g}, p {p_value(strong.p_value)}"
+    if one.by_amplitude:
+        shifts = _by_amplitude(at, e, name, J) * slopes
+        code, subjects = "dynamics.depends-on-amplitude", (name,)
+        brief = f"the response of {name} depends on amplitude"
+        remedy = (
+            "a saturation, a rate limit, a deadband, play, friction or another nonlinearity is "
+            "missing"
+        )
+    elif one.odd is not None:
+        between = _between(one, flights)
+        code, subjects = "dynamics.flights-differ", (name, *between)
+        brief = f"the response of {name} differs between {' and '.join(between)}"
+        remedy = (
+            "mass, rotor speed or speed does, or the scale, sign or clock of a column. Fit the "
+            "flights by themselves, and compare (heli-jax compare)"
+        )
+    elif one.over_time:
+        code, subjects = "dynamics.changes-over-record", (name,)
+        brief = f"the response of {name} changes over the record"
+        remedy = (
+            "rotor speed, mass or speed did, or the log's clock. Fit shorter windows, and compare "
+            "(heli-jax compare)"
+        )
+    else:
+        drive = moving[strong.drive]
+        code, subjects = "dynamics.residual-follows-input", (name, drive)
+        brief = f"the residual of {name} still follows {drive}{where}"
+        what = "a mode or a lag" if strong.damping < 1.0 else "dynamics"
+        remedy = f"the model lacks {what}, or this is a poor optimum (try fit.starts)"
+    return Finding(
+        code,
+        "doubt",
+        f"{brief[0].upper()}{brief[1:]} ({chance}): {remedy}.",
         strong.p_value,
-        strong.statistic,
-        moved,
-        one.over_time,
-        odd,
+        f"probability of as much by chance, {LEVEL:g} over all outputs",
+        subjects,
+        dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
+        brief,
     )
+
+
+def _by_amplitude(
+    at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
+) -> np.ndarray:
+    """By unknown of interest (k,) its change over one standard deviation of the amplitude of an
+    input or of the output, whichever explains more.
+
+    The residual is regressed on the sensitivities, and on these times the amplitude. It is not
+    whitened: the answer that depends on amplitude is as slow as the response itself.
+    """
+    k, samples = len(at.layout.of_interest), of_one_clock(at, e, name)
+    left = np.concatenate([np.asarray(e.raw[i][name])[own.rows] for i, own in samples])
+    rows = np.concatenate([J[i, name][own.rows] for i, own in samples])
+    best, least = np.zeros(k), np.inf
+    for drive in (*moving_inputs(at), None):
+        signals = [
+            np.asarray(e.simulated[i][name] if drive is None else getattr(f.inputs, drive))[
+                own.rows
+            ]
+            for (i, own), f in ((pair, at.data.flights[pair[0]]) for pair in samples)
+        ]
+        amplitude = np.abs(np.concatenate(signals))
+        amplitude = (amplitude - amplitude.mean()) / max(float(np.std(amplitude)), 1e-300)
+        columns = np.concatenate([rows, rows[:, :k] * amplitude[:, None]], axis=1)
+        change = -pseudoinverse(columns) @ left
+        squares = float(np.sum((left + columns @ change) ** 2))
+        if squares < least:
+            best, least = change[rows.shape[1] :], squares
+    return best
+
+
+def _between(one: _Asked, flights: Sequence[str]) -> tuple[str, ...]:
+    """The flights between which the response differs; of two nobody knows which is odd."""
+    called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
+    if len(called) == 2:
+        return tuple(called)
+    assert one.odd is not None
+    return (called[one.flights.index(one.odd)], "the others")

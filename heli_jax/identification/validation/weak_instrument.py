@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.frequency_instrument import (
     PART,
     STRONG,
@@ -90,7 +91,7 @@ def _of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " q"]:
     return mean_share(by_line.sum(axis=0))(by_line[weak].sum(axis=0))
 
 
-def weak_note(names: Sequence[str]) -> list[str]:
+def weak_note(names: Sequence[str]) -> list[Finding]:
     """What a fit says of them.
 
     Args:
@@ -98,11 +99,17 @@ def weak_note(names: Sequence[str]) -> list[str]:
     """
     if not names:
         return []
-    return [
+    words = (
         f"Weak instrument: {', '.join(names)} show at frequencies at which the inputs hardly "
         f"follow the excitation (F below {STRONG:g}, all inputs together). They may be off by "
-        "many of their standard deviations and are not to be trusted. Remedy: a sweep that begins "
-        "at lower frequencies or is stronger there, or longer records."
+        "many of their standard deviations. Fly a sweep that begins at lower frequencies or is "
+        "stronger there, or longer records."
+    )
+    brief, names = "weak instrument", tuple(names)
+    return [
+        Finding(
+            "loop.weak-instrument", "doubt", words, None, "", names, brief=brief, distrusts=names
+        )
     ]
 
 

@@ -26,10 +26,8 @@ from heli_jax.report.tables.first_guess import first_guess, selection_steps, sta
 from heli_jax.report.tables.handling import handling, handling_sentences
 from heli_jax.report.tables.headline import (
     Headline,
-    adequate,
     further_sentences,
     headline,
-    held_out_doubt,
     model_remark,
     warnings,
 )
@@ -45,7 +43,6 @@ __all__ = [
     "Origin",
     "Table",
     "acceptance",
-    "adequate",
     "agreement",
     "baseline_facts",
     "baseline_ratios",
@@ -58,7 +55,6 @@ __all__ = [
     "handling_sentences",
     "headline",
     "held_out_bands",
-    "held_out_doubt",
     "held_out_flights",
     "intervals",
     "meanings",

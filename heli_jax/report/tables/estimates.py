@@ -62,10 +62,10 @@ def _estimate(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
         at = where_it_stopped(e)
         return (name, at, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
     # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
-    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
+    if e.sd is None or not math.isfinite(e.sd):
         return (name, NOT_DETERMINED, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
     value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
-    interval = f"{low} to {high}"
+    interval = "not trusted" if e.lower95 is None else f"{low} to {high}"
     share_sd = relative(e.sd, e.value)
     return (name, value, sd, share_sd, interval, pretty(e.unit), start, share, bound)
 

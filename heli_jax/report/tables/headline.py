@@ -6,10 +6,8 @@ import numpy as np
 
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
-from heli_jax.numbers import vaf_text
 from heli_jax.report.fit_content import whiteness_note
 from heli_jax.vehicle import of_helicopter
 
@@ -24,27 +22,14 @@ class Headline(NamedTuple):
 
 
 def headline(fit: Fit) -> Headline:
-    """Did the optimiser arrive; what do the data determine; is the model adequate."""
-    level, word, text = _determined(fit)
-    if not fit.adequate:
-        worst = fit.adequacy.less_than_mean or level == "bad"
-        level = "bad" if worst else "warning"
-    if (fit.adequacy.coloured or fit.adequacy.one_step_only) and level == "good":
-        level = "warning"
-    doubt = held_out_doubt(fit)
-    if doubt and level == "good":
-        level = "warning"
-    held = f". Held out: {doubt}" if doubt else ""
-    return Headline(level, word, f"{text}; adequate: {adequate(fit)}{held}")
+    """Did the optimiser converge; what do the data determine; is the model adequate.
 
-
-def held_out_doubt(fit: Fit) -> str:
-    """What flights held out have against the fit, in a few words; empty where nothing."""
-    # A simulation of an unstable machine leaves any flight: in frequency nothing is simulated.
-    if fit.held_out_frequency is not None and fit.held_out_frequency.flights:
-        return fit.held_out_frequency.doubt
-    worse = [f"{n} ({vaf_text(m.vaf)})" for n, m in fit.validation.items() if not m.vaf >= 0]
-    return f"worse than the mean (VAF): {', '.join(worse)}" if worse else ""
+    The light is that of the exit code.
+    """
+    code = fit.exit_code
+    level = "good" if code == 0 else "bad" if code == 4 or fit.not_identifiable else "warning"
+    word, text = _determined(fit)
+    return Headline(level, word, f"{text}; adequate: {fit.adequate_in_words}")
 
 
 def further_sentences(fit: Fit) -> list[str]:
@@ -52,7 +37,7 @@ def further_sentences(fit: Fit) -> list[str]:
     # What the data determine is a property of an optimum.
     if fit.status == "not-converged":
         return []
-    said, lines = _determined(fit).text, []
+    said, lines = _determined(fit)[1], []
     for sentence in fit.verdict.sentences:
         # Both begin with "the data": one of them as a sentence, the other after a colon.
         words = f"t{sentence[1:]}" if sentence.startswith("The ") else sentence
@@ -66,30 +51,22 @@ def further_sentences(fit: Fit) -> list[str]:
     return lines
 
 
-def adequate(fit: Fit) -> str:
-    """`yes`, `in size only (...)`, `no (...)`; what stopped before an optimum was not judged."""
-    return fit.adequacy.summary
-
-
-def _determined(fit: Fit) -> Headline:
+def _determined(fit: Fit) -> tuple[str, str]:
     """The status in words: what the data determine, and whether that may be believed."""
     v, names = fit.verdict, tuple(fit.estimates)
     # Before all else: what is said at a point that is no optimum holds for that point alone.
     if fit.status == "not-converged":
         text = "the optimiser stopped before an optimum; the numbers below are where it stopped"
-        return Headline("bad", "not converged", text)
+        return "not converged", text
     if fit.status == "not-identifiable":
         missing = [n for n in v.names if n in v.undetermined or n in v.without_effect]
         text = f"the data do not determine {listed(missing or list(v.names))}"
-        return Headline("bad", "converged, not identifiable", text)
-    resting = bool(v.resting)
+        return "converged, not identifiable", text
     # The sentence must not credit the data with what a prior contributed.
-    who = "the data and the priors together" if resting else "the data"
+    who = "the data and the priors together" if v.resting else "the data"
     text = f"{who} determine {listed(names)}"
     doubtful = _doubts(fit)
-    if doubtful:
-        text += f", but {listed(doubtful)}"
-    return Headline("warning" if doubtful or resting else "good", "converged", text)
+    return "converged", f"{text}, but {listed(doubtful)}" if doubtful else text
 
 
 def _doubts(fit: Fit) -> list[str]:
@@ -102,22 +79,14 @@ def _doubts(fit: Fit) -> list[str]:
             bool(v.through_zero),
         ),
         ("the intervals are too narrow", fit.overconfident),
-        # Where the noise's spectrum is estimated nothing asks them to be white.
-        ("the residuals are not white", fit.coloured and not fit.white and not _by_spectrum(fit)),
-        # Widened though each residual is white by itself: then several outputs err together.
-        ("residuals of outputs are correlated", fit.coloured and fit.white),
         (
-            f"{listed(fit.untrusted) if fit.untrusted else ''} not to be trusted",
+            f"{listed(fit.untrusted) if fit.untrusted else ''} not trusted",
             bool(fit.untrusted),
         ),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
     return [words for words, is_so in doubts if is_so]
-
-
-def _by_spectrum(fit: Fit) -> bool:
-    return estimator_of(fit.method).noise_spectrum
 
 
 def warnings(fit: Fit) -> list[str]:

@@ -3,7 +3,7 @@
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
-from heli_jax.identification.validation.advice import FAR_FROM_WHITE, GATE
+from heli_jax.identification.validation.advice import FAR_FROM_WHITE
 from heli_jax.numbers import percent
 
 
@@ -26,6 +26,11 @@ def meanings(fit: Fit) -> list[tuple[str, str]]:
             "initial states.",
         ),
         ("Adequate", _adequate(fit)),
+        (
+            "Not trusted",
+            "a misfit that was found moves the estimate by more than half of its 95 % interval, or "
+            "by an amount that is not known: the interval is withdrawn.",
+        ),
         ("Residuals that are not white", _coloured(fit)),
     ]
 
@@ -35,21 +40,15 @@ def _adequate(fit: Fit) -> str:
         ahead = fit.adequacy.ahead
         what = "simulation" if ahead is None else f"predictions up to {ahead:g} s ahead"
         return (
-            f"yes where the innovations of all outputs are white and the error of the {what} "
-            f"has at most {EXPECTED:g} times the power that the estimated disturbance makes, and "
-            "nothing is found that the model lacks; in size only where innovations are not white "
-            f"but have an autocorrelation below {FAR_FROM_WHITE:g} at one sample, or the "
-            f"simulation explains {percent(EXPLAINED, 0)} of what is not white noise; one step "
-            "ahead only where that holds, but the simulation by the inputs alone is worse than the "
-            "mean; no otherwise."
+            f"the error of the {what} has at most {EXPECTED:g} times the power that the estimated "
+            "disturbance makes, with innovations that are white or have an autocorrelation below "
+            f"{FAR_FROM_WHITE:g} at one sample; or the simulation explains {percent(EXPLAINED, 0)} "
+            "of what is not white noise. Nothing in the record speaks against every model."
         )
     return (
-        "yes where the residuals of all outputs are white (Ljung-Box at 1 %) and nothing is found "
-        "that the model lacks, a mode or a dependence on amplitude or time (1 %); in size only "
-        "where something is, or they are not white, but the simulation explains at least "
-        f"{percent(EXPLAINED, 0)} of what is not white noise, or at most "
-        f"{percent(NEARLY_WHITE, 0)} of the residual's variance is other than that (a VAF below "
-        f"{GATE:g} is then stated with it); no otherwise."
+        f"the simulation explains at least {percent(EXPLAINED, 0)} of what is not white noise, or "
+        f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. "
+        "Nothing in the record speaks against every model."
     )
 
 

@@ -40,7 +40,7 @@ def _cell(comparison: MethodComparison, result: MethodResult, name: str) -> str:
     if e.sd is None:
         return NOT_DETERMINED
     value, low, high, _ = measured(e.sd, e.value, e.lower95, e.upper95)
-    return f"{value} ({low} to {high})"
+    return f"{value} (not trusted)" if e.lower95 is None else f"{value} ({low} to {high})"
 
 
 def _seconds(result: MethodResult) -> str:

@@ -1,4 +1,4 @@
-"""Fits in gusts beside a method that weighs by their spectrum; records by SciPy alone."""
+"""Fits in gusts whose answer to the inputs asks for other values; records by SciPy alone."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ import scipy.stats
 
 from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.second_method import with_second_method
 from heli_jax.identification.validation.score_test import lines_of, pulled_away
 
+ASKS_OTHERWISE = "agreement.inputs-ask-otherwise"
 TRUTH = {"Nr": -2.92, "Nped": 20.8, "Kr": 1.376, "Krfb": -5.625}
 YAW = """
 name: yaw
@@ -79,11 +79,9 @@ def test_estimates_that_gusts_have_made_are_not_to_be_trusted(tmp_path):
     found = fit(problem)
     z = {n: (e.value - TRUTH[n]) / (e.sd or np.inf) for n, e in found.estimates.items()}
     assert max(abs(v) for v in z.values()) > 4.0  # or there is nothing to be said
-    beside = with_second_method(problem, found)
-    assert beside.not_borne_out
-    assert beside.untrusted == tuple(TRUTH)
-    assert "does not bear" in beside.distrust
-    assert any("frequency-error, or filter-error" in note for note in beside.notes)
+    assert {n for n, v in z.items() if abs(v) > 1.96} <= set(found.untrusted)
+    assert ASKS_OTHERWISE in {f.code for f in found.findings}
+    assert found.exit_code == 3
 
 
 ROTOR = {"tau_f": 0.09, "Lb": 95.0, "Blat": 0.12}
@@ -131,22 +129,20 @@ def test_a_disturbance_in_the_wrong_place_is_told_by_the_inputs(tmp_path, pushed
     (tmp_path / "roll.yaml").write_text(ROLL)
     roll = linear_model(tmp_path / "roll.yaml")
     free = {n: Free(1.2 * v) for n, v in ROTOR.items()}
-    plain = Problem(
-        roll.model, roll.vehicle({}).params, [_turned_by_gusts(1)], free, method="frequency-error"
-    )
-    model = with_disturbance(plain.model, (pushed,))
-    params = model.Params(**plain.vehicle._asdict())
-    problem = Problem(model, params, plain.flights, free, method="filter-error")
-    found = fit(problem)
+    model = with_disturbance(roll.model, (pushed,))
+    params = model.Params(**roll.vehicle({}).params._asdict())
+    found = fit(Problem(model, params, [_turned_by_gusts(1)], free, method="filter-error"))
     z = {n: (e.value - ROTOR[n]) / (e.sd or np.inf) for n, e in found.estimates.items()}
     assert (max(abs(v) for v in z.values()) < 4.0) == borne_out
-    beside = with_second_method(problem, found, undisturbed=lambda: plain)
     if borne_out:
-        assert not beside.untrusted
+        assert not found.untrusted
     else:
-        assert "tau_f" in beside.not_borne_out
-        assert "allows for any gusts" in beside.distrust
-        assert any("the disturbance acts elsewhere" in note for note in beside.notes)
+        [asks] = [f for f in found.findings if f.code == ASKS_OTHERWISE]
+        assert asks.value < 1e-3
+        # Towards the truth.
+        assert asks.shifts["tau_f"] > 0.0
+        assert "tau_f" in found.untrusted
+        assert found.exit_code == 3
 
 
 def test_what_the_inputs_ask_for_is_told_in_any_colour():
@@ -181,10 +177,9 @@ def test_what_goes_along_with_an_open_parameter_has_the_interval_of_both(tmp_pat
             assert e.lower95 < TRUTH[name] < e.upper95, name
 
 
-def test_without_gusts_nothing_is_asked(tmp_path):
-    problem = _problem(tmp_path, 0.0, "output-error")
-    found = fit(problem)
-    assert with_second_method(problem, found) is found
+def test_without_gusts_nothing_is_found(tmp_path):
+    found = fit(_problem(tmp_path, 0.0, "output-error"))
+    assert found.exit_code == 0
     for name, e in found.estimates.items():
         assert e.sd is not None
         assert e.value == pytest.approx(TRUTH[name], abs=4.0 * e.sd)

@@ -1,0 +1,125 @@
+"""Findings about a record, a model or a fit, and the one rule that concludes from them.
+
+A finding is data: a stable code, a severity, its number and limit, and what it does to the
+estimates. Its sentence stands beside these; no code reads it.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+Severity = Literal["ok", "note", "doubt", "refuse"]
+"""ok: tested, nothing found; note: for information; doubt: something may be wrong; refuse: a fit of
+this record says nothing of what is asked"""
+
+UNIT_IN_DOUBT = "units.in-doubt"
+"""code of a signal that may be in another unit than it is read in"""
+_HALF_INTERVAL = 1.96
+"""standard deviations from an estimate to the end of its 95 % interval; a misfit that moves it
+further leaves an interval without the truth in it"""
+
+
+class Finding(NamedTuple):
+    """One finding. The names of the fields are keys of fit.json."""
+
+    code: str
+    """stable, as `timing.input-late`: the topic, then what was found"""
+    severity: Severity
+    sentence: str
+    value: float | None = None
+    criterion: str = ""
+    """what `value` is, and the limit that it is held against"""
+    subjects: tuple[str, ...] = ()
+    """signals, parameters or flights that it is about"""
+    shifts: Mapping[str, float] = MappingProxyType({})
+    """by parameter: how far this misfit moves its estimate [SI], by one step of the score test"""
+    brief: str = ""
+    """the finding in a few words, for the first line of a report"""
+    denies: bool = False
+    """whether it shows that the model does not explain the record"""
+    distrusts: tuple[str, ...] = ()
+    """parameters whose intervals it makes unusable by an amount that is not known"""
+
+    @property
+    def topic(self) -> str:
+        """What was found, as a heading: the part of the code after the dot."""
+        return self.code.partition(".")[2].replace("-", " ")
+
+    @property
+    def bad(self) -> bool:
+        """True for a doubt, or worse."""
+        return self.severity in ("doubt", "refuse")
+
+
+class Distrust(NamedTuple):
+    """Why the interval of one estimate may not be used. The names of the fields are keys of
+    fit.json."""
+
+    code: str
+    """of the finding"""
+    shift: float | None
+    """how far the misfit moves the estimate [SI]; None where that is not known"""
+    brief: str
+
+
+def note(code: str, sentence: str, *subjects: str) -> Finding:
+    """A finding for information alone."""
+    return Finding(code, "note", sentence, subjects=subjects)
+
+
+def sentences(findings: Iterable[Finding]) -> list[str]:
+    """The sentences of findings, each once."""
+    return list(dict.fromkeys(f.sentence for f in findings))
+
+
+def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dict[str, Distrust]:
+    """By parameter the finding that takes its interval away, the largest shift first.
+
+    Args:
+        findings: of a fit.
+        estimates: by parameter, with `sd` [SI]; None where it is not identifiable.
+    """
+    out: dict[str, Distrust] = {}
+    for name, estimate in estimates.items():
+        if estimate.sd is None:
+            continue
+        moved = [f for f in findings if abs(f.shifts.get(name, 0.0)) > _HALF_INTERVAL * estimate.sd]
+        moved.sort(key=lambda f: -abs(f.shifts[name]))
+        unsized = [f for f in findings if name in f.distrusts]
+        if moved:
+            out[name] = Distrust(moved[0].code, float(moved[0].shifts[name]), moved[0].brief)
+        elif unsized:
+            out[name] = Distrust(unsized[0].code, None, unsized[0].brief)
+    return out
+
+
+def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[Finding]:
+    """The findings, a doubt of those that take an interval away and a note of misfits that do not.
+
+    Args:
+        findings: of a fit.
+        estimates: by parameter, with `sd` [SI].
+    """
+    out = []
+    for f in findings:
+        if f.shifts and not f.denies and f.severity != "refuse":
+            moved = bool(distrusted([f], estimates))
+            f = f._replace(severity="doubt" if moved else "note")
+        out.append(f)
+    return out
+
+
+def exit_code(status: str, adequate: bool, distrusts: Mapping[str, Distrust]) -> int:
+    """The exit code of a fit, which the first line and the page's light follow.
+
+    0: the intervals may be used as they stand. 3: something in the record contradicts the numbers
+    (not identifiable, or not trusted). 4: not converged, or the model does not explain the record.
+
+    Args:
+        status: of the fit.
+        adequate: whether the model explains the record.
+        distrusts: of `distrusted`.
+    """
+    if status == "not-converged" or not adequate:
+        return 4
+    return 3 if status == "not-identifiable" or distrusts else 0
