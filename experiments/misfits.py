@@ -27,7 +27,7 @@ H, EVERY, SECONDS = 1e-3, 20, 40.0
 """step of the integration [s], steps in a sample, length of a record [s]"""
 DT = H * EVERY
 LP, LD = -4.0, 30.0
-NOISE = 0.02
+NOISE = 0.05
 """sd of the measurement noise of p [rad/s]; of phi [rad]"""
 FAR = 3.0
 """standard deviations outside of an interval that no fit with exit code 0 may have"""
@@ -94,10 +94,10 @@ class Record(NamedTuple):
 
 
 def command(n: int, rng: np.random.Generator, smooth: bool) -> np.ndarray:
-    """A stick (n,) at the integration's rate: random steps, or a sum of sines up to 2 Hz."""
+    """A stick (n,) at the integration's rate: random steps, or a sum of sines up to 1 Hz."""
     t = H * np.arange(n)
     if smooth:
-        hz = rng.uniform(0.1, 2.0, 12)
+        hz = rng.uniform(0.1, 1.0, 12)
         phase = rng.uniform(0, 2 * np.pi, 12)
         return 0.25 * np.sum(np.sin(2 * np.pi * hz * t[:, None] + phase), axis=1)
     out, k = np.zeros(n), 0
@@ -125,7 +125,9 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
         if k % EVERY == 0 or (roll.smooth and not roll.feedback):
             held = asked[k] - roll.feedback * (p + NOISE * white[k] * (k % EVERY == 0))
         d[k], P[k], PHI[k] = held, seen, phi
-        u = float(roll.actuator(np.asarray(held)))
+        # A stick that moves is in the middle of the step where the mean of its ends is.
+        moved = 0.5 * (asked[min(k + 1, n - 1)] - asked[k]) if roll.smooth else 0.0
+        u = float(roll.actuator(np.asarray(held + moved)))
         servo += H / roll.lag * (u - servo) if roll.lag else u - servo
         gust = decay * gust + shaping * white[k - 1]
         drive = servo
@@ -133,8 +135,13 @@ def flown(roll: Roll, rng: np.random.Generator, seconds: float = SECONDS) -> Rec
             v += H * (roll.mode**2 * (servo - x) - 0.1 * roll.mode * v)
             x += H * v
             drive = 0.7 * servo + 0.3 * x
-        accel = roll.Lp(t) * p + roll.Ld(t) * drive - roll.drag * p * abs(p) + gust
-        p, phi = p + H * accel, phi + H * p
+
+        def accel(p: float, t: float = t, push: float = drive, gust: float = gust) -> float:
+            return roll.Lp(t) * p + roll.Ld(t) * push - roll.drag * p * abs(p) + gust
+
+        # The midpoint rule: Euler's would be off by more than the intervals.
+        middle = p + 0.5 * H * accel(p)
+        p, phi = p + H * accel(middle), phi + H * middle
     shift = round(roll.late / H)
     logged = np.concatenate([np.full(shift, d[0]), d[: n - shift]])[::EVERY]
     logged = logged + roll.input_noise * rng.standard_normal(logged.size)

@@ -234,10 +234,11 @@ def _private_cache() -> str | None:
     folder = _cache()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.chmod(0o700)  # refused where it is another user's
+        folder.chmod(0o700)  # refused where it is another user's, unless this one is root
+        owner = folder.stat().st_uid
     except OSError:
         return None
-    return str(folder)
+    return str(folder) if getattr(os, "getuid", lambda: owner)() == owner else None
 
 
 def _new_directory(options: argparse.Namespace) -> Path:

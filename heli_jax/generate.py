@@ -323,7 +323,7 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[s
         return []
     signals = first_signals(experiment).inputs
     auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
-    moving = [n for n in auto if decide(logged[n]).hold == "linear"]
+    moving = [n for n in auto if decide(logged[n]).hold != "zero-order"]
     if not moving:
         return []
     return [
@@ -343,7 +343,7 @@ def follow(experiment: Experiment) -> Simulated:
     runs: dict[str, Trajectory] = {}
     notes: list[str] = []
     gain = experiment.config.fit is not None and experiment.config.fit.nuisance.input_gain
-    for flight in read_flights(experiment, gain=gain, moving_inputs=False):
+    for flight in read_flights(experiment, gain=gain):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
         run = simulate(model, naming.replace(experiment.vehicle.params, **known), flight)
         outputs = {n: np.asarray(v) for n, v in naming.asdict(run.outputs).items()}

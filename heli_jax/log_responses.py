@@ -24,7 +24,11 @@ from heli_jax.stages import Note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
-_HOLDS = {"linear": "taken to move in straight lines", "zero-order": "held"}
+_HOLDS = {
+    "linear": "taken to move in straight lines",
+    "zero-order": "held",
+    "mixed": "held until they jump",
+}
 
 
 def responses_of_log(
@@ -116,7 +120,8 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         "responses of like flights together"
         for (first, other), names in mixed.items()
     ]
-    return [*notes, *_straight_lines(guessed, 500.0 * flights[0].dt)]
+    steps = [flights[0].logged_step(name, "input") for name in guessed]
+    return [*notes, *_straight_lines(guessed, 500.0 * max(steps, default=0.0))]
 
 
 def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
@@ -124,7 +129,7 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
 
     Args:
         guessed: by input the reason.
-        half: a sample's half [ms].
+        half: of the longest step between samples [ms].
     """
     if not guessed:
         return []
@@ -141,7 +146,8 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
     return [
         f"{', '.join(names)}: {_HOLDS['linear']} between samples, {why}, which is a guess; if "
         f"{'one' if several else 'it'} is a command that is held from sample to sample, "
-        f"{'its ' if several else ''}delays and phase delays are half a sample, {half:.3g} ms, "
+        f"{'its ' if several else ''}delays and phase delays are half a sample, "
+        f"{'up to ' if several else ''}{half:.3g} ms, "
         f"shorter and bandwidths higher: state signals.inputs.{whose}.hold"
     ]
 

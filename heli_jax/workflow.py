@@ -299,10 +299,10 @@ def log_notes(problem: Problem) -> list[str]:
         where = flight.source.path if flight.source else flight.name
         notes += [f"{where}: {note}" for note in (flight.source.notes if flight.source else ())]
         notes += [
-            f"{where}: {name} is taken as linear between samples, since it {reason}"
+            f"{where}: {name} is taken as {flight.hold[name]} between samples, since it {reason}"
             for name, reason in flight.hold_reason.items()
             # Held inputs are what a reader expects of a stick, and need no word.
-            if flight.hold[name] == "linear"
+            if flight.hold[name] != "zero-order"
         ]
     # Several flights may be windows of one log: what is the same for all of them is said once.
     return list(dict.fromkeys(notes))

@@ -572,7 +572,7 @@ def test_who_stops_reading_is_no_failure_and_a_full_disk_is(tmp_path):
 
 def test_the_style_of_the_working_folder_is_passed_over(tmp_path):
     os.mkfifo(tmp_path / "matplotlibrc")
-    script = "cli._info = lambda options: int(bool(__import__('matplotlib').figure))"
+    script = "cli._info = lambda options: int(not __import__('matplotlib').__version__)"
     process = as_program(script, ["info", "log.csv"], tmp_path)
     assert process.communicate(timeout=60)[1] == ""
 
@@ -588,6 +588,15 @@ def test_a_finished_fit_is_shown_where_its_directory_cannot_be_written(bench, ca
     assert "Ixx" in printed.out
     assert "No space left" in printed.err.splitlines()[-1]
     assert [p.name for p in bench.parent.iterdir() if "run" in p.name] == []
+
+
+def test_what_was_compiled_is_kept_for_its_owner_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "heli_jax").mkdir(mode=0o777)
+    assert cli._private_cache() == str(tmp_path / "heli_jax")
+    assert (tmp_path / "heli_jax").stat().st_mode & 0o777 == 0o700
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    assert cli._private_cache() is None
 
 
 def test_two_fits_of_one_directory_are_both_kept(tmp_path):

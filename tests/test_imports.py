@@ -40,7 +40,7 @@ ALLOWED = {
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
     "flights": {
         "stages", "numbers", "errors", "regular_file", "units", "summaries", "yaml_file",
-        "import_path",
+        "import_path", "numerics",
     },
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors", "pickled"},
     "linear_models": {"dynamics", *BASE},

@@ -158,7 +158,7 @@ def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():
     ("column", "value", "sentence"),
     [
         (3, "", "outputs.p: all its samples are missing"),
-        (None, "0", "nothing can be learnt from it"),
+        (None, "0", "no input moves"),
     ],
 )
 def test_a_log_that_says_nothing_is_refused(config, tmp_path, capsys, column, value, sentence):

@@ -242,7 +242,7 @@ def test_text_that_costs_more_than_its_size(tmp_path):
         "    begin = time.monotonic()\n"
         "    try:\n"
         "        read_flight(path, time='t', inputs={'u': Signal('phi', 'rad', 'rad')},\n"
-        "                    outputs={}, moving_inputs=False)\n"
+        "                    outputs={})\n"
         "        said = 'read'\n"
         "    except InputError as e:\n"
         "        said = str(e)\n"

@@ -20,6 +20,7 @@ from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_tran
 from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
 
 _LONGEST = 30.0
@@ -123,17 +124,27 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
             no output has a part that is long enough.
     """
     dt = _one_rate(flights)
+    flights = [without_jumps(f) for f in flights]
     longest = max(f.duration for f in flights)
     window = settings.window or min(longest / 5.0, _LONGEST)
     require_window(window, longest + dt)
-    omega = _frequencies(settings, window, dt)
     inputs = [n for n in flights[0].inputs if any(np.std(f.inputs[n]) > 0 for f in flights)]
     if not inputs:
-        raise ValueError("no input moves, expected one that does")
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
+    step = {n: max(f.logged_step(n, "input") for f in flights) for n in inputs}
+    omega = _frequencies(settings, window, dt, max(dt, min(step.values())))
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
     own = own_instruments(flights, instruments)
     instruments = tuple(n for n in instruments if n not in own)
     notes = _notes(flights, inputs, instruments)
+    notes += [
+        f"{n} was logged at {1.0 / step[n]:.3g} Hz: no response to it above {0.5 / step[n]:.3g} Hz"
+        for n in inputs
+        if omega[-1] * step[n] >= np.pi
+    ]
     notes += [f"{own_said(own)}; it is not used"] if own else []
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
@@ -143,7 +154,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         records = records_of(flights, names, group, parts)
         made = _windows(records, omega, window, names)
         try:
-            outputs |= _outputs(made, dt, (names, group))
+            outputs |= _outputs(made, dt, (names, group), np.array(list(step.values())))
         except TooFewAveragesError as e:
             # Outputs with fewer averages than inputs are no reason to keep back the others.
             without.append(f"{', '.join(group)}: no response, {e}")
@@ -183,19 +194,20 @@ def _one_rate(flights: Sequence[Flight]) -> float:
     return flights[0].dt
 
 
-def _frequencies(settings: Settings, window: float, dt: float) -> np.ndarray:
-    # Fewer than two periods in a window are not told from its own shape.
-    low, high = settings.band or (2.0 / window, _HIGHEST / dt)
+def _frequencies(settings: Settings, window: float, dt: float, step: float) -> np.ndarray:
+    # Fewer than two periods in a window are not told from its own shape; what moves faster than
+    # an input was logged nothing is known of.
+    low, high = settings.band or (2.0 / window, _HIGHEST / step)
     if not low < high:
         if settings.window is None and settings.band is None:
-            least = 2.0 * dt / _HIGHEST
+            least = 2.0 * step / _HIGHEST
             raise ValueError(
                 f"the longest flight is {5.0 * window:.3g} s, too short for responses at "
-                f"{1.0 / dt:.4g} Hz; expected more than {5.0 * least:.3g} s, five windows of "
+                f"{1.0 / step:.4g} Hz; expected more than {5.0 * least:.3g} s, five windows of "
                 "two periods at the highest frequency"
             )
         raise ValueError(
-            f"window: expected one of more than {2.0 * dt / _HIGHEST:.3g} s, got {window:g} s"
+            f"window: expected one of more than {2.0 * step / _HIGHEST:.3g} s, got {window:g} s"
         )
     if high >= 0.5 / dt:
         raise ValueError(
@@ -277,7 +289,11 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
     return notes
 
 
-def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dict[str, Output]:
+def _outputs(
+    windows: Windows, dt: float, names: tuple[Names, list[str]], steps: np.ndarray
+) -> dict[str, Output]:
+    """Each output's responses; none above half the rate at which an input was logged, whose usual
+    `steps` (inputs,) [s] are."""
     (inputs, instruments), outputs = names
     records, omega, window = windows.records, windows.omega, windows.seconds
     m, first = len(inputs), len(inputs) + len(instruments)
@@ -287,7 +303,7 @@ def _outputs(windows: Windows, dt: float, names: tuple[Names, list[str]]) -> dic
     estimate = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
-    seen = (driven & own[y]).T[:, :, None]
+    seen = (driven & own[y]).T[:, :, None] & (omega[:, None] * steps < np.pi)[:, None]
     moving = coherence_where_moving(estimate.coherence, records, by or u, round(window / dt))
     H, sd, coherence = (np.where(seen, v, np.nan) for v in (estimate.H, estimate.sd, moving))
     assert estimate.ends is not None

@@ -171,7 +171,10 @@ def windowed(
     lines = _lines(options, length, dt)
     inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
     if not inputs:
-        raise ValueError("no input moves, expected one that does")
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
     instruments = tuple(
         n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
     )

@@ -36,16 +36,13 @@ from heli_jax.flights.table import Table
 from heli_jax.identification.methods import estimator_of
 
 
-def read_flights(
-    experiment: Experiment, *, gain: bool = False, moving_inputs: bool = True
-) -> tuple[Flight, ...]:
+def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight, ...]:
     """The flights that a configuration names, in SI.
 
     Args:
         experiment: the configuration, with its model at hand.
         gain: whether a plain number is allowed for an input with a unit: an estimated gain then
             carries the unit.
-        moving_inputs: whether a run in which no input ever moves is refused.
 
     Raises:
         InputError: no flights, or one that cannot be read.
@@ -56,15 +53,13 @@ def read_flights(
     flights = tuple(
         flight
         for i, f in enumerate(config.flights)
-        for flight in _read_flight(experiment, i, f, gain, moving_inputs)
+        for flight in _read_flight(experiment, i, f, gain)
     )
     experiment.logs.close()
     return flights
 
 
-def _read_flight(
-    experiment: Experiment, i: int, f: FlightConfig, gain: bool, moving: bool
-) -> tuple[Flight, ...]:
+def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) -> tuple[Flight, ...]:
     """The flight, or where a gap splits it its parts."""
     model = experiment.model
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
@@ -97,7 +92,6 @@ def _read_flight(
             known=f.known,
             hold_out=f.hold_out,
             name=f.name or f"flight {i + 1}",
-            moving_inputs=moving,
             number=f.flight,
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
             follows=follows(experiment, f.rate, inputs),
@@ -237,7 +231,7 @@ def _clock(time: TimeConfig | None) -> Signal | None:
         return None
     if time.rate is not None:
         return by_rate(time.rate, time.signal)
-    return Signal(time.signal or "", time.unit, "s")
+    return Signal(time.signal or "", time.unit, "s", assumed="unit" not in time.model_fields_set)
 
 
 def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
@@ -291,6 +285,12 @@ def _resolved(
     """The signals of a flight's own log; what further logs hold is not asked of its preset."""
     elsewhere = {n for a in f.also for n in (*a.signals.inputs, *a.signals.outputs)}
     onboard = experiment.config.onboard
+    stated = f.signals
+    if "inputs" in stated.model_fields_set and not stated.inputs and stated.preset is None:
+        # Said to be none, and not forgotten: a free decay.
+        names = [n for n in naming.names(experiment.model.Inputs) if n not in elsewhere]
+        none = {n: InputConfig(constant=0.0) for n in names}
+        f = f.model_copy(update={"signals": stated.model_copy(update={"inputs": none})})
     return resolve(experiment.model, f.signals, where, onboard, log, elsewhere)
 
 
@@ -373,7 +373,9 @@ def signals(
     missing = [n for n in known if n not in stated]
     # Every input acts on the machine, so none can be left out; of the outputs one is enough.
     if role == "inputs" and missing:
-        raise InputError(f"{where}.inputs: {missing[0]} missing, model {model.name} needs it")
+        remedy = f"where it did not act, {missing[0]}: {{constant: 0}}"
+        problem = f"{missing[0]} missing, model {model.name} needs it; {remedy}"
+        raise InputError(f"{where}.inputs: {problem}")
     # No output, no residual: there would be nothing to fit, and nothing to compare a simulation
     # with.
     if not stated:

@@ -71,7 +71,7 @@ class TimeConfig(Section):
 class InputConfig(LoggedInputConfig):
     unit: str | None = None
     """that the numbers have then; taken to be in SI unless given"""
-    hold: Literal["auto", "zero-order", "linear"] = "auto"
+    hold: Literal["auto", "zero-order", "linear", "mixed"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
     missing: Numbers | None = None
     """numbers in the log, before scale and offset, that stand for no value, one or a list: the

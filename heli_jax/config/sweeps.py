@@ -71,7 +71,7 @@ def sweep_job(
     reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in sweep.reduce.items()}
     kept = sweep.trajectories
     # Inputs that never move say nothing of parameters, but a sweep may want just that run.
-    flights = (made,) if made is not None else read_flights(experiment, moving_inputs=False)
+    flights = (made,) if made is not None else read_flights(experiment)
     if sweep.start is not None:
         # Two beginnings would contradict each other.
         if made is not None:

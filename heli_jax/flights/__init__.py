@@ -5,7 +5,6 @@ from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.read import (
     read_flight,
     read_parts,
-    require_moving_inputs,
     require_moving_outputs,
 )
 from heli_jax.flights.request import Also, ReadOptions
@@ -23,6 +22,5 @@ __all__ = [
     "describe_log",
     "read_flight",
     "read_parts",
-    "require_moving_inputs",
     "require_moving_outputs",
 ]

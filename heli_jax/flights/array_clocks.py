@@ -10,7 +10,8 @@ import numpy as np
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
-from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
+from heli_jax.flights.row_clock import rate_cautions, rate_of
 from heli_jax.flights.table import Table, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
@@ -36,17 +37,53 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     """
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
     clocks = [c for name, x in arrays.items() if (c := _clock(name, x)) is not None]
-    matched = {n: _clock_of(n, x.size, clocks) for n, x in arrays.items()}
+    seconds = {c.name: _seconds(table, c.name, arrays[c.name]) for c in clocks}
+    matched = {n: _clock_of(n, x.size, clocks, seconds) for n, x in arrays.items()}
     of_clock: dict[str, list[str]] = {}
     for name, clock in matched.items():
         if clock is not None and name not in {c.name for c in clocks}:
             of_clock.setdefault(clock.name, []).append(name)
     if len(of_clock) < 2:
         return None
-    topics = tuple(_topic(table, arrays, c, names) for c, names in of_clock.items())
+    topics = tuple(_topic(table, arrays, c, seconds[c], names) for c, names in of_clock.items())
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
-    return ChannelLog(table.path, table.format, table.size, table.sha256, topics, notes=notes)
+    cautions = [
+        words
+        for t in topics
+        for rate in [1.0 / float(np.median(np.diff(t.times)))]
+        for words in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
+    ]
+    return ChannelLog(
+        table.path,
+        table.format,
+        table.size,
+        table.sha256,
+        topics,
+        notes=notes,
+        cautions=tuple(cautions),
+    )
+
+
+def _stated(
+    clock: str, clocks: Sequence[_Clock], arrays: Mapping[str, np.ndarray]
+) -> dict[float, str]:
+    """What states the rate of a clock, by rate [Hz]: a number in its group, called as it is."""
+    own = next(c for c in clocks if c.name == clock)
+    beside = {c.stem for c in clocks if c.group == own.group}
+    stated = {}
+    for name, values in arrays.items():
+        *group, leaf = _LEVEL.split(name)
+        words = words_in(leaf)
+        # p_fs beside p_t, and fs beside t where that is alone.
+        rest = tuple(w for w in own.stem if w in words)
+        if tuple(group) != own.group or (rest != own.stem and len(beside) > 1):
+            continue
+        plain = "_".join(w for w in words if w not in own.stem)
+        rate = rate_of(plain, values.astype(np.float64))
+        if rate is not None:
+            stated[rate] = f"{shown(name)} = {values.ravel()[0]:g}"
+    return stated
 
 
 def clock_notes(table: Table) -> tuple[str, ...]:
@@ -73,8 +110,11 @@ def _clock(name: str, values: np.ndarray) -> _Clock | None:
     return _Clock(name, tuple(group), words[:at] + words[at + 1 :], values.size)
 
 
-def _clock_of(name: str, size: int, clocks: Sequence[_Clock]) -> _Clock | None:
-    """The clock of an array; None where its group has none of its length, or several."""
+def _clock_of(
+    name: str, size: int, clocks: Sequence[_Clock], seconds: Mapping[str, np.ndarray]
+) -> _Clock | None:
+    """The clock of an array; None where its group has none of its length, or several of which not
+    one alone shares the other groups' time."""
     *group, leaf = _LEVEL.split(name)
     for depth in range(len(group), -1, -1):
         level = tuple(group[:depth])
@@ -85,19 +125,32 @@ def _clock_of(name: str, size: int, clocks: Sequence[_Clock]) -> _Clock | None:
         words = (*group[depth:], *words_in(leaf))
         own = [c for c in near if c.stem and tuple(words[: len(c.stem)]) == c.stem]
         near = own or near
+        others = [c for c in clocks if c.group != level]
+        if len(near) > 1 and others:
+            # GPS time of week beside the board's time.
+            times = seconds[max(others, key=lambda c: c.size).name]
+            shared = (float(times[0]), float(times[-1]))
+            on_it = sharing_clocks({c.name: seconds[c.name] for c in near}, shared)
+            near = [c for c in near if c.name in on_it]
         return near[0] if len(near) == 1 else None
     return None
 
 
-def _topic(
-    table: ArrayTable, arrays: Mapping[str, np.ndarray], clock: str, names: Sequence[str]
-) -> Topic:
-    stamps = arrays[clock]
+def _seconds(table: ArrayTable, clock: str, stamps: np.ndarray) -> np.ndarray:
     unit = table.time_unit(clock) or split_unit(clock)[1] or likely_unit(stamps)
-    units = {n: table.units.get(n, "") for n in names}
     with np.errstate(over="ignore"):  # of a damaged file
-        stamps = stamps * SECONDS[unit]
-    return Topic(clock, stamps, {n: arrays[n] for n in names}, units, clock)
+        return stamps * SECONDS[unit]
+
+
+def _topic(
+    table: ArrayTable,
+    arrays: Mapping[str, np.ndarray],
+    clock: str,
+    times: np.ndarray,
+    names: Sequence[str],
+) -> Topic:
+    units = {n: table.units.get(n, "") for n in names}
+    return Topic(clock, times, {n: arrays[n] for n in names}, units, clock)
 
 
 def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:

@@ -19,10 +19,11 @@ import numpy as np
 
 from heli_jax import import_path
 from heli_jax.errors import InputError
-from heli_jax.flights import mat_file, packed
+from heli_jax.flights import mat_file, packed, stacked
 from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.mat_references import References
 from heli_jax.flights.named_columns import NamedColumns, as_lists
+from heli_jax.flights.stacked import unstacked
 from heli_jax.flights.table import (
     Budget,
     Survey,
@@ -136,7 +137,7 @@ def open_mat(path: Path) -> ArrayTable:
         _require_arrays(path, whole, read.objects)
         listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
         notes = (*notes, f"objects of MATLAB are left out: {listed}")
-    real = {name: np.real(array) for name, array in whole.items()}
+    real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
     named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
     for name, array in real.items():
@@ -144,7 +145,7 @@ def open_mat(path: Path) -> ArrayTable:
             called = named.name(name, i) or part
             arrays[called] = vector
             of_parts[called] = named.unit(name, i) or units.get(name, "")
-    notes = (*notes, *named.notes)
+    notes = (*notes, *of_stacks, *named.notes)
     complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
     words = f"complex numbers, of which the real part is read: {complex_ones}"
     notes = (*notes, words) if complex_ones else notes
@@ -173,8 +174,7 @@ def _require_arrays(
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    # Text and complex numbers are no samples, and more than two dimensions leave open which one is
-    # the time.
+    # Text and complex numbers are no samples.
     if value.dtype.kind not in "biuf" or value.ndim > 2 or not value.size:
         return
     # MATLAB knows no vector: what it calls one is a matrix of a single row or column.
@@ -259,6 +259,11 @@ class DataSets:
         self._stored[name] = values
         self._units[name] = packed.text_of(stated)
 
+    def leave_out(self, name: str, kind: np.dtype, shape: tuple[int, ...] | None) -> None:
+        """Say that numbers are not read, where they are of too many dimensions to be a log's."""
+        if shape and kind.kind in "biuf":
+            self._left_out[name] = f"which has {len(shape)} dimensions"
+
     def add_texts(self, name: str, texts: Sequence[Any]) -> None:
         """A list of texts, by which columns may be called."""
         self._texts[name] = [packed.text_of(text).strip("\0 ") for text in texts]
@@ -275,14 +280,15 @@ class DataSets:
             {paths[name]: values for name, values in self._stored.items()}, self.references.texts
         )
         stated = {paths[name]: unit for name, unit in self._units.items()} | whole.units
-        named = NamedColumns(whole.arrays, self._texts)
+        flat, of_stacks = unstacked(whole.arrays)
+        named = NamedColumns(flat, self._texts)
         arrays, units = {}, {}
-        for name, values in whole.arrays.items():
+        for name, values in flat.items():
             for i, (part, vector) in enumerate(_vectors(name, values)):
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or stated.get(name, "")
-        return arrays, units, (*notes, *self._notes, *whole.notes, *named.notes)
+        return arrays, units, (*notes, *self._notes, *whole.notes, *of_stacks, *named.notes)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -341,7 +347,9 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
 
 def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
     """Whether a data set is an array of numbers, or a table of named fields that are."""
-    return dimensions <= (1 if kind.names else 2) and (bool(kind.names) or kind.kind in "biuf")
+    return dimensions <= (1 if kind.names else stacked.DEEPEST) and (
+        bool(kind.names) or kind.kind in "biuf"
+    )
 
 
 def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:

@@ -6,14 +6,16 @@ never lets it end, and it reads one message at a time.
 """
 
 import array
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.flights import progress
 from heli_jax.flights.digest import Digest
-from heli_jax.flights.log import ChannelLog, Topic, require_samples
+from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
@@ -38,7 +40,11 @@ FIELDS: dict[str, tuple[str, float | None]] = {
 _FEWEST_ROWS = 10
 """of a message, from which on a time that is out of order stands out"""
 # New firmware counts microseconds, old firmware milliseconds.
-_CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}
+# In old firmware's message GPS TimeMS is the time of the week, and T the board's.
+_CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "T": 1e-3}
+# These messages describe the log and are no samples: what they say is in units, parameters and
+# firmware.
+_OF_LOG = ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG")
 _PREFIXES = {1.0: "", 1e-2: "c", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
 # Labels of ArduPilot that `heli_jax.units` does not know, in words that it does.
 _LABELS = {"degheading": "deg", "deglatitude": "deg", "deglongitude": "deg", "satellites": "1"}
@@ -67,6 +73,34 @@ class Format:
         )
 
 
+class Part(NamedTuple):
+    """Messages that are read by one description.
+
+    Attributes:
+        form: the description.
+        number: of the message.
+        since: where the description stands, in the count of `at`.
+        at: where each message stands in the file (N,), increasing.
+        rows: their fields (N,), structured.
+    """
+
+    form: Format
+    number: int
+    since: int
+    at: np.ndarray
+    rows: np.ndarray
+
+
+class _Table(NamedTuple):
+    """The messages of a topic, by one description or by several that were made one."""
+
+    name: str
+    form: Format
+    rows: np.ndarray
+    units: Mapping[str, str]
+    descriptions: int
+
+
 def open_dataflash(path: Path) -> ChannelLog:
     """The flight of a binary DataFlash log.
 
@@ -77,18 +111,15 @@ def open_dataflash(path: Path) -> ChannelLog:
     data = read_regular(path, "a DataFlash log", _LARGEST)
     if not data.startswith(MAGIC):
         raise wrong(str(path), "is no DataFlash log, expected one that begins with a format")
-    formats, starts, damaged = _walk(data)
+    described, damaged = _walk(data)
     raw = np.frombuffer(data, np.uint8)
-    rows = {}
-    for number, places in starts.items():
-        form = formats[number]
-        dtype = form.dtype
-        # Messages of one kind are of one length, so all of them are taken out of the bytes at once.
-        # Each message's bytes become a row, whose columns are then the fields.
-        rows[form.name] = _gathered(raw, np.frombuffer(places, np.int64) + 3, dtype)
-    by_name = {form.name: form for form in formats.values()}
-    names = {number: form.name for number, form in formats.items()}
-    return make_log(str(path), data, rows, by_name, names, damaged)
+    parts = []
+    for form, number, since, starts in described:
+        # Messages of one description are of one length, so all of them are taken out of the bytes
+        # at once. Each message's bytes become a row, whose columns are then the fields.
+        at = np.frombuffer(starts, np.int64)
+        parts.append(Part(form, number, since, at, _gathered(raw, at + 3, form.dtype)))
+    return make_log(str(path), data, parts, damaged)
 
 
 def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
@@ -101,13 +132,25 @@ def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return rows.view(dtype)[:, 0]
 
 
-def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, array.array], int]:
-    """The formats by number, where the messages of each begin, and how often there was neither."""
+class _Described(NamedTuple):
+    """A description, its message's number, where it stands in the file, and where the messages
+    that are read by it begin."""
+
+    form: Format
+    number: int
+    since: int
+    starts: array.array
+
+
+def _walk(data: bytes) -> tuple[list[_Described], int]:
+    """The descriptions that have messages, and how often there was no message."""
     # The format of formats is stated here, since without it the first message could not be read,
     # which states it again.
-    formats = {_FMT: Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
+    of_formats = Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))
+    described = [_Described(of_formats, _FMT, 0, array.array("q"))]
+    forms = {_FMT: of_formats}
     lengths = {_FMT: _FMT_LENGTH}
-    starts: dict[int, array.array] = {}
+    starts = {_FMT: described[0].starts}
     at, damaged, size, report_at = 0, 0, len(data), 0
     while at + 3 <= size:
         if at >= report_at:
@@ -131,35 +174,36 @@ def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, array.array], int]:
         if at + length > size:
             damaged += 1
             break
-        if number == _FMT and not _take_format(data[at + 3 : at + length], formats, lengths):
-            damaged += 1
         # Positions alone are gathered in this loop, and the numbers are read by NumPy afterwards: a
         # log has millions of messages.
-        places = starts.get(number)
-        if places is None:
-            places = starts[number] = array.array("q")
-        places.append(at)
+        starts[number].append(at)
+        if number == _FMT:
+            taken = _format(data[at + 3 : at + length])
+            damaged += taken is None
+            # Every boot describes its messages again. A new firmware may do so otherwise, and what
+            # follows is written by its description.
+            if taken is not None and forms.get(taken[0]) != taken[1]:
+                new = _Described(taken[1], taken[0], at, array.array("q"))
+                described.append(new)
+                forms[new.number], starts[new.number] = new.form, new.starts
+                lengths[new.number] = new.form.dtype.itemsize + 3
         at += length
-    return formats, starts, damaged
+    return [d for d in described if d.starts], damaged
 
 
-def _take_format(body: bytes, formats: dict[int, Format], lengths: dict[int, int]) -> bool:
+def _format(body: bytes) -> tuple[int, Format] | None:
+    """The number and the format that a message FMT describes; None of damage."""
     number, length = body[0], body[1]
     name, kinds, columns = (_text(part) for part in (body[2:6], body[6:22], body[22:86]))
     form = Format(name, kinds, tuple(columns.split(",")) if columns else ())
     # The length is stated beside the kinds that give it. That both agree tells a format from bytes
     # that look like one.
     if not form.is_valid or length != form.dtype.itemsize + 3:
-        return False
-    # A log has one format a number: another is damage that looks like a message.
-    if number in formats:
-        return formats[number] == form
-    # The rows are kept by name, so the same name under a second number would take the place of the
-    # first.
-    if name in {f.name for f in formats.values()}:
-        return False
-    formats[number], lengths[number] = form, length
-    return True
+        return None
+    # The format of formats is the same in every log.
+    if (number == _FMT) != (name == "FMT") or (number == _FMT and length != _FMT_LENGTH):
+        return None
+    return number, form
 
 
 def _text(raw: bytes) -> str:
@@ -167,78 +211,147 @@ def _text(raw: bytes) -> str:
 
 
 def make_log(
-    path: str,
-    data: bytes,
-    rows: dict[str, np.ndarray],
-    formats: dict[str, Format],
-    numbers: dict[int, str],
-    damaged: int,
-    scaled: bool = False,
+    path: str, data: bytes, parts: Sequence[Part], damaged: int, scaled: bool = False
 ) -> ChannelLog:
     """The log that messages make.
 
     Args:
         path: of the file.
         data: its bytes.
-        rows: the messages' fields (N,) by the message's name, structured.
-        formats: what was said of each message.
-        numbers: the names of messages by number.
+        parts: the messages by description, those of one number in the file's order.
         damaged: how many places were no message.
         scaled: whether fields hold numbers that were multiplied already, as text does.
 
     Raises:
         InputError: no message holds a number.
     """
-    units = _units(rows, formats, numbers)
+    alone = {name: _joined([p for p in parts if p.form.name == name], scaled) for name in _OF_LOG}
+    units = _units(parts, alone)
+    tables = []
+    for name in dict.fromkeys(p.form.name for p in parts):
+        if name not in _OF_LOG:
+            tables += _tables(name, [p for p in parts if p.form.name == name], units, scaled)
+    reference = _board_time(tables)
     topics = []
-    for name, table in rows.items():
-        # These messages describe the log and are no samples: what they say is in units, parameters
-        # and firmware.
-        if name not in ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG"):
-            of_message, lost = _topics(formats[name], table, units.get(name, {}), scaled)
-            topics += of_message
-            damaged += lost
+    for table in tables:
+        of_message, lost = _topics(table, _clock(table, reference), scaled)
+        topics += of_message
+        damaged += lost
     require_samples(path, topics)
+    anew = [t.name for t in tables if t.descriptions > 1 or "#" in t.name]
+    words = f"described anew within the log, and read by each description: {', '.join(anew)}"
+    notes = (f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped",) if damaged else ()
     return ChannelLog(
         path=path,
         format="dataflash",
         size=len(data),
         sha256=Digest(data).hex(),
         topics=tuple(topics),
-        firmware=_firmware(rows),
-        parameters=_parameters(rows),
-        notes=(f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped",) if damaged else (),
+        firmware=_firmware(alone["MSG"].rows),
+        parameters=_parameters(alone["PARM"].rows),
+        notes=(*notes, words) if anew else notes,
     )
 
 
-def _topics(
-    form: Format, table: np.ndarray, units: dict[str, str], scaled: bool
-) -> tuple[list[Topic], int]:
+def _tables(
+    name: str, parts: Sequence[Part], units: Mapping[int, dict[str, str]], scaled: bool
+) -> list[_Table]:
+    """The messages of a name as tables: one, but where a new description has another clock or
+    another unit."""
+    groups: list[tuple[list[Part], dict[str, str]]] = []
+    for part in parts:
+        said = units.get(id(part), {})
+        for group, known in groups:
+            clocks = [set(_CLOCKS) & set(p.form.columns) for p in (group[0], part)]
+            if clocks[0] == clocks[1] and all(known.get(c, u) == u for c, u in said.items()):
+                group.append(part)
+                known |= said
+                break
+        else:
+            groups.append(([part], dict(said)))
+    return [
+        _Table(name if not i else f"{name}#{i + 1}", joined.form, joined.rows, said, len(group))
+        for i, (group, said) in enumerate(groups)
+        for joined in (_joined(group, scaled),)
+    ]
+
+
+def _joined(parts: Sequence[Part], scaled: bool) -> Part:
+    """Messages of one name in the file's order, by the columns of all of its descriptions; numbers
+    that one lacks are NaN."""
+    if not parts:
+        return Part(Format("", "", ()), -1, 0, np.zeros(0, np.int64), np.zeros(0, []))
+    if len(parts) == 1:
+        return parts[0]
+    kinds: dict[str, set[str]] = {}
+    for part in parts:
+        for column, kind in zip(part.form.columns, part.form.kinds, strict=True):
+            kinds.setdefault(column, set()).add(kind)
+    letters, types = [], []
+    for column, letter in kinds.items():
+        have = [p.rows.dtype[column] for p in parts if column in p.form.columns]
+        is_text = any(t.kind == "S" for t in have)
+        # Numbers of several kinds are made what they mean before they stand in one column.
+        letters.append(letter.copy().pop() if len(letter) == 1 else "Z" if is_text else "d")
+        same = len(set(have)) == 1 and (is_text or len(have) == len(parts))
+        types.append(have[0] if same else np.dtype("S64" if is_text else "<f8"))
+    form = Format(parts[0].form.name, "".join(letters), tuple(kinds))
+    rows = np.zeros(sum(p.rows.size for p in parts), list(zip(kinds, types, strict=True)))
+    begin = 0
+    for part in parts:
+        own = dict(zip(part.form.columns, part.form.kinds, strict=True))
+        block = slice(begin, begin := begin + part.rows.size)
+        for column, letter in zip(form.columns, letters, strict=True):
+            if column not in own:
+                if rows.dtype[column].kind == "f":
+                    rows[column][block] = np.nan
+                continue
+            values = part.rows[column]
+            if letter != own[column] and not scaled:
+                values = _multiplied(values, FIELDS[own[column]][1])
+            # Text and numbers, or an array and a number, are not made one another.
+            if values.shape[1:] == rows[column].shape[1:] and (
+                (values.dtype.kind == "S") == (rows.dtype[column].kind == "S")
+            ):
+                rows[column][block] = values
+    at = np.concatenate([p.at for p in parts])
+    order = np.argsort(at, kind="stable")
+    return Part(form, parts[-1].number, parts[0].since, at[order], rows[order])
+
+
+def _multiplied(values: np.ndarray, factor: float | None) -> np.ndarray:
+    if factor is None:
+        return values
+    # 718 / 100 is the number nearest to 7.18, 718 * 0.01 is not.
+    return values / round(1.0 / factor) if factor < 1.0 else values * factor
+
+
+def _topics(table: _Table, clock: str, scaled: bool) -> tuple[list[Topic], int]:
     """A message's topics, one for each instance where the log says which field counts them, and
     how many messages are damaged by their times."""
-    tables = _by_instance(form, table, units)
-    kept = {name: _in_order(form, rows) for name, rows in tables.items()}
+    tables = _by_instance(table)
+    kept = {name: _in_order(clock, rows) for name, rows in tables.items()}
     lost = sum(tables[name].size - rows.size for name, rows in kept.items())
-    return [_topic(name, form, rows, units, scaled) for name, rows in kept.items()], lost
+    form, units = table.form, table.units
+    return [_topic(name, form, rows, units, clock, scaled) for name, rows in kept.items()], lost
 
 
-def _by_instance(form: Format, table: np.ndarray, units: dict[str, str]) -> dict[str, np.ndarray]:
-    instance = next((c for c, unit in units.items() if unit == "#"), None)
+def _by_instance(table: _Table) -> dict[str, np.ndarray]:
+    instance = next((c for c, unit in table.units.items() if unit == "#"), None)
     # In text a count is read as any number is.
-    if instance is None or not _are_counts(table[instance]):
-        return {form.name: table}
-    counts = np.unique(table[instance]).astype(np.int64)
+    if instance is None or not _are_counts(table.rows[instance]):
+        return {table.name: table.rows}
+    counts = np.unique(table.rows[instance]).astype(np.int64)
     # A machine with one sensor has instance 0 alone; a name without an index is what its user
     # expects.
     if len(counts) == 1 and not counts[0]:
-        return {form.name: table}
-    return {f"{form.name}[{i}]": table[table[instance] == i] for i in counts}
+        return {table.name: table.rows}
+    return {f"{table.name}[{i}]": table.rows[table.rows[instance] == i] for i in counts}
 
 
-def _in_order(form: Format, table: np.ndarray) -> np.ndarray:
+def _in_order(clock: str, table: np.ndarray) -> np.ndarray:
     """The rows without single ones whose time lies outside of those around them, as where a log was
     cut off in a message: where the others are in order, and these are few."""
-    clock = _clock(form)
     if not clock or table.size < _FEWEST_ROWS:
         return table
     times = table[clock].astype(np.float64)
@@ -255,9 +368,33 @@ def _in_order(form: Format, table: np.ndarray) -> np.ndarray:
     return kept if np.all(np.diff(kept[clock].astype(np.float64)) >= 0) else table
 
 
-def _clock(form: Format) -> str:
-    """The field with the time; some firmware puts it behind the instance."""
-    return next((c for c in form.columns if c in _CLOCKS), "")
+def _clocks(table: _Table) -> list[str]:
+    """The fields that may be the time; some firmware puts it behind the instance."""
+    return [
+        c
+        for c, kind in zip(table.form.columns, table.form.kinds, strict=True)
+        if c in _CLOCKS and (kind in "IQ" or c != "T")
+    ]
+
+
+def _board_time(tables: Sequence[_Table]) -> tuple[float, float] | None:
+    """First and last time [s] by the board's clock: that of the message with the most rows of
+    those with one time that is no GPS time."""
+    certain = [t for t in tables if len(_clocks(t)) == 1 and "Week" not in t.form.columns]
+    if not certain:
+        return None
+    most = max(certain, key=lambda t: t.rows.size)
+    times = most.rows[(clock := _clocks(most)[0])] * _CLOCKS[clock]
+    return float(np.nanmin(times)), float(np.nanmax(times))
+
+
+def _clock(table: _Table, board: tuple[float, float] | None) -> str:
+    """The field with the board's time: of GPS.TimeMS, a time of week, and GPS.T the one that shares
+    the other messages' time. Empty where there is none."""
+    clocks = _clocks(table)
+    if board is None or (len(clocks) < 2 and "Week" not in table.form.columns):
+        return next(iter(clocks), "")
+    return next(iter(sharing_clocks({c: table.rows[c] * _CLOCKS[c] for c in clocks}, board)), "")
 
 
 def _are_counts(values: np.ndarray) -> bool:
@@ -268,7 +405,12 @@ def _are_counts(values: np.ndarray) -> bool:
 
 
 def _topic(
-    name: str, form: Format, table: np.ndarray, units: dict[str, str], scaled: bool
+    name: str,
+    form: Format,
+    table: np.ndarray,
+    units: Mapping[str, str],
+    clock: str,
+    scaled: bool,
 ) -> Topic:
     columns, named = {}, {}
     for column, kind in zip(form.columns, form.kinds, strict=True):
@@ -276,46 +418,45 @@ def _topic(
         # Text is no signal: a mode that is written as its name cannot be an input or an output.
         if values.dtype.kind == "S":
             continue
-        if factor is not None and not scaled:
-            # 718 / 100 is the number nearest to 7.18, 718 * 0.01 is not.
-            values = values / round(1.0 / factor) if factor < 1.0 else values * factor
+        values = values if scaled else _multiplied(values, factor)
         parts = {f"[{i}]": values[:, i] for i in range(values.shape[1])} if values.ndim > 1 else {}
         for end, part in (parts or {"": values}).items():
             columns[f"{name}.{column}{end}"] = part
             if units.get(column, "#") != "#":
                 named[f"{name}.{column}{end}"] = units[column]
-    clock = _clock(form)
     # Without a clock the rows have their order alone, which `clock` says by being empty.
     times = table[clock] * _CLOCKS[clock] if clock else np.arange(len(table), dtype=np.float64)
     return Topic(name, times, columns, named, clock)
 
 
-def _units(
-    rows: dict[str, np.ndarray], formats: dict[str, Format], numbers: dict[int, str]
-) -> dict[str, dict[str, str]]:
-    """The units of each message's fields, by its name; `#` is that of a count of instances."""
-    if "FMTU" not in rows or not {"FmtType", "UnitIds"} <= set(rows["FMTU"].dtype.names or ()):
+def _units(parts: Sequence[Part], alone: Mapping[str, Part]) -> dict[int, dict[str, str]]:
+    """The units of each description's fields, by the id of its part; `#` is that of a count of
+    instances."""
+    stated = alone["FMTU"]
+    if not {"FmtType", "UnitIds"} <= set(stated.rows.dtype.names or ()):
         return {}
-    labels = _pairs(rows.get("UNIT"), "Id", "Label")
-    factors = _pairs(rows.get("MULT"), "Id", "Mult")
-    units: dict[str, dict[str, str]] = {}
+    labels = _pairs(alone["UNIT"].rows, "Id", "Label")
+    factors = _pairs(alone["MULT"].rows, "Id", "Mult")
+    units: dict[int, dict[str, str]] = {}
     # A unit is told in three messages: FMTU has a letter for each field of a format, UNIT says
     # which unit the letter is, MULT what the field's number has to be multiplied with.
-    for row in rows["FMTU"]:
-        name = numbers.get(int(row["FmtType"]), "")
-        if name not in rows:
+    for row, at in zip(stated.rows, stated.at, strict=True):
+        of_number = [p for p in parts if p.number == int(row["FmtType"])]
+        # Of several descriptions it is about the one that holds there.
+        part = next((p for p in reversed(of_number) if p.since <= at), next(iter(of_number), None))
+        if part is None:
             continue
         marks = _text(bytes(row["UnitIds"]))
         scales = _text(bytes(row["MultIds"])) if "MultIds" in row.dtype.names else ""
-        units[name] = {}
+        found = units[id(part)] = {}
         # By the letters of the format, since text has whole numbers as any other.
         for i, (column, kind) in enumerate(
-            zip(formats[name].columns[: len(marks)], formats[name].kinds, strict=False)
+            zip(part.form.columns[: len(marks)], part.form.kinds, strict=False)
         ):
             scale = factors.get(scales[i : i + 1], 1.0)
             unit = _unit(marks[i], labels, scale, kind)
             if unit:
-                units[name][column] = unit
+                found[column] = unit
     return units
 
 
@@ -334,9 +475,9 @@ def _unit(mark: str, labels: dict[str, object], scale: object, kind: str) -> str
     return prefix + label if is_count and label in ("s", "m", "V", "A", "Hz") else label
 
 
-def _pairs(table: np.ndarray | None, key: str, value: str) -> dict[str, object]:
+def _pairs(table: np.ndarray, key: str, value: str) -> dict[str, object]:
     """A column by another; of text both without what stands behind the end, ids as letters."""
-    if table is None or not {key, value} <= set(table.dtype.names or ()):
+    if not {key, value} <= set(table.dtype.names or ()):
         return {}
     pairs = {}
     for row in table:
@@ -353,19 +494,18 @@ def _pairs(table: np.ndarray | None, key: str, value: str) -> dict[str, object]:
     return pairs
 
 
-def _parameters(rows: dict[str, np.ndarray]) -> dict[str, str | int | float]:
+def _parameters(rows: np.ndarray) -> dict[str, str | int | float]:
     return {
         name: value
-        for name, value in _pairs(rows.get("PARM"), "Name", "Value").items()
+        for name, value in _pairs(rows, "Name", "Value").items()
         if isinstance(value, float)
     }
 
 
-def _firmware(rows: dict[str, np.ndarray]) -> str:
+def _firmware(rows: np.ndarray) -> str:
     """The first message that names an ArduPilot."""
-    messages = rows.get("MSG")
-    if messages is None or "Message" not in (messages.dtype.names or ()):
+    if "Message" not in (rows.dtype.names or ()):
         return ""
     # The firmware names itself when it begins to log; messages of the flight may quote anything.
-    texts = [_text(text) for text in messages["Message"][:50]]
+    texts = [_text(text) for text in rows["Message"][:50]]
     return next((t for t in texts if t.startswith(("Ardu", "APM:", "Blimp", "Rover"))), "")

@@ -4,11 +4,12 @@ The oldest have no TimeUS: their rows have only an order, which `info` shows and
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.flights.csv_text import lines_of
-from heli_jax.flights.dataflash import FIELDS, Format, make_log
+from heli_jax.flights.dataflash import FIELDS, Format, Part, make_log
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
@@ -33,22 +34,30 @@ def open_dataflash_text(path: Path) -> ChannelLog:
         OSError: it cannot be read.
     """
     data = read_regular(path, "a DataFlash log in text", _LARGEST)
-    formats: dict[str, Format] = {}
-    numbers: dict[int, str] = {}
-    cells: dict[str, list[list[str]]] = {}
+    formats: dict[str, _Described] = {}
+    described: list[_Described] = []
     damaged = 0
     # Bytes that are no UTF-8 cost the line that they are in and not the log: a message may hold
     # damage.
-    for line in lines_of(data.decode("utf-8", "replace").replace("\r", "")):
+    for at, line in enumerate(lines_of(data.decode("utf-8", "replace").replace("\r", ""))):
         name, _, rest = line.partition(",")
         name = name.strip()
         if name == "FMT":
-            damaged += not _take_format(rest, formats, numbers)
+            taken = _format(rest)
+            damaged += taken is None
+            # A new firmware may describe its messages otherwise from its boot on.
+            if taken is not None and (
+                taken[1].name not in formats or formats[taken[1].name].form != taken[1]
+            ):
+                described.append(_Described(taken[1], taken[0], at, [], []))
+                formats[taken[1].name] = described[-1]
         elif name in formats:
+            form, _, _, places, rows = formats[name]
             # The last cell may be a message with commas of its own.
-            row = [cell.strip() for cell in rest.split(",", len(formats[name].columns) - 1)]
-            if len(row) == len(formats[name].columns):
-                cells.setdefault(name, []).append(row)
+            row = [cell.strip() for cell in rest.split(",", len(form.columns) - 1)]
+            if len(row) == len(form.columns):
+                places.append(at)
+                rows.append(row)
             else:
                 damaged += 1
         # Before the first format stand lines of the firmware and the board.
@@ -56,34 +65,45 @@ def open_dataflash_text(path: Path) -> ChannelLog:
             damaged += 1
     if not formats:
         raise wrong(str(path), "is no DataFlash log, expected lines of FMT that name its columns")
-    rows = {}
-    for name, lines in cells.items():
-        rows[name], bad = _columns(formats[name], lines)
-        damaged += bad
-    rows = {name: table for name, table in rows.items() if table.size}
-    return make_log(str(path), data, rows, formats, numbers, damaged, scaled=True)
+    parts = []
+    for form, number, since, places, rows in described:
+        table, good = _columns(form, rows)
+        damaged += len(rows) - table.size
+        if table.size:
+            parts.append(Part(form, number, since, np.array(places)[good], table))
+    return make_log(str(path), data, parts, damaged, scaled=True)
 
 
-def _take_format(rest: str, formats: dict[str, Format], numbers: dict[int, str]) -> bool:
+class _Described(NamedTuple):
+    """A description, its message's number, the line that it stands in, and the lines and cells of
+    the messages that are read by it."""
+
+    form: Format
+    number: int
+    since: int
+    places: list[int]
+    rows: list[list[str]]
+
+
+def _format(rest: str) -> tuple[int, Format] | None:
+    """The number and the format that a line FMT describes; None of damage."""
     cells = [cell.strip() for cell in rest.split(",")]
     if len(cells) < _FMT_PARTS or not cells[0].isdigit():
-        return False
+        return None
     # A line is FMT, type, length, name, kinds, columns. The length is that of the binary message,
     # which says nothing of a text.
     form = Format(cells[2], cells[3], tuple(cells[_FMT_PARTS - 1 :]))
     # Of arrays nobody has seen a text.
-    if not form.is_valid or "a" in form.kinds or form.name in formats:
-        return formats.get(form.name) == form
-    formats[form.name] = form
+    if not form.is_valid or "a" in form.kinds:
+        return None
     # Cut, since a damaged cell may hold thousands of digits, which Python refuses to convert.
-    numbers[int(cells[0][:9])] = form.name
-    return True
+    return int(cells[0][:9]), form
 
 
-def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, int]:
-    """Lines of one message as a structured array, and how many hold no numbers."""
-    good, parsed = 0, []
-    for row in lines:
+def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, list[int]]:
+    """Lines of one message as a structured array, and which of them hold numbers."""
+    good, parsed = [], []
+    for i, row in enumerate(lines):
         try:
             parsed.append(
                 tuple(
@@ -91,7 +111,7 @@ def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, int]:
                     for kind, cell in zip(form.kinds, row, strict=True)
                 )
             )
-            good += 1
+            good.append(i)
         # A row whose cells are no numbers is left out as a whole: what else it holds is as
         # doubtful.
         except ValueError:
@@ -101,4 +121,4 @@ def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, int]:
     kinds = [FIELDS[kind][0] if kind in _TEXT else "<f8" for kind in form.kinds]
     # A mode is written as its name: a column that never holds a number is text.
     dtype = np.dtype(list(zip(form.columns, kinds, strict=True)))
-    return np.array(parsed, dtype), len(lines) - good
+    return np.array(parsed, dtype), good

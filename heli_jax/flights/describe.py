@@ -26,7 +26,7 @@ from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.row_clock import ROWS
+from heli_jax.flights.row_clock import ROWS, contradicted_rate
 from heli_jax.flights.runs import clock_scale, numbering, numbering_notes, restarts, with_runs
 from heli_jax.flights.table import (
     Survey,
@@ -279,6 +279,7 @@ def describe_table(
             *clock_notes(table),
             *(counter_notes(surveys) if clock is None else arrival_notes(table, clock.column)),
             *numbering_notes(clock.numbering if clock else ""),
+            *(contradicted_rate(table, clock.column, clock.rate) if clock else ()),
             *marks,
         ),
     )

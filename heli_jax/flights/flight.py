@@ -9,7 +9,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.flights.signal_facts import SignalFacts
 
-HOLDS = ("zero-order", "linear")
+HOLDS = ("zero-order", "linear", "mixed")
 _BY_NAME = {
     **dict.fromkeys(("inputs", "outputs", "instruments"), "arrays by name, as {'p': p}"),
     **dict.fromkeys(("sd", "known"), "numbers by name, as {'p': 0.01}"),
@@ -27,8 +27,8 @@ class Signal:
         unit: the unit, such as `deg`.
         si: the SI unit of the model, such as `rad`.
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
-        hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
-            log shows of it.
+        hold: what an input does between samples: "zero-order", "linear", "mixed" (held
+            until it jumps, else linear), or "auto", by what the log shows of it.
         repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
             table), "keep", or "auto", missing where that is unmistakable.
         scale: `unit` per number in the log.
@@ -126,7 +126,8 @@ class Flight:
         known: parameters that differ in this run, SI.
         hold_out: whether the run serves for validation alone.
         hold: by input, what it does between samples: "zero-order" (it stays until the next
-            sample), as all do that are not named, or "linear".
+            sample), as all do that are not named, "linear", or "mixed" (held in the intervals that
+            end in a jump, linear in others; see `heli_jax.numerics.jumps`).
         hold_reason: by input, why the reader of a log took that hold, where the log decided.
         choose_windows: whether its most telling windows are to be fitted in its place.
         instruments: by input, samples (N,) of an excitation that was added to it and that no
@@ -228,6 +229,16 @@ class Flight:
     def duration(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)
+
+    def logged_step(self, name: str, kind: str) -> float:
+        """Usual time between a signal's samples as they were logged [s]; `dt` where none is known.
+
+        Args:
+            name: the model's.
+            kind: `input` or `output`.
+        """
+        facts = self.source.facts.get((name, kind)) if self.source else None
+        return facts.usual if facts is not None and facts.usual > 0 else self.dt
 
     # Imported within: `summaries` is for notebooks, and a flight is made without it.
     def __repr__(self) -> str:

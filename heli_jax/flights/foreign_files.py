@@ -41,6 +41,14 @@ _BY_MARK = (
     (b"#ROSBAG V", _BY_ENDING[".bag"]),
     (b"SQLite format 3\0", _BY_ENDING[".db3"]),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", _SHEET),
+    (
+        b"version https://git-lfs.github.com/spec/",
+        "is a pointer of Git LFS that stands for the log; git lfs pull fetches the log itself",
+    ),
+    (
+        b"/annex/objects/",
+        "is a pointer of git-annex that stands for the log; git annex get fetches the log itself",
+    ),
     (b"FEA1", "is of the first version of Feather; write it anew, frame.to_feather(FILE)"),
     (b"TDSm", _BY_ENDING[".tdms"]),
     (b"MDF     ", _BY_ENDING[".mf4"]),

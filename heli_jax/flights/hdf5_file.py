@@ -76,6 +76,7 @@ def _read(path: Path, kind: str, budget: Budget) -> DataSets:
             read.references.add_letters(dotted, item)
             return
         if not holds_numbers(item.dtype, item.ndim):
+            read.leave_out(dotted, item.dtype, item.shape)
             return
         if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
             return

@@ -2,13 +2,17 @@
 
 An input that stays for several samples and jumps was commanded in steps, and each sample holds
 until the next. One that moves at nearly every sample was sampled on its way: a straight line from
-sample to sample is nearer to it.
+sample to sample is nearer to it. A record may have both: doublets, then a chirp.
 """
 
+import dataclasses
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+
+from heli_jax.flights.flight import Flight
+from heli_jax.numerics.jumps import FEW, POWER, jumps, smallest_move, split, weights
 
 
 class Decision(NamedTuple):
@@ -19,54 +23,65 @@ class Decision(NamedTuple):
 
 
 _LOW_PASSED = "was low-passed as"
-_QUIET = 0.25 + 1e-6
-"""of a jump: a neighbour smaller than that is none"""
-_FEW = 10
-"""quanta in the whole range, below which the resolution of the log hides how an input moves"""
-_ROUNDING = 1e-9
-"""of the range: smaller moves are rounding"""
-_POWER = 1.5
-"""Moves count by their size to this power: between their sum, which much small noise dominates, and
-their energy, which a single glitch does."""
+_SHARE = 0.05, 0.9
+"""share of the motion in jumps, from which on an input is held at them, and at all samples: white
+noise has 0.01, a random walk 0.02, steps under noise of half a percent 0.96"""
 
 
 def decide(values: np.ndarray) -> Decision:
-    """The hold of an input (N,), in any unit, by how it moves from sample to sample.
+    """Decide what an input (N,), in any unit, does between samples, by how it moves.
 
-    A jump is a move between two quiet samples: both neighbouring moves are below a quarter of it.
-    Where jumps make up most of the motion the input was commanded in steps, whether it stays for
-    two samples (a stick logged faster than it was sampled) or two hundred, and whatever noise of a
-    few counts lies on the steps. A smooth motion has hardly any, with or without pauses, and nor
-    has a step that takes several samples. Moves by one count of the log say nothing by themselves:
-    they are the resolution's, of a slow motion or of noise.
+    An input that was commanded in steps moves in jumps, whether it stays for two samples (a stick
+    logged faster than it was sampled) or two hundred, and whatever noise of a few counts lies on
+    the steps. A smooth motion has hardly any, with or without pauses, and nor has a step that takes
+    several samples. An input that does both is mixed. Moves by one count of the log say nothing by
+    themselves: they are the resolution's, of a slow motion or of noise.
     """
     largest = float(np.abs(values).max())
     if largest > 0:
         values = values / largest  # what is left neither overflows nor vanishes
-    moves = np.diff(values)
-    span = float(np.ptp(values))
-    size = np.where(np.abs(moves) > _ROUNDING * span, np.abs(moves), 0.0)
-    moved = size > 0
-    if not moved.any():
+    quantum, span = smallest_move(values), float(np.ptp(values))
+    if not np.isfinite(quantum):
         return Decision("zero-order", "never moves")
-    quantum = float(size[moved].min())
+    moved = np.abs(np.diff(values)) >= quantum
     share = float(moved.mean())
-    if span <= (_FEW + 0.5) * quantum:
-        return _of_few_values(moves, moved, span, quantum, share)
-    # 1.5: one count against two, whatever the rounding of either.
-    evident = np.where(size > 1.5 * quantum, size, 0.0)
-    if not evident.any():
+    if span <= FEW * quantum:
+        return _of_few_values(np.diff(values), moved, share)
+    weight = weights(values)
+    if not weight.any():
         return Decision("linear", f"moves by one count of the log at a time, {_percent(share)}")
-    # The larger of a move's two neighbours; before the first and after the last there is none.
-    beside = np.maximum(np.r_[0.0, size[:-1]], np.r_[size[1:], 0.0])
-    jumps = (evident > 0) & (beside <= _QUIET * evident)
+    held = jumps(values)
     # No move counts for more than the range of nearly all samples: a single absurd number goes
     # farther than all steps together.
     low, high = np.quantile(values, [0.01, 0.99])
-    weight = np.minimum(evident, (high - low) or span) ** _POWER
-    if weight[jumps].sum() >= 0.5 * weight.sum():
-        return Decision("zero-order", _steps(jumps))
+    weight = np.minimum(weight, ((high - low) / span or 1.0) ** POWER)
+    in_jumps = weight[held].sum() / weight.sum()
+    if in_jumps >= _SHARE[1]:
+        return Decision("zero-order", _steps(held))
+    if in_jumps >= _SHARE[0]:
+        count = np.count_nonzero(held)
+        return Decision("mixed", f"jumps {count} times and moves at {_percent(share)}")
     return Decision("linear", f"moves at {_percent(share)}")
+
+
+def without_jumps(flight: Flight) -> Flight:
+    """Return the flight with mixed inputs as linear ones that do nearly the same.
+
+    A held staircase does what a linear one does that is late by half a sample, but for terms of
+    second order in the sample time.
+    """
+    inputs = {}
+    for name, u in flight.inputs.items():
+        if flight.hold[name] == "mixed":
+            stairs, rest = split(u)
+            inputs[name] = rest + 0.5 * (stairs + np.r_[stairs[:1], stairs[:-1]])
+    if not inputs:
+        return flight
+    return dataclasses.replace(
+        flight,
+        inputs={**flight.inputs, **inputs},
+        hold={**flight.hold, **dict.fromkeys(inputs, "linear")},
+    )
 
 
 def low_passed(outputs: Iterable[str]) -> Decision:
@@ -79,11 +94,9 @@ def is_low_passed(reason: str) -> bool:
     return reason.startswith(_LOW_PASSED)
 
 
-def _of_few_values(
-    moves: np.ndarray, moved: np.ndarray, span: float, quantum: float, share: float
-) -> Decision:
-    """Of an input with a handful of values, such as -1, 0 and 1, or noise of a few counts: steps,
-    unless it passes through the values between on its way."""
+def _of_few_values(moves: np.ndarray, moved: np.ndarray, share: float) -> Decision:
+    """Decide for an input with a handful of values, such as -1, 0 and 1, or noise of a few counts:
+    steps, unless it passes through the values between on its way."""
     at = np.flatnonzero(moved)
     # Two moves of the same sign at neighbouring samples are one motion, seen on its way.
     # Of white noise of a few counts less than a third of neighbouring moves agree in sign, since a

@@ -13,6 +13,9 @@ import numpy as np
 from heli_jax.errors import nearest
 from heli_jax.flights.table import shown, wrong
 
+_APART = 1.0
+"""s before and after the others' samples that a topic on their clock may have some"""
+
 
 class Channel(NamedTuple):
     """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where one is missing."""
@@ -54,6 +57,7 @@ class ChannelLog:
         parameters: the firmware's settings, by name.
         notes: what was lost or assumed when it was read, in sentences.
         flight: which flight of the file it is, from 1, and of how many.
+        cautions: what speaks against its times, which every fit repeats.
         start: when the logger began [s], in the log's own count, where the log says so.
     """
 
@@ -67,6 +71,7 @@ class ChannelLog:
     notes: tuple[str, ...] = ()
     flight: tuple[int, int] = (1, 1)
     start: float | None = None
+    cautions: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,6 +116,24 @@ class ChannelLog:
             problem = "its rows have an order and no times, so nothing can be fitted to them"
             raise wrong(self.path, problem, f"channel {shown(name)}")
         return Channel(topic.times, as_floats(topic.columns[name]))
+
+
+def sharing_clocks(
+    clocks: Mapping[str, np.ndarray], shared: tuple[float, float]
+) -> tuple[str, ...]:
+    """The columns of times of one topic that are on the other topics' clock, the nearest first.
+
+    Args:
+        clocks: times (N,) [s] by column.
+        shared: first and last time [s] of the others.
+    """
+    first, last = shared
+    within = {
+        name: float(np.mean((times >= first - _APART) & (times <= last + _APART)))
+        for name, times in clocks.items()
+        if times.size
+    }
+    return tuple(sorted((n for n, part in within.items() if part > 0.5), key=lambda n: -within[n]))
 
 
 def as_floats(values: np.ndarray) -> np.ndarray:

@@ -99,3 +99,5 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
     elif array_table.holds_numbers(array.dtype, array.ndim):
         # In the machine's own order of bytes.
         sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
+    else:
+        sets.leave_out(name, array.dtype, array.shape)

@@ -16,6 +16,7 @@ from heli_jax.flights.resample import (
     goes_down,
     held_low_passed,
     held_mean,
+    held_until_jumps,
     hold,
     in_gaps,
     longest_gap,
@@ -174,16 +175,12 @@ def at_times(
 ) -> OnGrid:
     """The signals on a grid.
 
-    A held input has the mean of what it was until the grid's next instant. Other inputs and the
-    outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
-    than the grid stand at the instants nearest to their own. A held input that a low-passed output
-    follows within a sample is low-passed too, and is linear between samples then.
-
-    Args:
-        request: names them.
-        signals: by key, SI, each on its own clock.
-        holds: by input.
-        times: of the grid (M,) [s].
+    A held input has the mean of what it was until the grid's next instant; a mixed one jumps at the
+    instant nearest to its jump. Other inputs and the outputs are interpolated, or low-pass filtered
+    where the rate goes down; outputs that are slower than the grid stand at the instants nearest to
+    their own. A held input that a low-passed output follows within a sample is low-passed too, and
+    is linear between samples then. Args: request: names them. signals: by key, SI, each on its own
+    clock. holds: by input. times: of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
@@ -193,7 +190,9 @@ def at_times(
     low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
-            if holds[key].hold != "zero-order":
+            if holds[key].hold == "mixed" and not goes_down(signal.seconds, times):
+                samples[key, kind] = held_until_jumps(*signal, times)
+            elif holds[key].hold != "zero-order":
                 samples[key, kind] = resampled(*signal, times)
             elif key in alike:
                 samples[key, kind] = low[key]
@@ -227,6 +226,12 @@ def at_times(
                 made = at_own_rate(own, times)
             samples[key, kind] = np.where(gaps, np.nan, made)
     decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
+    # What was low-passed has no jumps left.
+    decided |= {
+        n: d._replace(hold="linear")
+        for n, d in holds.items()
+        if d.hold == "mixed" and goes_down(signals[n, "input"].seconds, times)
+    }
     return OnGrid(samples, decided, notes)
 
 

@@ -132,6 +132,9 @@ _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
 
 def _reader(path: Path) -> _Reader:
     ending = path.suffix.lower()
+    with open_regular(path, "a log", sys.maxsize) as file:
+        head = file.read(_SNIFFED)
+    foreign_files.refuse(path, head)
     # By the ending first where it says enough, so that a damaged Parquet file is called so and not
     # read as text.
     if ending == ".parquet":
@@ -141,9 +144,6 @@ def _reader(path: Path) -> _Reader:
             problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
             raise wrong(str(path), f"{problem}; expected it unpacked")
         return open_csv
-    with open_regular(path, "a log", sys.maxsize) as file:
-        head = file.read(_SNIFFED)
-    foreign_files.refuse(path, head)
     marked = _by_content(head)
     # What such a file begins with is the user's own text, which may look like the mark of any
     # other; but an autopilot's log may have been given the name of a table.

@@ -13,7 +13,8 @@ FEWEST = 50
 
 
 def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
-    """First and last time [s] of each stretch in which no clock has a gap that nothing bridges.
+    """First and last time [s] of each stretch in which no clock has a gap that nothing bridges; a
+    lone row between gaps is a stretch too.
 
     Args:
         clocks: stamps (N,) [s] of each, increasing.
@@ -26,13 +27,13 @@ def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
         gaps += [(float(seconds[i]), float(seconds[i + 1])) for i in rows]
     intervals, at = [], begin
     for before, after in sorted(gaps):
-        if before > at:
+        if before >= at:
             intervals.append((at, min(before, end)))
         # Gaps of several clocks may overlap.
         at = max(at, after)
-    if at < end:
+    if at <= end:
         intervals.append((at, end))
-    return [(a, b) for a, b in intervals if b > a]
+    return [(a, b) for a, b in intervals if b >= a]
 
 
 def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> bool:

@@ -21,6 +21,7 @@ from heli_jax.flights.origins import with_origins, without_constants
 from heli_jax.flights.parts import is_too_short, stretches
 from heli_jax.flights.read_channels import clocks_of, on_all_the_time
 from heli_jax.flights.request import ReadOptions, Request
+from heli_jax.flights.slower import Timed
 from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opened
 from heli_jax.flights.table import wrong
 
@@ -58,8 +59,7 @@ def read_flight(
         outputs: the same for what was measured.
         options: which part of the log, at which rate; all of it unless given.
         **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
-            [s], `known` [SI], `hold_out`, `name`, `moving_inputs`, `number`,
-            `also`.
+            [s], `known` [SI], `hold_out`, `name`, `number`, `also`.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.
@@ -67,7 +67,7 @@ def read_flight(
     """
     options = dataclasses.replace(options, **keywords)
     logs, request, finish = _opened(path, time, inputs, outputs, options)
-    return _checked(finish(flight_from(logs, request)), request)
+    return finish(flight_from(logs, request))
 
 
 def read_parts(
@@ -92,8 +92,8 @@ def read_parts(
 
     Returns:
         The run as it is where it has no such gap, else its parts, named `NAME, part 1` and so on.
-        Parts of less than 2 s or 50 samples, and those in which no input moves, are left out; the
-        first one's notes say which.
+        Parts of less than 2 s or 50 samples, and those in which no input moves where one does in
+        others, are left out; the first one's notes say which.
 
     Raises:
         InputError: as `read_flight`, or no part is left.
@@ -112,9 +112,11 @@ def read_parts(
     clocks = [clock.seconds for clock in needed]
     intervals = stretches(clocks)
     if len(intervals) < 2:
-        return (_checked(finish(flight_from(logs, request)), request),)
+        return (finish(flight_from(logs, request)),)
     values = {key: signal.values for key, signal in signals.items()}
     holds = decided_holds(request, values)
+    inputs_of = [s.timed for (_, kind), s in signals.items() if kind == "input"]
+    moving = [i for i in intervals if any(_moves(u, *i) for u in inputs_of)]
     parts, left_out, why = [], [], None
     for start, end in intervals:
         name = f"{options.name or 'flight 1'}, part {len(parts) + 1}"
@@ -122,7 +124,11 @@ def read_parts(
         try:
             if is_too_short((start, end), clocks):
                 raise InputError("too short")
-            flight = _enough_measured(_checked(finish(flight_from(logs, part)), part))
+            # On the ground before and behind a flight; where nothing moves anywhere each part is a
+            # free decay.
+            if moving and inputs_of and (start, end) not in moving:
+                raise InputError("no input moves")
+            flight = _enough_measured(finish(flight_from(logs, part)))
         except InputError as e:
             words = str(e).removeprefix(f"{request.path}, ").removeprefix(f"{request.path}: ")
             left_out.append(f"{start:.6g} s to {end:.6g} s ({words})")
@@ -143,6 +149,12 @@ def read_parts(
         raise wrong(request.path, problem + left_out[-1]) from why
     notes = (*beyond(logs, request), *_notes(intervals, left_out))
     return (_with_notes(parts[0], notes), *parts[1:])
+
+
+def _moves(signal: Timed, start: float, end: float) -> bool:
+    """Whether a signal moves from `start` to `end` [s]."""
+    values = signal.values[(signal.seconds >= start) & (signal.seconds <= end)]
+    return values.size > 1 and bool(np.ptp(values) > 0)
 
 
 def _opened(
@@ -218,32 +230,6 @@ def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
     assert flight.source is not None  # it was read from a log
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
     return dataclasses.replace(flight, source=source)
-
-
-def _checked(flight: Flight, request: Request) -> Flight:
-    # Last, and for every kind of log alike: an input may move in the log and not within the window.
-    if request.options.moving_inputs:
-        require_moving_inputs(flight)
-    return flight
-
-
-def require_moving_inputs(flight: Flight) -> None:
-    """Refuse a flight in which no input moves: nothing can be learnt from it.
-
-    Raises:
-        InputError: naming the first input and the value it keeps.
-    """
-    path = flight.source.path if flight.source else flight.name or "flight"
-    if not flight.inputs or any(x.min() != x.max() for x in flight.inputs.values()):
-        return
-    name, values = next(iter(flight.inputs.items()))
-    others = " as do the others" if len(flight.inputs) > 1 else ""
-    raise wrong(
-        path,
-        f"stays at {values[0]:.6g} (SI) for all of {flight.duration:.6g} s{others}, so nothing"
-        " can be learnt from it; expected an input that moves",
-        f"input {name!r}",
-    )
 
 
 def require_some_time(flight: Flight) -> None:

@@ -90,7 +90,9 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
             outside the log, a rate is needed or makes no sense.
     """
     notes = (*log.notes, *channel_window_note(log, request))
-    source = Source(log.path, log.sha256, notes, log.firmware, log.parameters)
+    source = Source(
+        log.path, log.sha256, notes, log.firmware, log.parameters, cautions=log.cautions
+    )
     return flight_of_signals(signals_of(log, request), request, source, log.first_time)
 
 

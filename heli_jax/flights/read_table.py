@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.clock_faults import require_increasing, unit_notes
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
@@ -46,9 +47,10 @@ from heli_jax.flights.onto_grid import (
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
-from heli_jax.flights.row_clock import ROWS, counted
+from heli_jax.flights.row_clock import ROWS, contradicted_rate, counted
 from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.slower import Timed
+from heli_jax.flights.stacked import NUMBER
 from heli_jax.flights.table import Table, column, sample_count, wrong
 from heli_jax.flights.table_view import first_of_copies, seen_once
 from heli_jax.flights.time_units import require_likely
@@ -77,6 +79,12 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     if request.time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
+    file = table.table if isinstance(table, DerivedTable) else table
+    of_stack = isinstance(file, ArrayTable) and NUMBER in file.names
+    if of_stack and request.time.name == ROWS and not request.options.runs:
+        problem = f"its rows are of several runs, which {NUMBER!r} numbers"
+        remedy = f"expected time: {{rate: HZ, runs: {NUMBER}}}, which makes a flight of each"
+        raise wrong(table.path, f"{problem}; {remedy}")
     if isinstance(table, DerivedTable):
         if request.time.name == ROWS:
             table = DerivedTable(counted(table.table, request.time), table.swashplate)
@@ -152,7 +160,13 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
     notes = (*table.notes, *clock.notes, *other_units(request), *notes)
     notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
-    source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
+    source = Source(
+        table.path,
+        table.sha256,
+        notes,
+        cautions=clock.cautions,
+        first_time=loaded.first_time,
+    )
     source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
@@ -201,6 +215,8 @@ class _Clock:
     notes: tuple[str, ...] = ()
     unit_notes: tuple[str, ...] = ()
     """where the file or a name says another unit"""
+    cautions: tuple[str, ...] = ()
+    """what speaks against the times"""
 
     @contextlib.contextmanager
     def hinting(self) -> Iterator[None]:
@@ -249,9 +265,11 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         raise wrong(table.path, problem, table.place(row), place)
     stamps, notes = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
-    if said and not stated:
-        require_likely(table.path, time.name, time.unit, stamps)
-    return _Clock(stamps, scale, (*notes, *said), said)
+    step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
+    cautions = contradicted_rate(table, time.name, 1.0 / step)
+    if not stated and time.scale == 1.0:
+        cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
+    return _Clock(stamps, scale, (*notes, *said), said, cautions)
 
 
 def _rows(

@@ -58,8 +58,6 @@ class ReadOptions:
     """whether the run serves for validation alone"""
     name: str = ""
     """what to call the run"""
-    moving_inputs: bool = True
-    """whether a run in which no input ever moves is refused"""
     number: int | None = None
     """which flight of a file that holds several, from 1"""
     also: tuple[Also, ...] = ()
@@ -90,7 +88,7 @@ class Request:
     ) -> None:
         self.path, self.options = path, options
         self.known = dict(options.known or {})
-        self.time = Signal(time, "s", "s") if isinstance(time, str) else time
+        self.time = Signal(time, "s", "s", assumed=True) if isinstance(time, str) else time
         # By name and kind: a model may call an input and an output the same.
         self.signals = {(key, "input"): signal for key, signal in inputs.items()}
         self.signals |= {(key, "output"): signal for key, signal in outputs.items()}

@@ -6,6 +6,7 @@ import numpy as np
 
 from heli_jax.flights.band_limited import PASSED, decimate, low_pass
 from heli_jax.flights.clock_steps import step_notes
+from heli_jax.numerics.jumps import split
 
 # What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
 # still near a straight line. What lies in a longer gap nobody knows.
@@ -74,6 +75,24 @@ def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarr
     """
     tolerance = 1e-6 * float(np.median(np.diff(seconds)))
     return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
+
+
+def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """A signal that is held until it jumps, and else follows straight lines.
+
+    A jump comes to the time nearest to its own, so that it remains one on the grid.
+
+    Args:
+        seconds: stamps (N,) [s], increasing.
+        values: samples (N,), finite.
+        times: (M,) [s], evenly spaced, none before the first stamp.
+
+    Returns:
+        (M,), in the samples' unit.
+    """
+    stairs, rest = split(values)
+    nearest = times + 0.5 * (times[1] - times[0])
+    return hold(seconds, stairs, nearest) + resampled(seconds, rest, times)
 
 
 def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -1,10 +1,13 @@
 """Clocks of tables that hold no times: rows, or counts of a column, at a rate that is known."""
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from heli_jax.errors import InputError
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.table import Survey, Table, shown
@@ -15,6 +18,8 @@ _STEPS = {"ts", "dt", "tsample", "tsamp", "tsampling"}
 _RATES = {"fs", "hz"}
 _OF_SAMPLES = {"sample", "samples", "sampling", "time"}
 _STEP_WORDS, _RATE_WORDS = {"time", "step", "period", "interval"}, {"rate", "freq", "frequency"}
+_OTHER_RATE = 0.01
+"""by which a stated rate differs from that of the times at least: less is a clock's own error"""
 FASTEST, SLOWEST = 1e5, 0.2
 """Hz: no record of a flight is outside of these"""
 
@@ -89,16 +94,9 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
     """
     rates: dict[float, str] = {}
     for each in surveys:
-        step = _is_step(each.name)
-        if each.values is None or step is None:
-            continue
-        values = each.values[np.isfinite(each.values)]
-        # In a table a number may stand in the first row alone, or in each.
-        if not values.size or np.ptp(values) > 0 or values[0] <= 0:
-            continue
-        number = float(values[0])
-        rate = 1.0 / number if step else number
-        if SLOWEST <= rate <= FASTEST:
+        rate = rate_of(each.name, each.values)
+        if rate is not None and each.values is not None:
+            number = float(each.values[np.isfinite(each.values)][0])
             rates.setdefault(rate, f"{shown(each.name)} = {number:g}")
     if not rates:
         # Of a text alone there may be anything above the rows.
@@ -109,6 +107,77 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
     # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
+
+
+def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[str, ...]:
+    """A caution where a file states another rate than that of its times.
+
+    Args:
+        table: of rows.
+        clock: the column of times.
+        rate: of its usual step [Hz].
+    """
+    file: Any = table
+    while hasattr(file, "table"):  # below what was derived of it
+        file = file.table
+    stated = dict([above] if (above := getattr(file, "rate_above", None)) else [])
+    for name in table.names:
+        # Of another clock than this one its path tells.
+        if _is_step(name) is not None and _group(name) == _group(clock):
+            stated |= _one_rate(table, name)
+    return rate_cautions(stated, clock, rate)
+
+
+def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple[str, ...]:
+    """A caution for each rate that is neither that of times nor a whole multiple, of which every
+    second or tenth sample may have been logged.
+
+    Args:
+        stated: what says so, by rate [Hz].
+        clock: the column of times.
+        rate: of its usual step [Hz].
+    """
+    if not (math.isfinite(rate) and rate > 0):
+        return ()
+    return tuple(
+        f"the file states {other:.6g} Hz ({words}), and its times {shown(clock)} are at "
+        f"{rate:.6g} Hz: one of the two clocks is wrong, and rates that follow from it are off "
+        f"by {abs(other / rate - 1):.0%}."
+        for other, words in stated.items()
+        if abs(other / rate / max(round(other / rate), 1) - 1.0) > _OTHER_RATE
+    )
+
+
+def _group(name: str) -> str:
+    return re.split(r"[./][^./]*$", name)[0] if re.search(r"[./]", name) else ""
+
+
+def _one_rate(table: Table, name: str) -> dict[float, str]:
+    """The rate [Hz] in a column or an array, where it holds a single number."""
+    try:
+        values = table.numbers([name])[name]
+    except InputError:
+        return {}
+    rate = rate_of(name, values)
+    return {} if rate is None else {rate: f"{shown(name)} = {values[np.isfinite(values)][0]:g}"}
+
+
+def rate_of(name: str, values: np.ndarray | None) -> float | None:
+    """The rate [Hz] that a single number states, or one that stands in every row; None of others.
+
+    Args:
+        name: by which it is a step or a rate.
+        values: (N,)
+    """
+    step = _is_step(name)
+    if values is None or step is None:
+        return None
+    values = values[np.isfinite(values)]
+    # In a table a number may stand in the first row alone, or in each.
+    if not values.size or np.ptp(values) > 0 or values[0] <= 0:
+        return None
+    rate = 1.0 / float(values[0]) if step else float(values[0])
+    return rate if SLOWEST <= rate <= FASTEST else None
 
 
 def _is_step(name: str) -> bool | None:

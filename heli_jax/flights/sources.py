@@ -108,11 +108,15 @@ def flight_from(logs: Opened, request: Request) -> Flight:
         return read_table(log, request)
     notes = (*beyond(logs, request), *(one.note for one in logs.beside))
     if isinstance(log, ChannelLog):
-        source = Source(log.path, log.sha256, (*log.notes, *notes), log.firmware, log.parameters)
+        notes = (*log.notes, *notes)
+        source = Source(
+            log.path, log.sha256, notes, log.firmware, log.parameters, cautions=log.cautions
+        )
         first = log.first_time
     else:
         notes = (*log.table.notes, *log.clock.notes, *notes)
-        source, first = Source(log.table.path, log.table.sha256, notes), log.first_time
+        source = Source(log.table.path, log.table.sha256, notes, cautions=log.clock.cautions)
+        first = log.first_time
     return flight_of_signals(clocked(logs, request), request, source, first)
 
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from heli_jax.flights.table import column, wrong
+from heli_jax.flights.table import column, shown, wrong
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
 """of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
@@ -62,24 +62,34 @@ def split_unit(name: str) -> tuple[str, str]:
     return (match[1], unit) if match and unit else (name, "")
 
 
-def require_likely(path: str, name: str, unit: str, stamps: np.ndarray) -> None:
-    """Refuse stamps in seconds that are a flight's only in the unit that their name says.
+def require_likely(
+    path: str, name: str, unit: str, stamps: np.ndarray, assumed: bool = False
+) -> tuple[str, ...]:
+    """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
+    that one or nobody stated seconds; a caution where somebody did.
 
     Args:
         path: for the message.
         name: of the column.
         unit: in which the stamps are taken.
         stamps: (N,)
+        assumed: whether nobody stated it.
 
     Raises:
         InputError: with what to state.
     """
-    named = split_unit(name)[1]
-    if unit == "s" and named and likely_unit(stamps) == named != unit:
-        step = float(np.median(np.diff(stamps)))
-        problem = f"taken in s its stamps are {step:.4g} s apart, and its name says {named}"
-        remedy = f"expected its unit: {{signal: {name}, unit: {named}}}"
-        raise wrong(path, f"{problem}; {remedy}", column(name))
+    named, likely = split_unit(name)[1], likely_unit(stamps)
+    if unit != "s" or likely == "s":
+        return ()
+    step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
+    problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
+    if named != likely and not assumed:
+        return (f"time: {shown(name)}: {problem}.",)
+    why = f", as its name says {named}" if named == likely else ""
+    remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
+    if named != likely:
+        remedy += ", or unit: s where it is so slow"
+    raise wrong(path, f"{problem}{why}; {remedy}", column(name))
 
 
 def likely_unit(stamps: np.ndarray | None) -> str:

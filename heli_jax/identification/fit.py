@@ -19,6 +19,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
@@ -43,6 +44,7 @@ from heli_jax.identification.further_starts import (
 )
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
@@ -51,6 +53,9 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
     Solution,
     layout_of,
     scales_of,
@@ -58,7 +63,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.expected_accuracy import (
     guessed_gusts,
     starting_at_zero,
@@ -66,6 +71,7 @@ from heli_jax.identification.validation.expected_accuracy import (
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.input_units import doubtful_inputs, scaled_by
+from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
@@ -73,6 +79,7 @@ from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
     RATE_AGAINST_ANGLE,
+    RATE_SCALE,
     against_start,
     sticks_of,
 )
@@ -111,11 +118,27 @@ def first_guess(problem: Problem) -> FirstGuess:
     z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
     return FirstGuess(layout, data, noise, z, e, begun)
+
+
+def _in_free_motion(
+    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
+) -> tuple[Array, Evaluation]:
+    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    from rest at zero no parameter would have any effect."""
+    own = slice(layout.first_nuisance, layout.size)
+    if not (layout.initial_state and np.isfinite(e.J).all()):
+        return z, e
+    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
+    moved = z.at[own].add(step)
+    after = evaluate(layout, data, noise, moved)
+    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -170,6 +193,10 @@ def check(problem: Problem) -> Check:
     )
     sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
+    # Sensitivities are those of the model, whatever moved what was measured.
+    for nothing in [f for f in findings if f.code == NOTHING_FOLLOWS and f.severity == "refuse"]:
+        names = listed(verdict.names, "or")
+        verdict = verdict.nothing(f"The data do not determine {names}: {nothing.sentence}")
     slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
     findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
     return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))
@@ -224,15 +251,6 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 
-def _starts(
-    guess: FirstGuess, problem: Problem, starts: int | None, seed: int
-) -> Float[Array, "s q"]:
-    """Where the optimiser begins, as `fit` says of its argument."""
-    if starts is None:
-        return delay_starts(guess.layout, problem, guess.z, seed)
-    return draw(guess.layout, problem, guess.z, starts, seed)
-
-
 def fit(
     problem: Problem,
     *,
@@ -248,10 +266,10 @@ def fit(
         problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
             within the bounds, or about a factor of three around the start. None: one, or where a
-            delay is free five that differ in the delays; of a linear model by output error six
-            others are tried where the best of these explains less than half of the outputs, and by
-            frequency error where a stable model became unstable: what equation error makes of the
-            record, and five that are drawn.
+            delay is free the deepest valleys of the misfit over the delay, three at most; of a
+            linear model by output error six others are tried where the best of these explains less
+            than half of the outputs, and by frequency error where a stable model became unstable:
+            what equation error makes of the record, and five that are drawn.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -274,21 +292,26 @@ def fit(
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
-    points = _starts(guess, problem, starts, seed)
     # A model that is unstable where the search passes overflows, in time as in its powers; that is
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
-        further = None if starts is not None else seed
-        search, points, optima, optimum = _search(
-            problem, guess, points, further, max_steps, report
-        )
-    about_record = (*cautions(problem), *record_doubts(problem))
+        search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
+    late = _late_inputs(problem, guess.layout)
+    about_record = (*late, *cautions(problem), *record_doubts(problem))
     optimum = optimum._replace(notes=(*about_record, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing)
         estimate = assemble(problem, search, optimum, run)
         return concluded(_with_doubtful_signals(problem, guess, estimate))
+
+
+def _late_inputs(problem: Problem, layout: Layout) -> list[Finding]:
+    """Return the inputs that are logged late where no delay and no shift is free to say so."""
+    if layout.shift or set(problem.model.delay_parameters) & set(problem.free):
+        return []
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    return late_inputs(flights, feedback_of(problem))
 
 
 def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
@@ -302,43 +325,52 @@ def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -
     doubts = doubtful_inputs(*at_start)
     if not estimate.adequate:
         doubts += against_start(*at_start)
-    findings = [
-        f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
-        if f.code == UNIT_IN_DOUBT and not f.denies and estimate.status != "not-converged"
-        else f
-        for f in (*doubts, *estimate.findings)
-    ]
+    findings = []
+    for f in (*doubts, *estimate.findings):
+        if estimate.status != "not-converged" and not f.denies:
+            if f.code == UNIT_IN_DOUBT:
+                f = f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
+            elif f.code == RATE_SCALE:
+                # A scale, a unit or the clock is off: each parameter depends on one of them.
+                f = f._replace(distrusts=tuple(estimate.estimates))
+        findings.append(f)
     return dataclasses.replace(estimate, findings=tuple(findings))
 
 
 def _search(
     problem: Problem,
     guess: FirstGuess,
-    points: Float[Array, "s q"],
-    further: int | None,
+    starts: int | None,
+    seed: int,
     max_steps: int,
     report: starting.Progress,
 ) -> tuple[starting.Search, Float[Array, "s q"], list[Optimum], RelaxedOptimum]:
     """The search with its layout and data, its starts, an optimum for each, and where it ended.
 
-    Where those of `points` explain little others are gone to, drawn by the seed `further`.
+    Where these explain little others are gone to, unless a number of starts is asked for.
     """
     layout, data, noise = guess.layout, guess.data, guess.noise
+
+    def begin(quick: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
+        if starts is None:
+            return delay_starts(problem, layout, guess.begun, quick, guess.z, known)
+        return draw(layout, problem, guess.z, starts, seed)
+
     disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     search = starting.Search(
         problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
     )
-    first, quick, optima = first_optima(search, guess, points, report)
+    first, quick, points, optima = first_optima(search, guess, begin, report)
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
     if shooting is not None:
         best, notes = shooting, (BY_WINDOWS,)
-    if further is not None and explains_little(first, quick, best):
+    if starts is None and explains_little(first, quick, best):
         report(SAID_FURTHER)
-        more = further_starts(layout, problem, guess.z, further)
+        more = further_starts(layout, problem, guess.z, seed)
         optima += first.run(quick, more, report, nearing=layout.estimator.nearing)
         points = jnp.concatenate([points, more])
         better = min(optima, key=starting.rank)
@@ -351,9 +383,9 @@ def _search(
     search.max_steps = max_steps
     # A search that began with a part of the data has not tried where all of them lead.
     again = [] if quick is noise else [points]
-    if (further is not None or again) and left_stability(problem, search, optimum):
+    if (starts is None or again) and left_stability(problem, search, optimum):
         report(SAID_STABLE)
-        again += [] if further is None else [further_starts(layout, problem, guess.z, further)]
+        again += [further_starts(layout, problem, guess.z, seed)] if starts is None else []
         optimum = better_of_stable(problem, search, noise, jnp.concatenate(again), optimum)
     if disturbed:
         several = len(disturbances_of(problem.model)) > 1

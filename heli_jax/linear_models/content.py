@@ -112,7 +112,8 @@ def _section(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """A section of named things, which may not be empty; their names can be names."""
     section = as_mapping(mapping[key], key)
     if not section:
-        raise InputError(f"{key}: empty, expected at least one")
+        hint = ": for a free decay name one that does not act, and signals.inputs: {} of the flight"
+        raise InputError(f"{key}: empty, expected at least one{hint if key == 'inputs' else ''}")
     # Parameters make no matrix larger: only what has rows and columns is bounded.
     if len(section) > _MOST and key != "parameters":
         raise InputError(f"{key}: expected at most {_MOST}, got {len(section)}")

@@ -4,14 +4,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from heli_jax import naming
 from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight
 from heli_jax.flights.preset import fitting_presets
+from heli_jax.identification.validation.follows_response import feedback
+from heli_jax.identification.validation.late_inputs import led_by
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import tables, text
 from heli_jax.new_config.filtered import filter_settings, filtered_outputs
+from heli_jax.new_config.guess import Series
 from heli_jax.new_config.logs import Log, read_log
-from heli_jax.new_config.model_choice import chosen_model, other_models
+from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
 from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.new_config.signals import (
     names_of_input,
@@ -90,6 +96,7 @@ def write_config(
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=from_preset,
         filtered=filtered,
+        late=_late(read.series, signals),
     )
     for path, words in {out: content, **paths}.items():
         with whole_file(path, str(path)) as temporary:
@@ -114,6 +121,8 @@ def write_config(
         absent = [n for n in absent if n not in signals.wandering]
         called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
         notes += unread_notes((*lacking, *absent), called, read.unread)
+    if vehicle_of_log := other_vehicle(read.autopilot):
+        notes.append(f"the log's vehicle is {vehicle_of_log}: see that the model is one of it")
     if others:
         assert isinstance(chosen.name, dict)
         notes.append(
@@ -140,6 +149,39 @@ def _outputs(
     known = tuple(log.series)
     found = channels_of_preset(preset, known, asked or naming.names(model.Outputs))
     return found or channels_of_preset(preset, known, naming.names(model.Inputs))
+
+
+def _seen(channel: Series) -> Series:
+    """The channel without missing samples."""
+    seen = np.isfinite(channel.values)
+    return channel._replace(times=channel.times[seen], values=channel.values[seen])
+
+
+def _late(series: Mapping[str, Series], signals: text.Signals | None) -> str:
+    """Which input an output precedes and does not feed back to, in words; empty where none is."""
+    if signals is None:
+        return ""
+    inputs, outputs = (
+        {n: _seen(series[g.channel]) for n, g in of.items() if g is not None}
+        for of in (signals.inputs, signals.outputs)
+    )
+    both = [*inputs.values(), *outputs.values()]
+    if not (inputs and outputs and all(s.times.size > 1 for s in both)):
+        return ""
+    first, last = max(s.times[0] for s in both), min(s.times[-1] for s in both)
+    dt = min(float(np.median(np.diff(s.times))) for s in outputs.values())
+    if not (dt > 0 and last - first > 2.0 * dt):
+        return ""
+    times = np.arange(first, last, dt)
+    on_grid = [
+        {n: np.interp(times, s.times, s.values) for n, s in of.items()} for of in (inputs, outputs)
+    ]
+    followed = {f.input for f in feedback(Flight(dt, *on_grid)) if f.present}
+    for output, y in on_grid[1].items():
+        led = led_by(y, on_grid[0], dt)
+        if led is not None and led[2] not in followed:
+            return f"{led[2]} is logged late: {output} moves {led[1]:.2g} s or more before it"
+    return ""
 
 
 def _rate(log: Log, outputs: Sequence[str]) -> float | None:

@@ -1,11 +1,13 @@
 """The model that a log is fitted with: the one that is named, or that of the axis that moves."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax import models
+from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
@@ -24,6 +26,21 @@ _AXES = {
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
+_SHIPS = ("ArduPlane", "ArduRover", "Rover", "Blimp", "ArduSub", "APM:Plane", "APM:Rover")
+"""what firmware of ArduPilot for other vehicles calls itself"""
+_HELICOPTERS = (6, 11, 13)
+"""ArduPilot's FRAME_CLASS: with one rotor, two, and four of variable pitch"""
+_MAV_TYPES = {1: "a fixed-wing aircraft", 2: "a quadrotor", 7: "an airship", 10: "a rover"}
+_MAV_TYPES |= {11: "a boat", 13: "a hexarotor", 14: "an octorotor", 15: "a tricopter"}
+_MAV_TYPES |= dict.fromkeys(range(19, 26), "a VTOL aircraft")
+"""MAVLink's MAV_TYPE, but for helicopters (3, 4) and what is not known"""
+_AIRFRAMES = ("a multirotor", "a fixed-wing aircraft", *["a VTOL aircraft"] * 3, *["a rover"] * 2)
+_AIRFRAMES += ("a multirotor", "an airship")
+"""PX4's CA_AIRFRAME from 0 to 8; helicopters have 10 to 12"""
+_TYPES = {2: "a fixed-wing aircraft", 3: "a rover", 4: "an airship"}
+"""PX4's vehicle_status.vehicle_type"""
+_OF_ROTORS = ("Betaflight", "Cleanflight", "INAV", "EmuFlight")
+"""firmware of multirotors, which writes the command of each motor"""
 _FULL_TRAVEL = 1.5
 """of a stick in parts of it, which radios let exceed 1"""
 
@@ -40,6 +57,11 @@ def chosen_model(
         folder: of the configuration, where a module of one's own lies.
     """
     if name is None:
+        vehicle = other_vehicle(log.autopilot)
+        if vehicle:
+            problem = f"its vehicle is {vehicle}, and the models that are chosen for a log are of"
+            remedy = "expected --model NAME; heli-jax new-model makes one of your own"
+            raise wrong(path, f"{problem} helicopters; {remedy}")
         name = _by_what_moves(log, path)
     # Of roll and pitch there are the paper's model and a linear one: the latter by {linear: roll}.
     stated = name.strip().removeprefix("{").removesuffix("}")
@@ -49,6 +71,52 @@ def chosen_model(
     if not linear and (not file or stated in ("roll", "pitch")):
         return models.by_name(stated, "--model", folder), stated, False
     return linear_models.linear_model(stated).model, {"linear": stated}, True
+
+
+def other_vehicle(log: ChannelLog | None) -> str:
+    """What an autopilot's log says its vehicle is, and by what; empty of a helicopter, and where
+    nothing says so.
+
+    Args:
+        log: of an autopilot; None of a table.
+    """
+    if log is None:
+        return ""
+    has, firmware = log.parameters, log.firmware
+    if log.format == "dataflash":
+        return _of_ardupilot(has, firmware)
+    if log.format == "blackbox":
+        motors = {"motor[2]", "motor[3]"} <= {n.rpartition(".")[2] for n in log.names}
+        return (
+            f"a multirotor ({firmware[:40]})" if firmware.startswith(_OF_ROTORS) and motors else ""
+        )
+    if (frame := has.get("CA_AIRFRAME")) is not None:
+        kind = _AIRFRAMES[int(frame)] if 0 <= frame < len(_AIRFRAMES) else ""
+        return f"{kind} (CA_AIRFRAME {frame})" if kind else ""
+    if (mav := has.get("MAV_TYPE")) in _MAV_TYPES:
+        return f"{_MAV_TYPES[int(mav)]} (MAV_TYPE {mav})"
+    for field, known in (("is_vtol", {1: "a VTOL aircraft"}), ("vehicle_type", _TYPES)):
+        name = f"vehicle_status.{field}"
+        values = log.topic_of(name).columns[name] if name in log.names else ()
+        if len(values) and int(values[-1]) in known:
+            return f"{known[int(values[-1])]} ({name} {int(values[-1])})"
+    return ""
+
+
+def _of_ardupilot(has: Mapping[str, str | int | float], firmware: str) -> str:
+    if has.get("Q_ENABLE") == 1:
+        return f"a VTOL aircraft ({firmware or 'ArduPlane'}, Q_ENABLE 1)"
+    if firmware.startswith(_SHIPS):
+        return f"no helicopter ({firmware})"
+    frame = has.get("FRAME_CLASS")
+    if frame in _HELICOPTERS or "heli" in firmware.casefold():
+        return ""
+    if frame:
+        return f"a multirotor (FRAME_CLASS {frame:g})"
+    # Before it had classes a frame was told by what there is to set.
+    if has and firmware.startswith("Ardu") and not any(n.startswith("H_") for n in has):
+        return f"a multirotor ({firmware}, without parameters of a helicopter's swashplate)"
+    return ""
 
 
 def _by_what_moves(log: Log, path: str) -> str:

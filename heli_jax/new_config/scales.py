@@ -22,11 +22,15 @@ _FULL_COMMAND = 500.0
 """at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
 _PARTS = 1.5
 """above which a stick is not logged in parts of its travel"""
+_FULL_TILT = np.pi / 4
+"""rad, beyond which no stick tilts a blade or a swashplate"""
 _FASTEST_TURN = 8.0
 """rad/s, which a small helicopter hardly exceeds in a log for identification"""
 
 
-def scaled(channel: str, series: Series, si: str, full: float | None = None) -> Guess:
+def scaled(
+    channel: str, series: Series, si: str, full: float | None = None, is_input: bool = False
+) -> Guess:
     """A channel with the unit and the scale that its name, the log or its numbers tell.
 
     Args:
@@ -34,6 +38,7 @@ def scaled(channel: str, series: Series, si: str, full: float | None = None) -> 
         series: its samples.
         si: the unit that the model has.
         full: what the log's sticks count to at their stops, where that is known.
+        is_input: whether it is a stick's or a servo's.
     """
     values = series.values[np.isfinite(series.values)]
     low, high = float(np.min(values)), float(np.max(values))
@@ -51,6 +56,13 @@ def scaled(channel: str, series: Series, si: str, full: float | None = None) -> 
     if si == "rad":
         # A heading may count from 0 to a turn; a pitch angle ends at a quarter of it.
         most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
+        # Blades and swashplates are tilted by less than half a right angle.
+        most = _FULL_TILT if is_input else most
+        if is_input and max(-low, high) > np.degrees(_FULL_TILT):
+            guess = (
+                f"GUESS: {low:.4g} to {high:.4g} is no blade's angle; scale: rad for 1 in the log"
+            )
+            return Guess(channel, si, EDIT, remarks=(guess,))
         unit = "deg" if max(-low, high) > most else "rad"
     elif si == "rad/s":
         # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.

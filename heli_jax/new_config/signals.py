@@ -35,7 +35,8 @@ def signals_of(model: Any, log: Log) -> text.Signals:
             numbered[name] = guess.by_number(called["numbered"][stick], sticks)
         unit, known = naming.unit(model.Inputs, name) or "1", [words_of(name), *known]
         allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
-        inputs[name] = _found(log, guess.by_name(known, allowed, commands), unit, taken)
+        found = guess.by_name(known, allowed, commands)
+        inputs[name] = _found(log, found, unit, taken, is_input=True)
         for channel in that_move(log, guess.excitations(known, tuple(log.series)))[:1]:
             excitations[name] = channel
     taken += excitations.values()
@@ -124,7 +125,9 @@ def that_move(log: Log, names: Sequence[str]) -> list[str]:
     return [n for n in names if np.nanstd(log.series[n].values) > 0]
 
 
-def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:
+def _found(
+    log: Log, names: Sequence[str], si: str, taken: list[str], is_input: bool = False
+) -> Guess | None:
     candidates = [n for n in names if n not in taken]
     # What never moves is a trim, or a channel that is not connected; better than none.
     candidates = that_move(log, candidates) or candidates
@@ -132,7 +135,7 @@ def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess |
         return None
     chosen = guess.of_known_unit(candidates, log.series, si)
     taken.append(chosen)
-    scaled = scales.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    scaled = scales.scaled(chosen, log.series[chosen], si, _full_travel(log), is_input)
     others = [n for n in candidates if n != chosen]
     if not others:
         return scaled
@@ -155,7 +158,7 @@ def _by_number(
     for name, input in inputs.items():
         si = naming.unit(model.Inputs, name) or "1"
         names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
-        made = None if input is not None else _found(log, names, si, taken)
+        made = None if input is not None else _found(log, names, si, taken, is_input=True)
         if made is not None:
             why = "GUESS: by its number, in the order roll, pitch, throttle, yaw"
             inputs[name] = made._replace(remarks=(why, *made.remarks))
@@ -190,7 +193,7 @@ def _by_correlation(
         if best is None:
             continue
         channel, related = best
-        made = scales.scaled(channel, log.series[channel], si, _full_travel(log))
+        made = scales.scaled(channel, log.series[channel], si, _full_travel(log), is_input=True)
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)

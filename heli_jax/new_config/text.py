@@ -78,6 +78,7 @@ def configuration(
     others: Sequence[str] = (),
     preset_outputs: Sequence[str] = (),
     filtered: Mapping[str, Filtered] = {},
+    late: str = "",
 ) -> str:
     """The configuration as text.
 
@@ -96,6 +97,7 @@ def configuration(
         others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
         filtered: those of the preset's outputs that the autopilot filtered.
+        late: which input is logged late, in words; empty where none is.
 
     """
     lines = [
@@ -132,7 +134,9 @@ def configuration(
     lines += [_free(name, start) for name, start in free.items()]
     lines += [_held(name, value) for name, value in held.items()]
     lines += [
-        "  # nuisance: {time_shift: true} # where the stick was logged late or early",
+        f"  nuisance: {{time_shift: true}}   # GUESS: {_comment(late)}"
+        if late
+        else "  # nuisance: {time_shift: true} # where the stick was logged late or early",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]

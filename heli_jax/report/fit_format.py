@@ -319,7 +319,7 @@ class FlightSource(TypedDict, total=False):
 class HoldContent(TypedDict):
     """What an input does between samples."""
 
-    hold: Literal["zero-order", "linear"]
+    hold: Literal["zero-order", "linear", "mixed"]
     reason: str
 
 

@@ -13,7 +13,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
 from heli_jax.simulation.delays import at
-from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
+from heli_jax.simulation.hold import FlightOrInputs, between_samples
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.reduced_blocks import Reducing, blocks, of_whole_run
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at
@@ -201,8 +201,8 @@ def _prepared(
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")
-    linear = linear_inputs(model, flight, options.hold)
     inputs, dt = held_inputs(model, flight, options.dt)
+    model, inputs, linear = between_samples(model, flight, inputs, options.hold)
     x0 = start_state(model, params, options.initial_state, inputs)
     run = per_sample(model, params, inputs, options._replace(dt=dt), linear)
     reducer = _Reducer(Reducing(model, params, update), model.limits if limits else None)

@@ -1,9 +1,12 @@
-"""What an input does between two samples: it stays (zero-order), or follows a straight line.
+"""What an input does between two samples: it stays (zero-order), follows a straight line, or is
+mixed, which stays until it jumps and follows straight lines elsewhere.
 
 A stick that is commanded in steps stays; one that was sampled while it moved does not. To hold such
 an input delays it by half a sample on average.
 """
 
+import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -16,9 +19,10 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import nearest
 from heli_jax.naming import Number, Record
+from heli_jax.numerics.jumps import split
 from heli_jax.simulation.delays import Delays, at
 
-HOLDS = ("zero-order", "linear")
+HOLDS = ("zero-order", "linear", "mixed")
 """The names of what an input may do between samples."""
 
 # A Flight is a class of flights/, which this part does not import; Inputs are anyone's own.
@@ -29,12 +33,33 @@ type Hold = str | Mapping[str, str] | None
 """one name for all inputs, or names by input"""
 
 
-def linear_inputs(model: Model, flight: FlightOrInputs, hold: Hold) -> tuple[bool, ...]:
-    """Of each of the model's inputs whether it is linear between samples; () where none is.
+class Between(NamedTuple):
+    """A model and its inputs, each of which is held or linear in all sample intervals."""
+
+    model: Model
+    """takes the staircases of mixed inputs as inputs of their own"""
+    inputs: Record
+    """arrays (N,)"""
+    linear: tuple[bool, ...]
+    """of each input whether it is linear between samples; () where none is"""
+
+    def merged(self, inputs: Record, model: Model) -> Record:
+        """Return the Inputs of `model`, which this was made of, from those of `self.model`."""
+        return inputs if self.model is model else _merged(model, inputs)
+
+
+def between_samples(
+    model: Model, flight: FlightOrInputs, inputs: Record, hold: Hold = None
+) -> Between:
+    """Return a model and inputs of which each has one hold throughout.
+
+    A mixed input is the sum of a staircase of its jumps, which is held, and the rest, which is
+    linear. What takes inputs of either hold takes a mixed one as two.
 
     Args:
         model: of which the names of the inputs count.
         flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
+        inputs: the model's Inputs, arrays (N,).
         hold: as `simulate` takes it.
 
     Raises:
@@ -57,9 +82,48 @@ def linear_inputs(model: Model, flight: FlightOrInputs, hold: Hold) -> tuple[boo
         by_name |= hold
     for value in by_name.values():
         check_hold(value)
+    moving = {n for n in names if by_name.get(n, "zero-order") != "zero-order"}
+    mixed = tuple(n for n in names if by_name.get(n) == "mixed")
+    if mixed:
+        model, values = _with_stairs(model, mixed), naming.asdict(inputs)
+        for n in mixed:
+            values[_stairs(n)], values[n] = split(values[n], jnp)
+        inputs = model.Inputs(**values)
     # The empty tuple where none moves: the simpler program, with one matrix less in its recurrence.
-    linear = tuple(by_name.get(n) == "linear" for n in names)
-    return linear if any(linear) else ()
+    linear = tuple(n in moving for n in naming.names(model.Inputs)) if moving else ()
+    return Between(model, inputs, linear)
+
+
+def _stairs(name: str) -> str:
+    return f"stairs_of_{name}"
+
+
+# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+@functools.cache
+def _with_stairs(model: Model, mixed: tuple[str, ...]) -> Model:
+    """Return the model with the staircases of mixed inputs as inputs beside the rest of them."""
+    annotations = naming.fields(model.Inputs)
+    more = {_stairs(n): (annotations[n], None) for n in mixed}
+    limits, late = model.limits, dict(model.delays)
+    return dataclasses.replace(
+        model,
+        Inputs=naming.extended(model.Inputs, f"{model.Inputs.__name__}WithStairs", more),
+        vector_field=lambda p, x, u: model.vector_field(p, x, _merged(model, u)),
+        output=lambda p, x, u: model.output(p, x, _merged(model, u)),
+        limits=None if limits is None else lambda p, x, u: limits(p, x, _merged(model, u)),
+        delays=(*model.delays, *((_stairs(n), late[n]) for n in mixed if n in late)),
+    )
+
+
+def _merged(model: Model, inputs: Record) -> Record:
+    """Return the model's Inputs from those with staircases."""
+    of = naming.asdict(inputs)
+    return model.Inputs(
+        **{
+            n: of[n] + of[_stairs(n)] if _stairs(n) in of else of[n]
+            for n in naming.names(model.Inputs)
+        }
+    )
 
 
 def check_hold(value: PyTree, where: str = "hold") -> None:

@@ -16,7 +16,7 @@ from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import blockwise
 from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
-from heli_jax.simulation.hold import FlightOrInputs, delayed, linear_inputs
+from heli_jax.simulation.hold import FlightOrInputs, between_samples, delayed
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.process_noise import with_process_noise
 from heli_jax.simulation.solvers import (
@@ -79,9 +79,17 @@ def simulate(
     """
     # dt belongs to the Flight unless it is given: from here on `options` has it.
     options = options.changed(keywords)
-    linear = linear_inputs(model, flight, options.hold)
+    given = model
     inputs, dt = held_inputs(model, flight, options.dt)
+    between = between_samples(model, flight, inputs, options.hold)
+    model, inputs, linear = between
     options = options._replace(dt=dt)
+    if model is not given and options.events:
+        events = {
+            n: lambda p, x, u, event=event: event(p, x, between.merged(u, given))
+            for n, event in options.events.items()
+        }
+        options = options._replace(events=events)
     x0 = start_state(model, params, options.initial_state, inputs)
     run = _method_with_extras(model, params, inputs, options, linear)
     states, result = _states(run, x0, inputs, options, linear)
@@ -97,6 +105,7 @@ def simulate(
     if model.limits is not None:
         limits = model.limits
         outside = jax.vmap(lambda x, u: limits(params, x, u))(states, acting)
+    acting = between.merged(acting, given)
     return Trajectory(times, states, outputs, acting, result, finite, outside, *end)
 
 
@@ -129,7 +138,7 @@ def _check_feedback(delays: Delays | None, linear: tuple[bool, ...]) -> None:
     if linear:
         raise ValueError(
             "feedback acts once a sample and is held until the next: expected inputs with "
-            "hold='zero-order', got hold='linear'"
+            "hold='zero-order', got hold='linear' or 'mixed'"
         )
 
 

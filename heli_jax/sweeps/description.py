@@ -13,7 +13,7 @@ from heli_jax.regular_file import read_regular
 from heli_jax.sweeps import reducers
 from heli_jax.sweeps.axes import digest
 from heli_jax.sweeps.reducers import Reduce
-from heli_jax.sweeps.spec import Job, linear_inputs_of
+from heli_jax.sweeps.spec import Job, moving_inputs_of
 
 
 def described(job: Job) -> dict[str, Any]:
@@ -29,7 +29,11 @@ def described(job: Job) -> dict[str, Any]:
             "known": dict(f.known),
             "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
             # Only where it is so: stores from before inputs could be linear have no such key.
-            **({"linear": list(linear)} if (linear := linear_inputs_of(model, f)) else {}),
+            **{
+                hold: held
+                for hold in ("linear", "mixed")
+                if (held := [n for n, own in moving_inputs_of(model, f) if own == hold])
+            },
         }
         for f in job.flights
     ]

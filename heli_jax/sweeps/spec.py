@@ -81,15 +81,18 @@ class Plan(NamedTuple):
     trimmed: Trimmed | None
     streamed: bool
     simulated: bool
-    linear: tuple[str, ...] = ()
-    """inputs that are linear between samples; the others are held"""
+    moving: tuple[tuple[str, str], ...] = ()
+    """inputs that are linear or mixed between samples, with their holds; the others are held"""
 
     def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
         """How a run is simulated; `numbers` are the fields that an element has of its own."""
         return SimulationOptions(
             solver=solver_named(self.solver),
             substeps=self.substeps,
-            hold=dict.fromkeys(self.linear, "linear"),
+            hold={
+                **dict.fromkeys(naming.names(self.model.Inputs), "zero-order"),
+                **dict(self.moving),
+            },
             **numbers,
         )
 
@@ -128,7 +131,7 @@ class Job(NamedTuple):
             self.trimmed,
             self.streamed,
             self.simulated,
-            linear_inputs_of(self.model, self.flights[index]),
+            moving_inputs_of(self.model, self.flights[index]),
         )
 
     @property
@@ -148,9 +151,10 @@ class Job(NamedTuple):
         return bool(kept) or self.trajectories is not None
 
 
-def linear_inputs_of(model: Model, flight: Flight) -> tuple[str, ...]:
-    """The model's inputs that are straight lines between this flight's samples."""
-    return tuple(n for n in naming.names(model.Inputs) if flight.hold.get(n) == "linear")
+def moving_inputs_of(model: Model, flight: Flight) -> tuple[tuple[str, str], ...]:
+    """The model's inputs that are not held between this flight's samples, with their holds."""
+    holds = ((n, flight.hold.get(n, "zero-order")) for n in naming.names(model.Inputs))
+    return tuple((n, hold) for n, hold in holds if hold != "zero-order")
 
 
 def _needs_whole_run(reduce: Reduce) -> bool:

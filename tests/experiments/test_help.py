@@ -16,7 +16,10 @@ def test_each_file_answers_when_it_is_called() -> None:
 
 
 def test_a_part_of_other_scripts_says_so() -> None:
-    assert {p.stem for p in PARTS} == {"script", "r50_record", "kernels"}
+    assert {p.stem for p in PARTS} == {
+        *("script", "r50_record", "kernels"),
+        *("corpus_cases", "corpus_records", "corpus_matrix"),
+    }
     command = [sys.executable, str(EXPERIMENTS / "script.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
     assert "by itself it does nothing" in done.stdout

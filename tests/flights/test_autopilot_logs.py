@@ -139,6 +139,79 @@ def test_a_dataflash_log_as_text(tmp_path):
     assert log.firmware == "ArduCopter V4.5.1, with a comma"
 
 
+RATE_ROWS = [(1000 * i, 10.0 + i, 5.0 + i, 0.1 * i) for i in range(60)]
+
+
+@pytest.mark.parametrize("writer", [writers.dataflash, writers.dataflash_text])
+def test_a_new_description_holds_from_where_it_stands(tmp_path, writer):
+    # Three boots: the columns in another order and hundredths, then as at first, then one more.
+    boots = [
+        {"RATE": (1, "Qfff", "TimeUS,RDes,R,ROut")},
+        {"RATE": (1, "Qfcf", "TimeUS,ROut,R,RDes"), "ACC": (2, "Qf", "TimeUS,X")},
+        {"RATE": (1, "Qfff", "TimeUS,RDes,R,ROut"), "ACC": (3, "Qf", "TimeUS,X")},
+        {"RATE": (1, "Qffff", "TimeUS,RDes,R,ROut,Y")},
+    ]
+    is_text = writer is writers.dataflash_text
+    data = b""
+    for k, boot in enumerate(boots):
+        rows = []
+        for t, des, r, out in RATE_ROWS[15 * k : 15 * k + 15]:
+            stored = r if is_text or k != 1 else round(100 * r)
+            row = [t, out, stored, des] if k == 1 else [t, des, r, out, *[1.5] * (k == 3)]
+            rows.append(("RATE", row))
+            rows += [("ACC", (t, 2.0 * r))] if "ACC" in boot else []
+        data += writer(boot, rows)
+    log = open_log(written(tmp_path, data, "anew.log" if is_text else "anew.bin"))
+    for column, at in (("RDes", 1), ("R", 2), ("ROut", 3)):
+        times, values = log.channel(f"RATE.{column}")
+        np.testing.assert_allclose(values, [row[at] for row in RATE_ROWS], rtol=1e-6)
+        np.testing.assert_allclose(times, [1e-6 * row[0] for row in RATE_ROWS])
+    added = log.channel("RATE.Y").values
+    np.testing.assert_array_equal(added, [np.nan] * 45 + [1.5] * 15)
+    # One name under two numbers, and no damage.
+    np.testing.assert_allclose(
+        log.channel("ACC.X").values, [2 * row[2] for row in RATE_ROWS[15:45]]
+    )
+    assert len(log.notes) == 1
+
+
+def test_a_new_unit_makes_another_topic(tmp_path):
+    described = dict(list(MESSAGES.items())[:3])
+    boots = [(b"d", "ATT"), (b"r", "ATT"), (b"d", "ATT")]
+    data = b""
+    for k, (mark, name) in enumerate(boots):
+        rows = [("UNIT", (0, ord(m), label)) for m, label in (("d", b"deg"), ("r", b"rad"))]
+        rows.append(("FMTU", (0, 210 + k, b"s" + mark, b"F-")))
+        rows += [(name, (1000 * (20 * k + i), float(k))) for i in range(20)]
+        data += writers.dataflash(described | {name: (210 + k, "Qf", "TimeUS,Roll")}, rows)
+    log = open_log(written(tmp_path, data, "units.bin"))
+    first, second = (log.topic_of(f"{name}.Roll") for name in ("ATT", "ATT#2"))
+    np.testing.assert_array_equal(first.columns["ATT.Roll"], [0.0] * 20 + [2.0] * 20)
+    np.testing.assert_array_equal(second.columns["ATT#2.Roll"], [1.0] * 20)
+    assert first.units["ATT.Roll"] == "deg"
+    assert second.units["ATT#2.Roll"] == "rad"
+
+
+@pytest.mark.parametrize("writer", [writers.dataflash, writers.dataflash_text])
+@pytest.mark.parametrize("board", [True, False])
+def test_a_time_of_week_is_not_the_boards_clock(tmp_path, writer, board):
+    # ArduCopter before 3.3: TimeMS is the board's clock but in GPS, where T is.
+    end = ("IHfI", "TimeMS,Week,Spd,T") if board else ("IHf", "TimeMS,Week,Spd")
+    messages = {"IMU": (2, "If", "TimeMS,GyrX"), "GPS": (3, *end)}
+    rows = [("IMU", (50_000 + 20 * i, 0.5 * i)) for i in range(300)]
+    rows += [
+        ("GPS", (6_250_000 + 200 * i, 1815, 1.0 * i, *[50_003 + 200 * i] * board))
+        for i in range(30)
+    ]
+    log = open_log(written(tmp_path, writer(messages, rows), "week.log"))
+    if board:
+        np.testing.assert_allclose(log.channel("GPS.Spd").times, 50.003 + 0.2 * np.arange(30))
+    else:
+        # Nothing tells how the two clocks belong together.
+        assert log.topic_of("GPS.Spd").clock == ""
+    assert log.channel("IMU.GyrX").times[-1] == pytest.approx(55.98)
+
+
 def test_old_text_has_only_an_order(tmp_path):
     messages = {"ATT": (1, "ccC", "RollIn,Roll,Yaw")}
     rows = [("ATT", (0.0, i / 2, 3.0)) for i in range(20)]

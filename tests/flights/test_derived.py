@@ -128,7 +128,6 @@ def test_derived_channels_of_a_log(flown):
         outputs={"yaw": Signal("euler(att.q[0], att.q[1], att.q[2], att.q[3]).yaw", "rad", "rad")},
         rate=50.0,
         window=(0.0, 0.9),
-        moving_inputs=False,
     )
     np.testing.assert_allclose(flight.outputs["yaw"], 2 * np.pi * flight.times / 1.99, atol=1e-4)
 

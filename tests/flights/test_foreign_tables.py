@@ -112,9 +112,7 @@ def test_a_row_of_units_is_no_sample(tmp_path):
         read_flight(path, time="time_ms", inputs=inputs, outputs=outputs, window=(10.0, 20.0))
     # Steps of 10 s are no flight's: those that the name says are meant.
     path = written(tmp_path, ["time_ms,u,p", *(f"{1e3 * k * DT:.1f},0,0" for k in range(N))])
-    with pytest.raises(
-        InputError, match=r"stamps are \S+ s apart, .* says ms; expected .*unit: ms"
-    ):
+    with pytest.raises(InputError, match=r"expected .*unit: ms"):
         read(path, "time_ms")
     # A line further down, and between blanks.
     rows = [r.replace(",", "  ") for r in ROWS]

@@ -50,6 +50,21 @@ def test_a_run_is_split_at_its_gaps(tmp_path):
     assert any("without slow" in n for n in second.source.notes)
 
 
+@pytest.mark.parametrize(
+    ("gaps", "parts"),
+    [
+        # One row behind the last gap, before the first, or between two.
+        ([(8.99, 19.97)], [0.0]),
+        ([(0.0, 9.0)], [9.0]),
+        ([(5.0, 10.0), (10.0, 15.0)], [0.0, 15.0]),
+    ],
+)
+def test_a_lone_row_is_left_out(tmp_path, gaps, parts):
+    read = read_parts(run(tmp_path, *gaps), time="t", **SIGNALS)
+    assert [f.t0 for f in read] == pytest.approx(parts)
+    assert any(n.startswith("left out") for n in read[0].source.notes)
+
+
 def test_a_run_without_gaps_stays_one(tmp_path):
     path = run(tmp_path, until=10.0)
     (whole,) = read_parts(path, time="t", **SIGNALS, name="hover")

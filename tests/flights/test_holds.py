@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from heli_jax.flights.holds import decide
+from heli_jax.numerics.jumps import jumps
 
 N, DT = 1500, 0.02
 T = DT * np.arange(N)
@@ -81,20 +82,39 @@ STEPS = {
     "smooth stick read at 50 Hz, logged at 250": pilot()[(np.arange(N) * 0.2).astype(int)],
 }
 
+
+def card(dt=DT, n=N):
+    """Doublets of the stick, then a chirp of it, in one record."""
+    u, t = np.zeros(n), dt * np.arange(n)
+    for k, (width, size) in enumerate([(0.4, 3.0), (0.3, -4.0), (0.6, 3.0), (0.24, 5.0)]):
+        first, length = round((1.0 + 3.0 * k) / dt), round(width / dt)
+        u[first : first + length] += size
+        u[first + length : first + 2 * length] -= size
+    return u + 3.0 * np.where(t > 14, np.sin(2 * np.pi * (0.2 * (t - 14) + 0.1 * (t - 14) ** 2)), 0)
+
+
+MIXED = {
+    "doublets and a chirp": card(),
+    "doublets and a chirp in pulse widths": counts(0.2 * card()),
+    "doublets and a chirp with noise": card() + 0.01 * rng().standard_normal(N),
+    "doublets and a chirp at 100 Hz": card(0.01, 2 * N),
+    "doublets and a chirp, samples missing": np.delete(card(), rng().choice(N, 100)),
+    "chirp with pauses": with_pauses(),
+    "chirp with pauses in counts": counts(with_pauses()),
+    "chirp between long neutral": np.where((T > 12) & (T < 18), chirp(), 0.0),
+    "chirp and the jump of a switch": 0.2 * chirp() + (T > 15),
+}
+
 MOVING = {
     "chirp": chirp(),
     "chirp to 8 Hz": chirp(top=8.0),
     "chirp in counts": counts(chirp()),
-    "chirp with pauses": with_pauses(),
-    "chirp with pauses in counts": counts(with_pauses()),
-    "chirp between long neutral": np.where((T > 12) & (T < 18), chirp(), 0.0),
     "pilot": pilot(),
     "pilot in counts": counts(0.3 * pilot()),
     "pilot at 10 Hz": pilot(0.1),
     "pilot at 400 Hz in counts": counts(0.3 * pilot(0.0025)),
     "pilot with noise": pilot() + 0.01 * rng().standard_normal(N),
     "slow, one count at a time": counts(0.1 * np.sin(0.3 * T)),
-    "chirp and the jump of a switch": 0.2 * chirp() + (T > 15),
     "doublets with a rate limit": doublets(6),
     "doublets with a rate limit in counts": counts(doublets(6)),
     "doublets with a fast rate limit": doublets(4),
@@ -114,9 +134,22 @@ def test_sampled_while_it_moved(name):
     assert decide(MOVING[name]).hold == "linear"
 
 
-@pytest.mark.parametrize("name", [*STEPS, *MOVING])
+@pytest.mark.parametrize("name", MIXED)
+def test_both_in_one_record(name):
+    assert decide(MIXED[name]).hold == "mixed"
+
+
+def test_the_jumps_of_a_test_card():
+    """The edges of the doublets and no sample of the chirp."""
+    at = np.flatnonzero(jumps(card()))
+    edges = np.flatnonzero(np.diff(card()))
+    np.testing.assert_array_equal(at, edges[edges < 690])
+    assert at.size == 12
+
+
+@pytest.mark.parametrize("name", [*STEPS, *MOVING, *MIXED])
 def test_units_and_signs_do_not_matter(name):
-    values = {**STEPS, **MOVING}[name]
+    values = {**STEPS, **MOVING, **MIXED}[name]
     for factor, offset in ((-1.0, 0.0), (1.7e-6, 3e-5), (180 / np.pi, -2.0), (1e300, 0.0)):
         assert decide(factor * values + offset) == decide(values)
 
@@ -125,8 +158,10 @@ def test_a_single_absurd_number_changes_no_hold():
     rng = np.random.default_rng(4)
     steps = np.repeat(rng.uniform(-0.2, 0.2, 40), 150)
     assert decide(steps).hold == "zero-order"
+    jumped = jumps(steps)
     steps[1234] = 50.0
-    assert decide(steps).hold == "zero-order"
+    assert decide(steps).hold != "linear"
+    np.testing.assert_array_equal(jumps(steps), jumped)
     smooth = np.sin(0.01 * np.arange(6000))
     smooth[1234] = 50.0
     assert decide(smooth).hold == "linear"

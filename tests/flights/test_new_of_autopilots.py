@@ -1,10 +1,12 @@
 """`heli-jax new` of autopilots' logs: what the settings say of filters, and the grid's rate."""
 
 import numpy as np
+import pytest
 import yaml
 
 from heli_jax import cli
 from heli_jax.config import load, read_flights
+from heli_jax.errors import InputError
 from heli_jax.new_config import write_config
 
 from . import log_writers as writers
@@ -124,3 +126,13 @@ def test_one_signal_and_one_gap_are_called_one(tmp_path, capsys):
     assert "one gap of 1.01 s" in capsys.readouterr().out
     assert cli.main(["convert", str(table), str(tmp_path / "o.csv"), "--signals", "aileron"]) == 0
     assert "samples of 1 signal to" in capsys.readouterr().err
+
+
+def test_no_rotor_is_written_for_another_vehicle(tmp_path):
+    log = px4_log(tmp_path / "flight.ulg", [("MAV_TYPE", 22)])
+    out = tmp_path / "new.yaml"
+    with pytest.raises(InputError):
+        write_config(log, out)
+    assert not out.exists()
+    write_config(log, out, "linear:roll")
+    assert out.exists()

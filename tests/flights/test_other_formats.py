@@ -142,6 +142,9 @@ def archive(name: str) -> bytes:
         ("a.bag", b"#ROSBAG V2.0\n", "bag of ROS 1; export"),
         ("a.tlog", bytes(99), "telemetry of MAVLink.*mavlogdump"),
         ("a.pkl", b"\x80\x04", r"pickle of Python.*to_parquet"),
+        ("a.csv", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS"),
+        ("a.parquet", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS"),
+        ("a.h5", b"/annex/objects/SHA256E-s1--0.h5\n", "git-annex"),
         ("a.xyz", b"t,p\n", "cannot be read, expected a table"),
     ],
 )

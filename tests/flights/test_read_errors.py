@@ -13,9 +13,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights import (
     Flight,
     Signal,
-    Source,
     read_flight,
-    require_moving_inputs,
     require_moving_outputs,
 )
 from heli_jax.flights.describe import describe_log
@@ -115,7 +113,6 @@ BAD_TEXT = {
     "time stands": (with_cell(5, 0, "0.080"), ["line 7", "'t'", "stands still", "'0.080'"]),
     "time back": (with_cell(5, 0, "0.05"), ["line 7", "backwards", "'0.05' after '0.080'"]),
     "few samples": (csv_text(rows(7)), ["7 samples", "at least 8"]),
-    "still input": (csv_text([[r[0], "2", r[2]] for r in rows()]), ["'x_roll'", "0.002", "learnt"]),
     "both decimal signs": (
         WHOLE.replace(",", ";").replace("0.020", "0,020"),
         ["'0,020'", "'0.000'", "one decimal sign"],
@@ -300,20 +297,16 @@ def test_broken_parquet(tmp_path, keep):
     refused(path, "no whole Parquet file")
 
 
-def test_still_input_can_be_allowed(tmp_path):
+def test_an_input_may_stay_where_it_is(tmp_path):
     path = tmp_path / "bench.csv"
     path.write_text(csv_text([[r[0], "2", r[2]] for r in rows()]))
     asked = {"time": "t", "inputs": {"x_roll": STICK}, "outputs": {"roll": PHI}}
-    flight = read_flight(path, **asked, moving_inputs=False)
+    flight = read_flight(path, **asked)
     assert np.array_equal(flight.inputs["x_roll"], np.full(20, 0.002))
 
 
-def test_moving_inputs_of_a_flight_made_by_hand():
+def test_moving_outputs_of_a_flight_made_by_hand():
     moving, still = np.arange(9.0), np.ones(9)
-    require_moving_inputs(Flight(0.1, {"x_roll": moving}, {"roll": still}))
-    flight = Flight(0.1, {"x_roll": still}, {}, source=Source("bench.csv", "0"))
-    with pytest.raises(InputError, match=r"^bench\.csv, input 'x_roll': .*nothing"):
-        require_moving_inputs(flight)
     require_moving_outputs(Flight(0.1, {"x_roll": still}, {"roll": moving, "p": still}))
     with pytest.raises(InputError, match="every output stays at one value"):
         require_moving_outputs(Flight(0.1, {"x_roll": moving}, {"roll": still}))

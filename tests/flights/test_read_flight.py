@@ -190,7 +190,6 @@ def test_any_uniform_log_comes_back(tmp_path_factory, data, rate, start, ending)
         time="t",
         inputs={"x_roll": Signal("stick", "1", "1")},
         outputs={"roll": Signal("phi", "1", "1")},
-        moving_inputs=False,
     )
     assert np.array_equal(flight.inputs["x_roll"], data[:, 0])
     assert np.array_equal(flight.outputs["roll"], data[:, 1])
@@ -325,5 +324,5 @@ def test_only_the_window_decides(tmp_path):
 def test_a_clock_in_milliseconds_without_its_unit_is_asked_for_by_it(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("t,stick,phi\n" + "".join(f"{20 * k},{k % 3},{k % 5}\n" for k in range(60)))
-    with pytest.raises(InputError, match=r"100 times as much; is its time in ms \(time.unit\)\?"):
+    with pytest.raises(InputError, match=r"\bms\b"):
         read_flight(path, **ASKED, options=ReadOptions(rate=50.0))

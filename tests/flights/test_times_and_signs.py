@@ -242,3 +242,45 @@ def test_a_receivers_fix_is_no_time(tmp_path):
     assert info.time is not None
     assert info.time.column == "Time"
     assert [c.kind for c in info.columns] == ["number"] * 3 + ["text"] * 2
+
+
+@pytest.mark.parametrize(
+    ("names", "stated", "count"),
+    [
+        # A quarter off; as stated; every eighth sample logged.
+        (("t", "u", "p"), {"fs": 100.0}, 1),
+        (("t", "u", "p"), {"dt": 0.0125}, 0),
+        (("t", "u", "p"), {"fs": 640.0}, 0),
+        # Of two clocks the one that is stated.
+        (("imu.t", "rc.u", "imu.p", "rc.t"), {"imu.fs": 100.0, "rc.fs": 200.0}, 1),
+        (("t_imu", "rc_u", "imu_p", "t_rc"), {"imu_dt": 0.0125, "rc_dt": 0.004}, 1),
+        (("t_imu", "rc_u", "imu_p", "t_rc"), {"imu_dt": 0.0125, "rc_dt": 0.005}, 0),
+    ],
+)
+def test_a_rate_beside_times_of_another_is_a_caution(tmp_path, names, stated, count):
+    slow, fast = 0.0125 * np.arange(2000), 0.005 * np.arange(4500)
+    clock, u, p, *other = names
+    arrays = {clock: slow, u: np.sin(fast if other else slow), p: np.cos(slow)}
+    np.savez(tmp_path / "a.npz", **arrays, **stated, **dict.fromkeys(other, fast))
+    flight = read_flight(
+        tmp_path / "a.npz",
+        time=None if other else clock,
+        inputs={"u": Signal(u, "1", "1")},
+        outputs={"p": Signal(p, "rad/s", "rad/s")},
+        rate=80.0,
+    )
+    assert len(flight.source.cautions) == count
+
+
+@pytest.mark.parametrize(("step", "rows"), [(10.0, 2000), (5.0, 300), (1.0, 20000)])
+def test_times_in_ms_are_not_taken_in_seconds(tmp_path, step, rows):
+    t = step * np.arange(rows)
+    np.savez(tmp_path / "a.npz", t=t, u=np.sin(t), p=np.cos(t))
+    signals = {"u": Signal("u", "1", "1")}, {"p": Signal("p", "rad/s", "rad/s")}
+    with pytest.raises(InputError):
+        read_flight(tmp_path / "a.npz", time="t", inputs=signals[0], outputs=signals[1])
+    for unit, scale, count in (("ms", 1e-3, 0), ("s", 1.0, 1)):
+        clock = Signal("t", unit, "s")
+        f = read_flight(tmp_path / "a.npz", time=clock, inputs=signals[0], outputs=signals[1])
+        assert f.dt == pytest.approx(scale * step)
+        assert len(f.source.cautions) == count

@@ -9,7 +9,9 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem
+from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
+from heli_jax.flights import Signal, read_flight
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, next_flight, signal_quality
 from heli_jax.identification.validation.expected_accuracy import too_good
@@ -200,6 +202,58 @@ def test_the_rate_of_an_input_that_moved_between_its_samples():
         )
         rates.append(input_rate(f, "u", u))
     assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
+
+
+@pytest.mark.parametrize("rate", [9.8, 24.7, 49.9, 80.0])
+def test_the_rate_of_an_input_is_that_of_its_own_clock(tmp_path, rate):
+    rng = np.random.default_rng(1)
+    t, fast = np.cumsum(1 / rate + 0.002 / rate * rng.standard_normal(int(40 * rate))), 250.0
+    gyro = np.arange(int(39 * fast)) / fast
+    u = np.sin(4.4 * t) + 0.5 * np.sin(10.7 * t + 1) + 0.2 * rng.standard_normal(t.size)
+    p = np.interp(gyro, t, u) + 0.1 * rng.standard_normal(gyro.size)
+    np.savez(tmp_path / "a.npz", **{"rc.t": t, "rc.u": u, "imu.t": gyro, "imu.p": p})
+    f = read_flight(
+        tmp_path / "a.npz",
+        inputs={"u": Signal("rc.u", "1", "1")},
+        outputs={"p": Signal("imu.p", "rad/s", "rad/s")},
+        rate=100.0,
+    )
+    assert input_rate(f, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
+    # Interpolated onto the grid before it came here, only slow straight lines show.
+    if rate < 40:
+        alone = replace(f, source=None)
+        assert input_rate(alone, "u", f.inputs["u"]) == pytest.approx(rate, rel=0.01)
+    found = flight_responses([f], Settings(band=(0.5, 45.0)))
+    hz, H = found.omega / (2 * np.pi), found.outputs["p"].pairs["u"].H
+    assert hz[np.isfinite(H)].max() == pytest.approx(min(rate / 2, 45.0), rel=0.05)
+
+
+def on_the_ground(seed, n=2000):
+    """A machine that spools up: noise, and a rate loop whose stick follows the gyro."""
+    rng = np.random.default_rng(seed)
+    p = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(n))
+    p = 0.05 * (p + 3.0 * rng.standard_normal(n))
+    heard = scipy.signal.lfilter([0.3], [1.0, -0.7], np.r_[0.0, 0.0, p[:-2]])
+    pilot = scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(n))
+    return pilot - 0.2 * heard, p
+
+
+def in_gusts(seed, n=2000, vaf=0.2):
+    """A machine that answers its stick, in gusts that move it more."""
+    rng = np.random.default_rng(seed)
+    u = steps(rng, n)
+    phi, _ = response(u, np.zeros(n))
+    gust, _ = response(rng.standard_normal(n), np.zeros(n))
+    return u, phi + gust * phi.std() / gust.std() * np.sqrt(1.0 / vaf - 1.0)
+
+
+@pytest.mark.parametrize(("made", "refused"), [(on_the_ground, True), (in_gusts, False)])
+def test_where_no_output_follows_any_input_nothing_is_determined(made, refused):
+    u, phi = made(2)
+    f = Flight(dt=DT, inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
+    found = check(problem(f))
+    assert (found.findings[0].severity == "refuse") == refused
+    assert (found.verdict.undetermined == tuple(FREE)) == refused
 
 
 def test_a_stick_that_stays_for_equal_times_is_a_slow_channel_unless_its_hold_is_stated():

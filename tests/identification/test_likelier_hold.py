@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model
+from heli_jax.flights.holds import decide
 from heli_jax.identification.likelier_hold import with_likelier_hold
 
 TRUTH = {"Lp": -5.0, "Lda": 30.0}
@@ -54,6 +56,59 @@ def test_an_input_is_held_where_the_record_says_so(tmp_path, held):
     for name, e in found.estimates.items():
         assert e.sd is not None
         assert e.value == pytest.approx(TRUTH[name], abs=3.5 * e.sd)
+
+
+def _on_a_test_card(stepped: bool, chirped: bool, seed: int) -> Flight:
+    """Doublets whose jumps are held and a chirp sampled on its way, p 60 ms late; by SciPy at ten
+    times the rate."""
+    dt, fine, n = 0.02, 10, 2000
+    t = np.arange(n * fine) * dt / fine
+    steps = np.zeros(t.size)
+    doublets = ((1.0, 0.4, 3.0), (4.0, 0.3, -4.0), (7.0, 0.24, 5.0), (11.0, 0.6, -3.0))
+    for begin, width, size in doublets if stepped else ():
+        for sign, at in ((1.0, begin), (-1.0, begin + width)):
+            first = fine * round(at / dt)
+            steps[first : first + fine * round(width / dt)] += sign * size
+    at = np.maximum(t - 15.0, 0.0)
+    chirp = 3.0 * np.sin(2.0 * np.pi * (0.2 + 0.07 * at) * at) * chirped
+    da, p = np.zeros(t.size), np.zeros(n)
+    for part, method in ((np.radians(steps), "zoh"), (np.radians(chirp), "foh")):
+        num, den, _ = scipy.signal.cont2discrete(([40.0], [1.0, 8.0]), dt / fine, method=method)
+        p += scipy.signal.lfilter(num.ravel(), den, np.r_[np.zeros(30), part[:-30]])[::fine]
+        da += part
+    p += 0.005 * np.random.default_rng(seed).standard_normal(n)
+    u = da[::fine]
+    decided = decide(u)
+    return Flight(
+        dt=dt,
+        inputs={"da": u},
+        outputs={"p": p},
+        hold={"da": decided.hold},
+        hold_reason={"da": decided.reason},
+    )
+
+
+@pytest.mark.parametrize(
+    ("stepped", "chirped", "hold"),
+    [(True, True, "mixed"), (True, False, "zero-order"), (False, True, "linear")],
+)
+def test_the_delay_of_a_test_card(tmp_path, stepped, chirped, hold):
+    (tmp_path / "late.yaml").write_text(
+        RATE.replace("B: {p", "delays: {da: tau}\nB: {p").replace(
+            "A: {", "  tau: {value: 0.02, unit: s}\nA: {"
+        )
+    )
+    late = linear_model(tmp_path / "late.yaml")
+    free = {"Lp": Free(-2.0), "Lda": Free(10.0), "tau": Free(0.02)}
+    flight = _on_a_test_card(stepped, chirped, 3)
+    assert flight.hold["da"] == hold
+    found = fit(Problem(late.model, late.vehicle({}).params, [flight], free))
+    assert found.exit_code == 0
+    for name, truth in {"Lp": -8.0, "Lda": 40.0, "tau": 0.060}.items():
+        e = found.estimates[name]
+        assert e.sd is not None
+        assert e.value == pytest.approx(truth, abs=3.5 * e.sd)
+    assert found.estimates["tau"].sd < 0.0006
 
 
 def test_what_was_stated_stays(tmp_path):

@@ -169,7 +169,7 @@ def test_coloured_residuals_are_announced_before_the_numbers(sound, tmp_path):
     name = next(iter(sound[0].whiteness))
     coloured = {name: Whiteness(False, 1e-9, 100, 0.4, 0.9)}
     text = words(page(sound, tmp_path, whiteness=coloured)[0])
-    assert "! converged: the data determine Ixx and If, but the intervals are too narrow" in text
+    assert "converged: the data determine Ixx and If, but the intervals are too narrow" in text
     assert text.index("The residuals are not white") < text.index("95 % (too narrow)")
 
 

@@ -22,6 +22,9 @@ from tests.dynamics.paper import BENCH
 DT, N = 0.05, 41
 RNG = np.random.default_rng(3)
 DE, DR = RNG.standard_normal(N), np.repeat(RNG.standard_normal(N // 4 + 1), 4)[:N]
+STICK = np.r_[np.repeat([0.0, 1.0, -1.0, 0.4], 5), 0.4 + 0.3 * np.sin(0.2 * np.arange(N - 20))]
+STEPPED = np.arange(N) < 20
+"""the intervals of STICK that are held"""
 X0 = np.array([0.3, -0.5])
 A = np.array([[-1.2, 20.0], [0.3, -3.7]])
 B = np.array([[-2.0, 0.4], [-9.0, 1.5]])
@@ -67,12 +70,13 @@ MIXED = {"de": "linear", "dr": "zero-order"}
 
 def acting(name, values, t, delay, hold):
     """One input at the time t, by its hold; before the first sample the first, and so on."""
-    if hold == "linear":
+    at = int(np.clip(np.floor((t - delay) / DT + 1e-9), 0, N - 1))
+    if hold == "linear" or (hold == "mixed" and not STEPPED[at]):
         return np.interp(t - delay, DT * np.arange(N), values)
-    return values[int(np.clip(np.floor((t - delay) / DT + 1e-9), 0, N - 1))]
+    return values[at]
 
 
-def integrated(delay=0.0, holds=("linear", "zero-order"), drag=0.0, x0=X0):
+def integrated(delay=0.0, holds=("linear", "zero-order"), drag=0.0, x0=X0, de=DE):
     """States (N, 2) by solve_ivp, stopped wherever an input has a corner or a jump."""
     knots = np.unique(np.round([*(DT * np.arange(N)), *(DT * np.arange(-N, 2 * N) + delay)], 12))
     knots = knots[(knots >= 0) & (knots <= DT * (N - 1) + 1e-9)]
@@ -83,8 +87,10 @@ def integrated(delay=0.0, holds=("linear", "zero-order"), drag=0.0, x0=X0):
         def rates(t, x, middle=middle):
             # A held input is that of the interval, a linear one that of the moment.
             u = [
-                acting(n, v, t if hold == "linear" else middle, delay, hold)
-                for (n, v), hold in zip((("de", DE), ("dr", DR)), holds, strict=True)
+                acting(n, v, middle if hold == "zero-order" else t, delay, hold)
+                if hold != "mixed" or not STEPPED[int((middle - delay) // DT)]
+                else acting(n, v, middle, delay, hold)
+                for (n, v), hold in zip((("de", de), ("dr", DR)), holds, strict=True)
             ]
             return A @ x + B @ u - [0.0, drag * x[1] ** 3]
 
@@ -100,7 +106,8 @@ def inputs(de=DE, dr=DR):
 
 @functools.cache
 def compiled(solver=None, delayed=False, block=1, substeps=4, hold="mixed", drag=0.0):
-    how = {"mixed": MIXED, "linear": "linear", "none": None}[hold]
+    jumps = {"de": "mixed", "dr": "zero-order"}
+    how = {"mixed": MIXED, "linear": "linear", "none": None, "jumps": jumps}[hold]
     model = LINEAR if solver in (None, "exact") else OTHER
     given = {"tsit5": dfx.Tsit5(), "adaptive": dfx.Dopri8()}.get(solver, solver)
     controller = dfx.PIDController(rtol=1e-9, atol=1e-11) if solver == "adaptive" else None
@@ -153,6 +160,26 @@ def test_other_solvers_follow_the_input_within_their_steps(solver, delay):
         inputs(), jnp.asarray(delay or 0.0)
     )
     close(states(found), integrated(delay or 0.0, drag=0.4), 1e-6 if solver == "rk4" else 1e-8)
+
+
+@pytest.mark.parametrize("delay", [None, 0.017, 0.083])
+@pytest.mark.parametrize(("solver", "block"), [("exact", 1), ("exact", 8), ("rk4", 1)])
+def test_a_mixed_input_is_held_until_it_jumps(solver, block, delay):
+    late, drag = delay or 0.0, 0.0 if solver == "exact" else 0.4
+    u = inputs(de=STICK)
+    go = compiled(solver, delay is not None, block, 8, "jumps", drag)
+    expected = integrated(late, ("mixed", "zero-order"), drag, de=STICK)
+    found = go(u, jnp.asarray(late))
+    close(states(found), expected, 1e-9 if solver == "exact" else 1e-6)
+    t = DT * np.arange(N)
+    de = [acting("de", STICK, s, late, "mixed") for s in t]
+    np.testing.assert_allclose(found.inputs.de, de, atol=1e-12)
+    if solver == "exact":
+        how = {"dt": DT, "initial_state": State(*jnp.asarray(X0)), "delay": delay}
+        measured, sd = {"q": jnp.zeros(N)}, {"q": 0.1}
+        for model in (LINEAR, OTHER):
+            error = innovations(model, Params(), u, measured, sd, **how, hold={"de": "mixed"}).error
+            np.testing.assert_allclose(error["q"], -expected[:, 1], atol=1e-9)
 
 
 @pytest.mark.parametrize("solver", ["exact", "rk4"])
@@ -284,7 +311,7 @@ def test_an_event_is_found_where_the_moving_input_brings_it():
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"hold": "foh"}, "zero-order, linear, got 'foh'"),
+        ({"hold": "foh"}, "zero-order, linear, mixed, got 'foh'"),
         ({"hold": {"de": "cubic"}}, "got 'cubic'"),
         ({"hold": {"da": "linear"}}, "no input 'da'"),
         ({"hold": "linear", "feedback": lambda s, u: u}, "feedback .* hold='zero-order'"),

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import without_jumps
 from heli_jax.identification.equation_error import smoothing
 from heli_jax.identification.equation_error.structure import Structure
 from heli_jax.numerics.white_noise import noise_guess
@@ -79,6 +80,7 @@ def record(
         half: half width of the kernel [samples].
         late: by input, how late it acts [s].
     """
+    flight = without_jumps(flight)
     outputs = structure.signals[: -len(naming.names(model.Inputs))]
     parts, bridged = whole_segments(flight, outputs)
     least = shortest(half)

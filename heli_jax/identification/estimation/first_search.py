@@ -1,5 +1,6 @@
 """The search from the start values, by what takes least time to search with."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,13 +29,14 @@ class FirstOptima(NamedTuple):
 
     search: Search
     noise: Noise
+    points: Float[Array, "s q"]
     optima: list[Optimum]
 
 
 def first_optima(
     search: Search,
     at: FirstGuess,
-    points: Float[Array, "s q"],
+    starts: Callable[[Noise, tuple[Any, Any]], Float[Array, "s q"]],
     report: Progress | None = None,
 ) -> FirstOptima:
     """An optimum for each start, after which the noise is relaxed.
@@ -42,13 +44,14 @@ def first_optima(
     Args:
         search: the optimiser over the problem.
         at: its first guess.
-        points: the starts.
+        starts: makes them of the noise to begin with, and of residuals and Jacobian at the guess.
         report: called with a sentence after each of several.
     """
     layout, estimator = at.layout, at.layout.estimator
     r_J: tuple[Any, Any] = (at.e.r, at.e.J)
     first = Search(search.problem, layout, at.begun, search.max_steps)
     quick, quickly = estimator.to_begin_with(layout, at.data, at.noise, at.z, r_J)
+    points = starts(quick, quickly)
 
     def run(noise: Noise, known: tuple[Array, Array]) -> list[Optimum]:
         # Residuals at the first start are those of the first guess.
@@ -60,4 +63,4 @@ def first_optima(
     # What a part of the data leads to nowhere may be found by all of them.
     if quick is not at.noise and not any(bool(o.converged) for o in optima):
         quick, optima = at.noise, run(at.noise, r_J)
-    return FirstOptima(first, quick, optima)
+    return FirstOptima(first, quick, points, optima)

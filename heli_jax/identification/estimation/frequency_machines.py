@@ -17,7 +17,7 @@ from heli_jax.identification.estimation.frequency_records import Record, records
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
-from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
 _TOGETHER = 4
@@ -114,8 +114,8 @@ def _machine(
     data = data._replace(flights=(*data.flights[:i], flight, *data.flights[i + 1 :]))
     condition = layout.of_flights[i].condition
     model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
+    model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
+    Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
     return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)

@@ -27,7 +27,7 @@ from heli_jax.identification.estimation.filter_step import Drive, Estimate, Filt
 from heli_jax.naming import Scalar
 from heli_jax.numerics.matrix_exponential import product
 from heli_jax.simulation.discretize import process_noise
-from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.stepping import held_columns
 
@@ -99,7 +99,7 @@ def begun(
     """What drives a filter, its first estimate, what is measured and the variances of its noise;
     arguments as of `innovations`."""
     options = _checked(options)
-    linear = linear_inputs(model, inputs, options.hold)
+    model, inputs, linear = between_samples(model, inputs, inputs, options.hold)
     begin = options.initial_state
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype

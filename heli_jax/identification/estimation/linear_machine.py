@@ -17,7 +17,7 @@ from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns
 from heli_jax.simulation.blocks import blockwise
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs
 from heli_jax.simulation.stepping import held_columns, start_state
 
@@ -59,8 +59,8 @@ def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:
         i: the flight's number.
     """
     model, drive = layout.model, driven(layout, data, u, i)
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
+    model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
+    Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
     x0 = start_state(model, drive.params, drive.state, drive.inputs)

@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.estimation.steady_gain import Gaussian, Records, filtered_records
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 from heli_jax.simulation.discretize import process_noise
-from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
 
 
@@ -59,9 +59,11 @@ def _system(
     model, params, dt = layout.model, drives[0].params, drives[0].dt
     names = layout.outputs[group[0]]
     inputs = jax.tree.map(lambda *v: _columns(v), *(drive.inputs for drive in drives))
-    linear = linear_inputs(model, inputs, layout.hold(group[0]))
+    first, hold = drives[0].inputs, layout.hold(group[0])
+    model = between_samples(layout.model, first, first, hold).model
 
     def held(inputs: Any) -> Any:
+        _, inputs, linear = between_samples(layout.model, inputs, inputs, hold)
         return held_columns(model, params, inputs, dt, u.shift, linear)
 
     # The matrices come out once and not by record: they do not depend on the inputs, and that they

@@ -1,7 +1,7 @@
 """What the identifiability analysis says: plain data."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -126,6 +126,24 @@ class Verdict:
     """pairs of parameters whose values may be exchanged: the data do not tell which is which"""
     second: tuple[SecondSolution, ...] = ()
     """other values that the data do not tell from these"""
+
+    def nothing(self, sentence: str) -> "Verdict":
+        """No parameter determined, for a reason.
+
+        Args:
+            sentence: the reason.
+        """
+        return replace(
+            self,
+            identifiable=False,
+            combinations=(),
+            pairs=(),
+            undetermined=tuple(n for n in self.names if n not in self.without_effect),
+            sentences=(sentence,),
+            resting=(),
+            roughly=(),
+            through_zero=(),
+        )
 
     @property
     def text(self) -> str:

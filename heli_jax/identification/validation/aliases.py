@@ -85,7 +85,8 @@ class Modes(NamedTuple):
         self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
     ) -> tuple[float, str, str]:
         """The part of mode k in the answer of an output to a step of an input's size, over the
-        output's noise, where that is largest: with the input's and the output's name.
+        output's noise, where that is largest: with the input's and the output's name. Where no
+        input moves, in the free motion: of the modes that the output shows best all of it.
 
         Args:
             k: of the eigenvalues.
@@ -95,6 +96,13 @@ class Modes(NamedTuple):
         """
         outputs = naming.names(problem.model.Outputs)
         best = (0.0, "", "")
+        if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
+            for y in flight.outputs:
+                shown = np.abs(self.C[outputs.index(y)] @ self.right)
+                shown *= np.linalg.norm(self.left, axis=1)
+                part = shown[k] / max(float(shown.max()), 1e-300)
+                best = max(best, (part * np.nanstd(flight.outputs[y]) / float(noise[y]), "", y))
+            return best
         for j, u in enumerate(naming.names(problem.model.Inputs)):
             size = float(np.std(flight.inputs[u]))
             for y in flight.outputs:

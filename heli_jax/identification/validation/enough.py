@@ -10,12 +10,13 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.aliases import measurement_noise
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excitation_test import outputs_against_excitation
+from heli_jax.identification.validation.excited_band import NOTHING, NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.feedback import feedback_notes, untested, why_untested
 from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Feedback
 from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_angles import late_angles
-from heli_jax.identification.validation.late_inputs import late_inputs
+from heli_jax.identification.validation.late_inputs import LATE, late_inputs
 from heli_jax.identification.validation.logging_rate import (
     LOGGING_RATE,
     logging_rate,
@@ -41,7 +42,15 @@ from heli_jax.numbers import p_value
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
+_CHANCE = 0.1
+"""p value of the output that follows the inputs most surely, from which on none is taken to: of a
+machine in strong gusts it is far less"""
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2, "note": 2}
+
+
+def _rank(finding: Finding) -> tuple[int, bool]:
+    """Rank findings: the worst first, and of those a late input, which makes modes look fast."""
+    return _ORDER[finding.severity], finding.code != LATE
 
 
 def is_it_enough(
@@ -65,7 +74,7 @@ def is_it_enough(
     findings = [
         *logging_rate(problem, flights, at.noise.sd),
         *loop_between_samples(flights, feedback),
-        *bands(problem.training),
+        *(_if_nothing_follows(problem, f, feedback) for f in bands(problem.training)),
         *_of_feedback(problem, feedback),
         *saturation(flights),
         *stuck(flights),
@@ -85,7 +94,18 @@ def is_it_enough(
     else:
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
         findings.append(Finding("excitation.next-flight", "note", words))
-    return tuple(sorted(findings, key=lambda f: _ORDER[f.severity]))
+    return tuple(sorted(findings, key=_rank))
+
+
+def _if_nothing_follows(problem: Problem, f: Finding, feedback: Sequence[Feedback]) -> Finding:
+    """Refuse a record in which no output follows any input, where what the two have in common is
+    chance, or comes from inputs that follow the response: a rate loop on the ground."""
+    if f.code != NOTHING_FOLLOWS or f.value is None or f.value >= NOTHING:
+        return f
+    p_values = outputs_against_excitation(problem)
+    by_chance = not p_values or min(p_values.values()) >= _CHANCE
+    is_refused = by_chance or any(one.present for one in feedback)
+    return f._replace(severity="refuse") if is_refused else f
 
 
 def judged_again(
@@ -102,7 +122,7 @@ def judged_again(
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
     kept = [f for f in findings if f.code != LOGGING_RATE]
-    return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
+    return tuple(sorted([*again, *kept], key=_rank))
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:

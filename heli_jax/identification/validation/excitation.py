@@ -56,7 +56,8 @@ def _feeble(
 def _few_changes(flight: Flight, free: int) -> list[Finding]:
     # Every change of an input is one new piece of information at best.
     changes = sum(int(np.count_nonzero(np.diff(u))) for u in flight.inputs.values())
-    if changes >= free:
+    # A free decay tells by its initial state.
+    if changes >= free or not any(np.ptp(u) > 0 for u in flight.inputs.values()):
         return []
     words = (
         f"{flight.name or 'the flight'}: {' and '.join(flight.inputs)} "

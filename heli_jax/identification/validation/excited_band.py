@@ -34,8 +34,14 @@ _WIDTH, _BINS = 0.25, 3
 vibration, or chance"""
 _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
+NOTHING = 0.2
+"""of the power of each output, below which inputs that no output follows over a band tell nothing,
+where they follow the response or none of it is beyond chance: a machine that is not flying had 0.11
+"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
+_NOISE = 0.5
+"""of what white noise has, in steps from sample to sample: above it an output shows no motion"""
 NOTHING_FOLLOWS = "excitation.nothing-follows"
 _NOTHING = (
     "no output follows any input coherently over a band of frequencies: noise, disturbances or "
@@ -70,8 +76,7 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
     if not moving:
-        words = "no input moves: nothing is excited."
-        return [Finding("excitation.excited-band", "refuse", words, 0.0, "inputs that move, 1")]
+        return [_free_motion(alike)]
     seen = seen_parts(alike)
     barely = hardly_moving(alike, moving)
     pooled = _pooled(seen, moving, alike[0].dt)
@@ -80,6 +85,32 @@ def _bands(flights: Sequence[Flight]) -> list[Finding]:
         return [*barely, *coherent, *together]
     together = _short_together(alike, moving)
     return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
+
+
+def _free_motion(flights: Sequence[Flight]) -> Finding:
+    """What can be learnt where no input moves: a free decay, or nothing from noise alone."""
+    turns = {
+        n: min(_roughness(f.outputs[n]) for f in flights if n in f.outputs)
+        for f in flights
+        for n in f.outputs
+    }
+    name = min(turns, key=lambda n: turns[n])
+    criterion = f"mean squared step of an output over that of white noise, {_NOISE:g}"
+    if turns[name] > _NOISE:
+        words = "no input moves, and the outputs show noise alone: nothing is excited."
+        return Finding(NOTHING_FOLLOWS, "refuse", words, turns[name], criterion)
+    words = (
+        f"no input moves: {name} shows how the machine moves freely from its first state, or under "
+        "constant inputs; what inputs do beyond that is not in the record."
+    )
+    return Finding("excitation.free-motion", "note", words, turns[name], criterion, (name,))
+
+
+def _roughness(y: Float[np.ndarray, " N"]) -> float:
+    """Mean squared step of a signal over that of white noise of its variance (von Neumann)."""
+    y = y[np.isfinite(y)]
+    spread = float(np.var(y)) if y.size > 2 else 0.0
+    return float(np.mean(np.diff(y) ** 2)) / (2.0 * spread) if spread > 0 else 1.0
 
 
 def _why_not(seen: SeenParts) -> str:
@@ -165,8 +196,27 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
         findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        findings.append(Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, None, criterion))
+        share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
+        criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
+        findings.insert(0, Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
     return findings
+
+
+def _share(pooled: _Pooled, i: int) -> float:
+    """Of an output's power where inputs have some, the part that follows them, less what chance
+    makes of few segments."""
+    excited, (_, segments, m) = _excited(pooled), pooled.inputs.shape
+    y, u = pooled.outputs[excited, :, i], pooled.inputs[excited]
+    left = float(np.sum(np.abs(without(u, y)) ** 2))
+    whole, chance = float(np.sum(np.abs(y) ** 2)), min(m / (0.9 * segments), 0.99)
+    return max(1.0 - left / max(whole, 1e-300) / (1.0 - chance), 0.0)
+
+
+def _excited(pooled: _Pooled) -> Bool[np.ndarray, " k"]:
+    """The frequencies at which an input has power: beyond, what a filter or a window has left of
+    both signals is coherent as well."""
+    power = np.sum(np.abs(pooled.inputs) ** 2, axis=1)
+    return np.any(power >= _LEAST_POWER * np.max(power, axis=0), axis=1)
 
 
 def _follow_together(pooled: _Pooled) -> bool:
@@ -182,7 +232,7 @@ def _follow_together(pooled: _Pooled) -> bool:
         y = pooled.outputs[:, :, i]
         left = np.sum(np.abs(without(pooled.inputs, y)) ** 2, axis=1)
         multiple = 1.0 - left / np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
-        run = longest_band(pooled.hz, multiple >= max(COHERENT, chance))
+        run = longest_band(pooled.hz, (multiple >= max(COHERENT, chance)) & _excited(pooled))
         if run is not None and _is_band(run, step):
             return True
     return False

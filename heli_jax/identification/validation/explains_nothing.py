@@ -1,7 +1,5 @@
 """A fit whose model explains nothing of what was measured determines nothing of it either."""
 
-from dataclasses import replace
-
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.validation.adequacy import Adequacy
@@ -26,14 +24,4 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
         f"{outputs} at this optimum. Start nearer, from several points (fit.starts), or from what "
         "the data say (start: equation-error)."
     )
-    return replace(
-        verdict,
-        identifiable=False,
-        combinations=(),
-        pairs=(),
-        undetermined=tuple(n for n in verdict.names if n not in verdict.without_effect),
-        sentences=(sentence,),
-        resting=(),
-        roughly=(),
-        through_zero=(),
-    )
+    return verdict.nothing(sentence)

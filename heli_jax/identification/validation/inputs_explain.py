@@ -4,8 +4,6 @@ What is then estimated is the colour of the noise, and not how the machine answe
 starts, or with another disturbance, it is something else, with an interval as narrow.
 """
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
@@ -46,17 +44,7 @@ def unless_inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict)
         "disturbance and the noise. Larger inputs are needed, or other columns: are these the "
         "signals that move the machine?"
     )
-    return replace(
-        verdict,
-        identifiable=False,
-        combinations=(),
-        pairs=(),
-        undetermined=tuple(n for n in verdict.names if n not in verdict.without_effect),
-        sentences=(sentence,),
-        resting=(),
-        roughly=(),
-        through_zero=(),
-    )
+    return verdict.nothing(sentence)
 
 
 def gain_of_inputs(at: Solution, e: Evaluation) -> float:

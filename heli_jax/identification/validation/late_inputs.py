@@ -16,6 +16,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.numbers import percent
 
+LATE = "timing.late-input"
+"""the topic of such a finding"""
 _RATE = 50.0
 """[Hz] to which logs are averaged, so that the verdict is the same at any rate of the log: samples
 that come faster each tell less"""
@@ -138,4 +140,4 @@ def _finding(label: str, name: str, share: float, lead: float, output: str) -> F
         "(feedback)."
     )
     criterion = f"part of what the past leaves that the later input explains, {_CLEAR:g}"
-    return Finding("timing.late-input", "doubt", words, share, criterion)
+    return Finding(LATE, "doubt", words, share, criterion)

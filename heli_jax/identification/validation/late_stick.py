@@ -21,10 +21,10 @@ from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
+from heli_jax.identification.validation.late_inputs import LATE
 from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
 from heli_jax.identification.validation.signal_quality import facts_of
 
-LATE_INPUT = "timing.late-input"
 _CLEAR = 5.0
 """sds from zero, from which on a shift is spoken of"""
 _LARGE = 0.1
@@ -87,7 +87,7 @@ def late_stick(
     values = dict(zip(at.layout.of_interest, np.asarray(e.named).tolist(), strict=True))
     shifts = {n: part * values[n] for n, part in moved.items()}
     criterion = f"seconds, {_CLEAR:g} sd"
-    return [Finding(LATE_INPUT, "doubt", words, seconds, criterion, names, shifts, brief)]
+    return [Finding(LATE, "doubt", words, seconds, criterion, names, shifts, brief)]
 
 
 def _freed(problem: Problem, value: float, sd: float | None) -> list[Finding]:

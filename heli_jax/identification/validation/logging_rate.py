@@ -23,6 +23,7 @@ from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
+from heli_jax.numerics.jumps import split
 
 LOGGING_RATE = "timing.logging-rate"
 HOPELESS, ENOUGH = 2.0, 5.0
@@ -34,6 +35,12 @@ _PART = 0.1
 guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
+_SLOW = 2.0
+"""Hz, at which no flight is logged: 500 Hz or more in ms, read as seconds"""
+_SLOWER = 1.05
+"""steps of the grid, from which on a topic's own is longer"""
+_MOST_BENDS = 8
+"""samples in a row at which straight lines bend: of more each is a sample of the signal's own"""
 _FAST_SHARE, _FALLS = 0.005, 0.5
 """part of an input's power above a quarter of its rate, and its density there over that of the
 octave below: an input with more of both moves between its samples"""
@@ -211,7 +218,7 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
             f"answers up to {fastest.hz:.3g} Hz (a mode at the {where})"
         )
         finding = _judged(begun, ratio, fastest.hz)
-        if finding.severity != "ok" and flight.hold[name] != "linear":
+        if finding.severity != "ok" and flight.hold[name] == "zero-order":
             # All stairs of one length are a clock's, and so is a test signal with a clock.
             finding = finding._replace(
                 sentence=f"{finding.sentence} Where {name} was commanded in steps of that length, "
@@ -246,7 +253,8 @@ def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> 
         ending = (
             f": {number(ratio, 2)} samples in a period cannot show it, so this log cannot be "
             f"fitted with this model; log at {hopeless * hz:.3g} Hz at least, "
-            f"better {ENOUGH * hz:.3g} Hz."
+            f"better {ENOUGH * hz:.3g} Hz"
+            f"{'; or its times are in ms (time.unit)' if ratio * hz <= _SLOW else ''}."
         )
     elif ratio < ENOUGH:
         severity = "doubt"
@@ -268,8 +276,12 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     """
     if np.ptp(u) == 0:
         return None
-    if flight.hold[name] == "linear":
-        return _corner_rate(flight.dt, u)
+    step = flight.logged_step(name, "input")
+    # A slower topic's own clock is known, and its straight lines are those of the grid.
+    slower = 1.0 / step if step > _SLOWER * flight.dt else None
+    if flight.hold[name] != "zero-order":
+        moving = split(u)[1] if flight.hold[name] == "mixed" else u
+        return slower or _corner_rate(flight.dt, moving)
     # Held because somebody said so: then it is known at all times.
     if name not in flight.hold_reason:
         return None
@@ -283,7 +295,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
     regular = np.mean(np.abs(stairs - usual) <= max(1.0, 0.05 * usual))
     if usual < 2 or regular < _REGULAR:
         return None
-    return 1.0 / (usual * flight.dt)
+    return min(1.0 / (usual * flight.dt), slower or np.inf)
 
 
 def _corner_rate(dt: float, u: np.ndarray) -> float:
@@ -294,16 +306,19 @@ def _corner_rate(dt: float, u: np.ndarray) -> float:
     corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
     if corners.size < _STEPS:
         return 1.0 / dt
-    usual = float(np.median(np.diff(corners)))
     # A corner between two samples of the new clock bends at both of them.
-    pairs = np.mean(np.diff(corners) == 1)
-    if usual <= 1 and pairs < 0.6:
-        usual = float(np.median(np.diff(corners)[np.diff(corners) > 1]))
-    return 1.0 / (max(usual, 1.0) * dt)
+    begins = np.flatnonzero(np.diff(corners, prepend=-2) > 1)
+    sizes = np.diff(begins, append=corners.size)
+    if np.median(np.repeat(sizes, sizes)) > _MOST_BENDS:
+        return 1.0 / dt
+    within = np.arange(corners.size) - np.repeat(begins, sizes)
+    steps = np.diff(corners[within % 2 == 0])
+    # Where it rests there are no corners.
+    return 1.0 / (float(np.mean(steps[steps <= 1.5 * np.median(steps)])) * dt)
 
 
 def output_rate(flight: Flight, name: str) -> float:
     """The rate [Hz] of the samples of an output that are there."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
     usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
-    return 1.0 / (usual * flight.dt)
+    return 1.0 / max(usual * flight.dt, flight.logged_step(name, "output"))

@@ -17,6 +17,7 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
+from heli_jax.numerics.jumps import split
 
 _NULL = 1e-8
 """Directions of the scaled Jacobian below this part of the largest stay where they are."""
@@ -141,7 +142,7 @@ def _least(e: Evaluation) -> float:
 
 def _held(flight: Flight, names: Collection[str], reason: str) -> Flight:
     """A flight with the inputs held of which its log let a straight line be taken."""
-    doubted = {n for n in names if flight.hold[n] == "linear" and n in flight.hold_reason}
+    doubted = {n for n in names if flight.hold[n] != "zero-order" and n in flight.hold_reason}
     if not doubted:
         return flight
     return replace(
@@ -163,7 +164,7 @@ def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]
         # What stays constant is the same under either hold.
         if np.ptp(flight.inputs[n]) > 0
         and not is_low_passed(flight.hold_reason.get(n, ""))
-        and (not in_doubt or (flight.hold[n] == "linear" and n in flight.hold_reason))
+        and (not in_doubt or (flight.hold[n] != "zero-order" and n in flight.hold_reason))
     }
 
 
@@ -194,7 +195,7 @@ def _averaged(layout: Layout, data: Data, moving: list[set[str]]) -> Data:
     second order in the sample time: the same program serves.
 
     A linear input is that held at the mean of both ends of its interval; a held one is a linear one
-    that is late by half a sample.
+    that is late by half a sample. A mixed one is held where it jumps already.
     """
     # Only where nothing is fed through: at the sample itself the mean of two is another value.
     flights = []
@@ -203,10 +204,11 @@ def _averaged(layout: Layout, data: Data, moving: list[set[str]]) -> Data:
         for n, u in naming.asdict(flight.inputs).items():
             # In NumPy: each operation by itself would be a program to load.
             u = np.asarray(u)
+            stairs, moving_part = split(u) if layout.hold(i)[n] == "mixed" else (0.0 * u, u)
             beside = np.concatenate([u[1:], u[-1:]])
-            if layout.hold(i)[n] == "linear":
-                beside = np.concatenate([u[:1], u[:-1]])
-            inputs[n] = 0.5 * (u + beside) if n in names else u
+            if layout.hold(i)[n] != "zero-order":
+                beside = np.concatenate([moving_part[:1], moving_part[:-1]])
+            inputs[n] = stairs + 0.5 * (moving_part + beside) if n in names else u
         flights.append(flight._replace(inputs=layout.model.Inputs(**inputs)))
     return data._replace(flights=jax.device_put(tuple(flights)))
 
@@ -222,7 +224,7 @@ def _flipped(layout: Layout, moving: list[set[str]]) -> Layout:
 
 
 def _other(hold: str) -> str:
-    return "zero-order" if hold == "linear" else "linear"
+    return "linear" if hold == "zero-order" else "zero-order"
 
 
 def pseudoinverse(J: np.ndarray) -> np.ndarray:

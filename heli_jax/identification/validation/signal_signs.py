@@ -41,6 +41,7 @@ _DEGREE = 180.0 / np.pi
 _NEARLY = 1.3
 """factor about 57.3 that is still degrees taken for radians"""
 
+RATE_SCALE = "units.rate-scale"
 AGAINST_START, RATE_AGAINST_ANGLE = "signs.against-start", "signs.rate-against-angle"
 AGAINST = -0.3
 """correlation below which a simulated output moves against the measured one"""
@@ -133,7 +134,8 @@ def _of_scale(
         "the scale or the unit of one of the two is off, and a fit puts it into the machine."
     )
     criterion = f"the integrated rate's change over that of the angle, 1 within {most:g}"
-    return [Finding("units.rate-scale", "doubt", words, size, criterion, (rate, angle))]
+    brief = f"{rate} is {size:.3g} times the rate of {angle}"
+    return [Finding(RATE_SCALE, "doubt", words, size, criterion, (rate, angle), brief=brief)]
 
 
 def _log_sd(first: np.ndarray, second: np.ndarray) -> float:

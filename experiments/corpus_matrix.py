@@ -1,0 +1,291 @@
+"""Which diagnostic fires where, and what is lost without it: `corpus.py --matrix`.
+
+The first table has a row for each code: in how many sound and unsound cases it fires, in how many
+sound ones that end with another exit code than 0 or not adequate, and in how many unsound ones no
+other finding of its rank or above stands beside it. The second has a row for each candidate for
+deletion: where its entry function gives something other than nothing, and what of exit code,
+status, adequacy, estimates and right answers changes where it is replaced by nothing.
+"""
+
+import contextlib
+import functools
+import importlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from corpus import Result, differences, run_entries
+
+_IDENTIFICATION, _FLIGHTS = "heli_jax.identification", "heli_jax.flights"
+_VALIDATION = f"{_IDENTIFICATION}.validation"
+
+
+class Ablation(NamedTuple):
+    """A candidate and what it gives where it has nothing to say."""
+
+    name: str
+    entry: str
+    """module:function, or module:Class.method"""
+    neutral: Callable[..., Any]
+    """of the same arguments"""
+
+
+def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
+    """What slopes alone say, without a look far from the optimum."""
+    from heli_jax.identification.identifiability.combinations import combinations
+
+    return combinations(null, covariance, unknowns)
+
+
+ABLATIONS: tuple[Ablation, ...] = (
+    Ablation("turned_sensors", f"{_VALIDATION}.turned_sensors:turned_sensors", lambda problem: []),
+    Ablation("odd_flights", f"{_VALIDATION}.odd_flights:odd_flights", lambda flights: []),
+    Ablation("noisy_inputs", f"{_VALIDATION}.noisy_inputs:noisy_inputs", lambda *_: ()),
+    Ablation(
+        "wandering_angles", f"{_VALIDATION}.wandering_angles:wandering_notes", lambda problem: []
+    ),
+    Ablation(
+        "noisy_scales", f"{_IDENTIFICATION}.estimation.noisy_scales:free_scales", lambda *_: ()
+    ),
+    Ablation(
+        "restricted_likelihood",
+        f"{_IDENTIFICATION}.estimation.restricted_likelihood:with_own_noise",
+        lambda problem, noise: noise,
+    ),
+    Ablation("moves_against", f"{_VALIDATION}.moves_against:moves_against", lambda *_: False),
+    Ablation(
+        "short_holds",
+        f"{_FLIGHTS}.short_holds:short_holds",
+        lambda y, begins, noisy, step: np.zeros(len(begins), bool),
+    ),
+    Ablation("noisy_rails", f"{_FLIGHTS}.noisy_rails:rail_below_noise", lambda x: None),
+    Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
+    Ablation("stick_dropouts", f"{_FLIGHTS}.stick_dropouts:stick_dropouts", lambda x: None),
+    Ablation(
+        "likelier_hold",
+        f"{_IDENTIFICATION}.likelier_hold:with_likelier_hold",
+        lambda problem, fit, refit: (problem, fit),
+    ),
+    Ablation(
+        "further_starts", f"{_IDENTIFICATION}.further_starts:explains_little", lambda *_: False
+    ),
+    Ablation(
+        "better_of_stable", f"{_IDENTIFICATION}.further_starts:left_stability", lambda *_: False
+    ),
+    Ablation(
+        "better_of_same_responses",
+        f"{_IDENTIFICATION}.estimation.same_responses:better_of_same_responses",
+        lambda search, optimum: optimum,
+    ),
+    Ablation(
+        "second_method",
+        f"{_IDENTIFICATION}.second_method:with_second_method",
+        lambda problem, first, **_: first,
+    ),
+    Ablation("twins", f"{_IDENTIFICATION}.identifiability.twins:twins_of", lambda *_, **__: ()),
+    Ablation(
+        "swapped_modes",
+        f"{_IDENTIFICATION}.identifiability.swapped_modes:second_solutions",
+        lambda *_, **__: (),
+    ),
+    Ablation(
+        "as_likely",
+        f"{_IDENTIFICATION}.identifiability.as_likely:unless_as_likely",
+        lambda verdict, others: verdict,
+    ),
+    Ablation("valley", f"{_IDENTIFICATION}.identifiability.valley:Valley.tied", _untied),
+)
+
+
+@contextlib.contextmanager
+def replaced(entry: str, make: Callable[[Callable[..., Any]], Any]) -> Iterator[None]:
+    """An entry function replaced wherever the package has imported it.
+
+    Args:
+        entry: as of an Ablation.
+        make: of the original, what stands in its place.
+    """
+    home, _, name = entry.partition(":")
+    module: Any = importlib.import_module(home)
+    if "." in name:
+        owner, name = name.split(".")
+        of = getattr(module, owner)
+        original = getattr(of, name)
+        setattr(of, name, make(original))
+        try:
+            yield
+        finally:
+            setattr(of, name, original)
+        return
+    original = getattr(module, name)
+    other = make(original)
+    _everywhere(original, other)
+    try:
+        yield
+    finally:
+        # Modules that were imported meanwhile have the other one too.
+        _everywhere(other, original)
+
+
+def _everywhere(old: Any, new: Any) -> None:
+    for module in list(sys.modules.values()):
+        if getattr(module, "__name__", "").startswith("heli_jax"):
+            for name, value in list(vars(module).items()):
+                if value is old:
+                    setattr(module, name, new)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two results are one, whatever their kinds."""
+    if a is b:
+        return True
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return bool(np.array_equal(a, b))
+    if type(a) is type(b) and isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(same, a, b))
+    try:
+        return bool(a == b)
+    except (TypeError, ValueError):
+        return False
+
+
+@contextlib.contextmanager
+def way(name: str) -> Iterator[Result]:
+    """What is done to the package while a case runs; yields what is added to its result.
+
+    Args:
+        name: `record` notes which candidates fire and what they take; a candidate's is replaced
+            by nothing.
+    """
+    added: Result = {}
+    if name != "record":
+        [one] = [a for a in ABLATIONS if a.name == name]
+        with replaced(one.entry, lambda _: one.neutral):
+            yield added
+        return
+    fired, spent = set(), {}
+
+    def recording(one: Ablation, original: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(original)
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
+            began = time.process_time()
+            result = original(*args, **kwargs)
+            spent[one.name] = spent.get(one.name, 0.0) + time.process_time() - began
+            if not same(result, one.neutral(*args, **kwargs)):
+                fired.add(one.name)
+            return result
+
+        return wrapper
+
+    with contextlib.ExitStack() as stack:
+        for one in ABLATIONS:
+            stack.enter_context(replaced(one.entry, functools.partial(recording, one)))
+        yield added
+    added |= {"fired": sorted(fired), "spent": {n: round(s, 2) for n, s in spent.items()}}
+
+
+def matrix(cases: Sequence[Any], shared: Path, jobs: int) -> str:
+    """Both tables, and the cases in which nothing is said that should be."""
+    entries = [(c, "record") for c in cases]
+    plain = {c: r for (c, _), r in run_entries(entries, shared, jobs, way).items()}
+    again = [(c, name) for c in cases for name in plain[c.name].get("fired", ())]
+    without = run_entries(again, shared, jobs, way)
+    parts = [
+        "Codes\n",
+        *firing_table(cases, plain),
+        "\nCandidates\n",
+        *ablation_table(cases, plain, without),
+        "\nSilent where something should be said, and wrong otherwise\n",
+        *silences(cases, plain),
+    ]
+    return "\n".join(parts)
+
+
+def _is_bad(result: Result) -> bool:
+    return bool(result.get("exit")) or result.get("adequate") is False
+
+
+def _silent(case: Any, result: Result) -> bool:
+    """Whether an unsound case says nothing of the kind that it should."""
+    said = [code for codes in result.get("codes", {}).values() for code in codes]
+    return not any(word in code for word in case.ought for code in said)
+
+
+def firing_table(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
+    """A row a code: rank, sound cases, wrongly, unsound cases, alone, the words that it answers."""
+    ranks = ("exit", "doubt", "note")
+    rows: dict[str, list[int]] = {}
+    where: dict[str, str] = {}
+    for case in cases:
+        by_rank = results[case.name].get("codes", {})
+        for i, rank in enumerate(ranks):
+            for code in by_rank.get(rank, ()):
+                key = f"{rank:5s} {code}"
+                row = rows.setdefault(key, [0, 0, 0, 0, 0])
+                as_strong = sum(len(by_rank.get(r, ())) for r in ranks[: i + 1])
+                if case.sound is True:
+                    row[0] += 1
+                    row[1] += _is_bad(results[case.name])
+                elif case.sound is False:
+                    row[2] += 1
+                    row[3] += as_strong == 1
+                else:
+                    row[4] += 1
+                where.setdefault(key, case.name)
+    head = f"{'sound':>5} {'wrong':>5} {'bad':>5} {'alone':>5} {'other':>5}  rank  code; first case"
+    order = sorted(rows, key=lambda k: (ranks.index(k.split()[0]), -sum(rows[k])))
+    return [head, *(f"{' '.join(f'{n:5d}' for n in rows[k])}  {k}; {where[k]}" for k in order)]
+
+
+def ablation_table(
+    cases: Sequence[Any],
+    plain: Mapping[str, Result],
+    without: Mapping[tuple[str, str], Result],
+) -> list[str]:
+    """A row a candidate, and a line for each case that changes."""
+    lines = []
+    known = {c.name: c for c in cases}
+    for one in ABLATIONS:
+        ran = [n for n, r in plain.items() if one.name in r.get("spent", {})]
+        seconds = sum(plain[n]["spent"][one.name] for n in ran)
+        at = [n for (n, name) in without if name == one.name]
+        kinds = [known[n].sound for n in at]
+        lines.append(
+            f"{one.name}: asked in {len(ran)} cases ({seconds:.0f} s), fires in {len(at)}: "
+            f"{kinds.count(True)} sound, {kinds.count(False)} unsound, {kinds.count(None)} other"
+        )
+        for name in at:
+            before, after = plain[name], without[name, one.name]
+            changed = [
+                line
+                for line in differences(before, after)
+                if not line.startswith(("newly said: note", "no longer said: note"))
+            ]
+            rank = {"wrong without it": (not before.get("wrong") and after.get("wrong"))}
+            rank |= {"right without it": (before.get("wrong") and not after.get("wrong"))}
+            verdict = "; ".join(k for k, v in rank.items() if v)
+            sound = {True: "sound", False: "unsound", None: "other"}[known[name].sound]
+            told = "; ".join(changed) or "notes alone"
+            lines.append(f"    {name} ({sound}): {f'[{verdict}] ' if verdict else ''}{told}")
+    return lines
+
+
+def silences(cases: Sequence[Any], results: Mapping[str, Result]) -> list[str]:
+    """Cases whose answer is wrong, or that lack the code which they should have."""
+    lines = []
+    for case in cases:
+        result = results[case.name]
+        if "skipped" in result:
+            continue
+        if case.sound is False and _silent(case, result):
+            ends = f"exit {result.get('exit')}, adequate {result.get('adequate')}"
+            lines.append(f"silent: {case.name}: none of {', '.join(case.ought)}; {ends}")
+        lines += [f"{k}: {case.name}: {result[k]}" for k in ("wrong", "failed") if result.get(k)]
+    return lines
+
+
+if __name__ == "__main__":
+    print(__doc__, "\nA part of the scripts beside it: by itself it does nothing.")

@@ -1,0 +1,157 @@
+"""Runs that a file has as a stack, (segment, sample, channel), as data sets for learning do.
+
+They are put one after another, (segment times sample, channel), with a column that numbers them.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.channel_names import words_in
+from heli_jax.flights.clock_guess import TIME_NAMES
+from heli_jax.flights.table import shown
+from heli_jax.flights.time_units import split_unit
+
+NUMBER = "segment"
+"""what the column is called that numbers the segments, from 1"""
+DEEPEST = 3
+"""dimensions of an array that may be a stack"""
+_FEWEST = 10
+"""samples of a segment, below which matrices of a few numbers are no stack"""
+_MOST_NAMED = 6
+
+
+class Unstacked(NamedTuple):
+    """Arrays of at most two dimensions, and what was made of the others, in sentences."""
+
+    arrays: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
+
+
+def unstacked(arrays: Mapping[str, np.ndarray]) -> Unstacked:
+    """Stacks as matrices of a column a channel.
+
+    Args:
+        arrays: of any shape, by path.
+    """
+    deep = {n: x for n, x in arrays.items() if x.dtype.kind in "biuf" and x.ndim > 2 and x.size}
+    cubes = {n: x for n, x in deep.items() if x.ndim == DEEPEST}
+    times = {n: x for n, x in arrays.items() if _is_time(n, x)}
+    shape = _segments(cubes, times)
+    # Rotation matrices, (sample, row, column), stand beside signals of one run.
+    alone = (x for n, x in arrays.items() if x.ndim == 1 and n not in times)
+    if shape is not None and (shape[1] < _FEWEST or any(x.size == shape[1] for x in alone)):
+        shape = None
+    made: dict[str, np.ndarray] = {}
+    for name, values in arrays.items():
+        if shape is not None and (flat := _flat(values, shape, name in times)) is not None:
+            made[name] = flat
+    notes = []
+    if shape is not None and made:
+        made = _without_padding(made, {n: x for n, x in made.items() if n in times}, shape)
+        rows = next(iter(made.values())).shape[0]
+        words = f"{shape[0]} segments of {shape[1]} samples, put one after another"
+        padding = shape[0] * shape[1] - rows
+        words += f" without {padding} that pad them" if padding else ""
+        notes.append(f"stacked arrays, {_listed(made, arrays)}: {words}; {NUMBER!r} numbers them")
+        if NUMBER in arrays:
+            made.pop(NUMBER, None)
+    left = [n for n in deep if n not in made]
+    if left:
+        why = "which of their dimensions is the time is not known"
+        notes.append(f"left out, since {why}: {_listed(left, arrays)}")
+    kept = {n: made.get(n, x) for n, x in arrays.items() if n not in left}
+    return Unstacked({**kept, **{n: x for n, x in made.items() if n not in kept}}, tuple(notes))
+
+
+def _is_time(name: str, values: np.ndarray) -> bool:
+    """Whether an array is called a time and holds one for each sample of one or several runs."""
+    words = words_in(split_unit(name.replace("/", ".").rpartition(".")[2])[0])
+    if not words or not TIME_NAMES & {words[0], words[-1]} or values.dtype.kind not in "biuf":
+        return False
+    return 1 <= values.ndim <= 2 and max(values.shape) >= _FEWEST
+
+
+def _segments(
+    cubes: Mapping[str, np.ndarray], times: Mapping[str, np.ndarray]
+) -> tuple[int, int] | None:
+    """How many segments there are, of how many samples; None without a stack."""
+    for values in times.values():
+        if values.ndim == 2 and min(values.shape) > 1 and (cubes or _all_increase(values)):
+            steps = [np.abs(np.diff(values.astype(float), axis=axis)) for axis in (0, 1)]
+            # From sample to sample less time goes by than from run to run, but for runs that all
+            # begin at 0.
+            moves = [float(np.nanmedian(s)) if s.size else 0.0 for s in steps]
+            by_rows = 0.0 < moves[1] < moves[0] or moves[0] == 0.0
+            return values.shape if by_rows else values.shape[::-1]
+    if not cubes:
+        return None
+    lengths = [x.size for x in times.values() if x.ndim == 1 or min(x.shape) == 1]
+    shapes = [x.shape for x in cubes.values()]
+    samples = next((n for n in lengths if all(n in shape for shape in shapes)), None)
+    samples = samples or max(shapes[0])
+    if not all(samples in shape for shape in shapes):
+        return None
+    # The number of segments is common to all; how many channels there are is not.
+    common = set.intersection(*(set(_rest(shape, samples)) for shape in shapes))
+    firsts = {shape[0] for shape in shapes}
+    if len(common) == 1 and (samples not in firsts or len(cubes) > 1):
+        return common.pop(), samples
+    # Whether channels or segments come behind the samples is anybody's choice.
+    return (firsts.pop(), samples) if len(firsts) == 1 and samples not in firsts else None
+
+
+def _rest(shape: tuple[int, ...], size: int) -> list[int]:
+    """Of a shape, the others than one of a size."""
+    rest = list(shape)
+    rest.remove(size)
+    return rest
+
+
+def _all_increase(times: np.ndarray) -> bool:
+    """Whether a matrix of times increases along its longer side, in all of its rows."""
+    rows = times if times.shape[1] >= times.shape[0] else times.T
+    steps = np.diff(rows.astype(float), axis=1)
+    return bool(np.all(steps > 0))
+
+
+def _flat(values: np.ndarray, shape: tuple[int, int], is_time: bool) -> np.ndarray | None:
+    """A stack, or a matrix of a number a sample, in the order of the segments; None of others."""
+    segments, samples = shape
+    if is_time and values.size == samples and samples in values.shape:
+        return np.tile(values.ravel(), segments)
+    if values.dtype.kind not in "biuf" or not 2 <= values.ndim <= DEEPEST:
+        return None
+    if values.ndim == 2:
+        if sorted(values.shape) != sorted(shape):
+            return None
+        return (values if values.shape == shape else values.T).ravel()
+    order = [axis for axis, size in enumerate(values.shape) if size == segments][:1]
+    order += [a for a, size in enumerate(values.shape) if size == samples and a not in order][:1]
+    if len(order) < 2:
+        return None
+    (channel,) = {0, 1, 2} - set(order)
+    return values.transpose(*order, channel).reshape(segments * samples, -1)
+
+
+def _without_padding(
+    made: Mapping[str, np.ndarray], times: Mapping[str, np.ndarray], shape: tuple[int, int]
+) -> dict[str, np.ndarray]:
+    """The stacked arrays with a number for each row's segment, without rows that fill up short
+    segments."""
+    # Behind a segment's last sample there are no values, or no times but zeros.
+    values = [x.reshape((*shape, -1)) for n, x in made.items() if n not in times]
+    used = [np.any([np.isfinite(x).any(axis=2) for x in values], axis=0)] if values else []
+    used += [np.nan_to_num(x.reshape(shape)) != 0 for x in times.values()]
+    lengths = np.min([shape[1] - np.argmax(is_used[:, ::-1], axis=1) for is_used in used], axis=0)
+    kept = np.ravel(np.arange(shape[1]) < lengths[:, None])
+    numbers = np.repeat(np.arange(1.0, shape[0] + 1.0), shape[1])
+    own = {NUMBER: numbers} if shape[0] > 1 else {}
+    return {name: x[kept] for name, x in {**made, **own}.items()}
+
+
+def _listed(names: Mapping[str, np.ndarray] | list[str], arrays: Mapping[str, np.ndarray]) -> str:
+    listed = [f"{shown(n)} {arrays[n].shape}" for n in names if n in arrays]
+    more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
+    return f"{', '.join(listed[:_MOST_NAMED])}{more}"
