@@ -120,8 +120,10 @@ def fit_notes(
 
 
 def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Finding]:
-    """Which parameters surely have the other sign than they began with, where they began with a
-    value and not next to zero.
+    """Doubt about parameters that surely have the other sign than they began with, where they began
+    with a value and not next to zero: a turned signal fits as well, and the start alone tells.
+
+    One whose sign is declared (`Model.positive`, `sign: keep`, bounds) cannot turn.
 
     Args:
         problem: with the starts.
@@ -143,7 +145,7 @@ def sign_notes(problem: Problem, estimates: Mapping[str, Estimate]) -> list[Find
         "where that sign is known, an input or an output has the wrong one in the log, or an axis "
         "points the other way (`invert: true`)."
     )
-    return [Finding("signs.turned-from-start", "note", words, subjects=tuple(turned))]
+    return [Finding("signs.turned-from-start", "doubt", words, subjects=tuple(turned))]
 
 
 def _hold_notes(

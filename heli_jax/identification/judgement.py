@@ -1,6 +1,6 @@
 """What is concluded of an optimum: whether the model explains its records, and who moved them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -26,7 +26,13 @@ from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
+from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
+    Adequacy,
+    Evidence,
+    assess,
+    by_responses,
+)
 from heli_jax.identification.validation.advice import Record, is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
@@ -169,7 +175,7 @@ def judge(
 def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:
     """Whether the model explains its records, and whether that was asked some seconds ahead."""
     problem, against = end.problem, _against_expected(end)
-    ahead = against is not None and is_unstable(problem, params)
+    ahead = against is not None and (is_unstable(problem, params) or _bent(end, against))
     pooled = pooled_metrics(end.signals)
     adequacy = (
         by_responses(responses)
@@ -179,6 +185,14 @@ def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tup
     if end.at.layout.estimator.noise_spectrum:
         adequacy = unless_unrelated(problem, adequacy)
     return adequacy, ahead
+
+
+def _bent(end: End, against: Mapping[str, float]) -> bool:
+    """True if a simulation misses by more than a disturbance makes of a linear model, though all
+    innovations of a nonlinear one are white: gusts may have carried it where slopes along the
+    simulation say nothing, such as a pendulum over the top."""
+    white = all(w.white for w in end.white.values())
+    return not end.problem.model.linear and white and max(against.values()) > EXPECTED
 
 
 def _instruments(end: End, responses: ResponseAgreement | None) -> tuple[str, ...]:
@@ -234,8 +248,8 @@ def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:
 
 
 def _ahead(end: End, params: Any) -> Adequacy:
-    """Of an unstable model under filter error, whose simulation says nothing over a whole record:
-    by what is predicted some seconds ahead."""
+    """Adequacy by what is predicted some seconds ahead, under filter error: of a model whose
+    simulation says nothing over a whole record."""
     problem, records, error, expected = end.problem, [], {}, {}
     for label, flight, prediction in zip(
         labels(problem.training), problem.training, predictions_ahead(end.at), strict=True

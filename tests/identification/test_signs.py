@@ -103,6 +103,18 @@ def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
         assert one.upper95 - one.value == pytest.approx(one.value - one.lower95, rel=1e-6)
 
 
+def test_a_signal_that_is_turned_is_a_doubt():
+    turned = Flight(dt=DT, inputs={"d": -FLIGHT.inputs["d"]}, outputs=FLIGHT.outputs)
+    free = {"Ld": Free(10.0), "Nd": Free(-2.0)}
+    right, wrong = fit(problem(free)), fit(problem(free, record=turned))
+    doubts = [
+        [f for f in one.findings if f.code == "signs.turned-from-start"] for one in (right, wrong)
+    ]
+    assert doubts[0] == []
+    assert [(f.severity, f.subjects) for f in doubts[1]] == [("doubt", ("Ld", "Nd"))]
+    assert wrong.estimates["Ld"].value == pytest.approx(-right.estimates["Ld"].value, rel=1e-4)
+
+
 @pytest.mark.parametrize("wrong", [0.5, 3.0])
 @pytest.mark.slow
 def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):

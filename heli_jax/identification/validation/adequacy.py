@@ -161,9 +161,9 @@ def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> li
     if ahead is not None:
         vafs = ", ".join(f"{output.output} {vaf_text(output.vaf)}" for output in outputs)
         words = (
-            "The model is unstable over the length of the record, so that no simulation of it can "
-            f"follow the record: it is judged by predictions up to {ahead:g} s ahead from the "
-            f"filter's state (VAF: {vafs})."
+            "No simulation of the model can follow the record, since it is unstable over its "
+            "length or the disturbance moves it beyond where it is nearly linear: it is judged by "
+            f"predictions up to {ahead:g} s ahead from the filter's state (VAF: {vafs})."
         )
         return [note("adequacy.judged-ahead", words)]
     return [
