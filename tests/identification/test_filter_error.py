@@ -295,8 +295,6 @@ def test_swapped_columns_are_told(bench30):
     found = fit(Problem(model, start, [swapped], FREE, method="filter-error"))
     assert found.metrics["roll"].vaf < 0
     assert found.exit_code == 4
-    [none] = [f for f in found.findings if f.denies]
-    assert (none.code, none.subjects) == ("adequacy.output-not-explained", ("roll",))
 
 
 @pytest.mark.slow
