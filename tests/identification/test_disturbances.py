@@ -192,7 +192,7 @@ def test_two_that_cannot_be_told_apart_are_named_together():
     assert _of_columns(["a", "b", "c"], rows, np.linalg.norm(rows, axis=0)) == []
     rows[:, 1] = -2.0 * rows[:, 0]
     [note] = _of_columns(["a", "b", "c"], rows, np.linalg.norm(rows, axis=0))
-    assert note.startswith("Exchangeable without a trace in these data: a and b.")
+    assert (note.code, note.subjects) == ("identifiability.disturbances-exchangeable", ("a", "b"))
 
 
 @pytest.mark.parametrize(
