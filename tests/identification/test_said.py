@@ -98,7 +98,7 @@ def test_an_effect_that_ends_with_the_other_sign_is_told():
     found = fit(problem(turned, **free))
     assert found.estimates["B"].value == pytest.approx(-3.0, rel=0.1)
     [one] = of(found, "signs.turned-from-start")
-    assert (one.severity, one.subjects) == ("note", ("B",))
+    assert (one.severity, one.subjects) == ("doubt", ("B",))
     assert not of(fit(problem(flight, **free)), one.code)
     # Next to zero a start says nothing of a sign.
     free["B"] = Free(0.1, sign="any")
