@@ -57,14 +57,12 @@ def command(*arguments: str | Path) -> Ended:
 
 def fit_of(problem: Any) -> tuple[Any, Result]:
     """A Problem's fit, and what is kept of it."""
-    from heli_jax import cli, fit
+    from heli_jax import fit
     from heli_jax.report import files
 
     found = fit(problem)
-    flights = [f.name for f in problem.flights]
-    signals = [n for f in problem.flights for n in (*f.inputs, *f.outputs)]
     content = files.fit_json(found, problem, None)
-    return found, of_fit(content, cli._fit_code(found), [*filter(None, flights), *signals])
+    return found, of_fit(content, found.exit_code)
 
 
 def names_of(config: Path) -> set[str]:
@@ -85,7 +83,7 @@ def fit_config(config: Path, *more: str) -> Result:
     ended, names = command("fit", config, "--out", "fit", *more), names_of(config)
     if not Path("fit/fit.json").exists():
         return refused(ended, names)
-    result = of_fit(json.loads(Path("fit/fit.json").read_text()), ended.code, names)
+    result = of_fit(json.loads(Path("fit/fit.json").read_text()), ended.code)
     said = {f"log {code_of(n, names)}" for n in ended.notes}
     result["codes"]["note"] = sorted({*result["codes"].get("note", ()), *said})
     return result
@@ -105,7 +103,7 @@ def check_config(config: Path, *more: str) -> Result:
     findings = [f for f in content["record"] if f["severity"] != "ok"]
     by = {s: [code_of(f, names) for f in findings if f["severity"] == s] for s in SEVERITIES}
     exits = [] if content["identifiable"] else ["exit not-identifiable"]
-    notes = [code_of(n, names) for n in content["notes"]]
+    notes = [f["code"] for f in content["notes"]]
     notes += [f"log {code_of(n, names)}" for n in content["log_notes"]]
     return {
         "exit": ended.code,

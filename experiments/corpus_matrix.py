@@ -45,9 +45,6 @@ ABLATIONS: tuple[Ablation, ...] = (
     Ablation("odd_flights", f"{_VALIDATION}.odd_flights:odd_flights", lambda flights: []),
     Ablation("noisy_inputs", f"{_VALIDATION}.noisy_inputs:noisy_inputs", lambda *_: ()),
     Ablation(
-        "wandering_angles", f"{_VALIDATION}.wandering_angles:wandering_notes", lambda problem: []
-    ),
-    Ablation(
         "noisy_scales", f"{_IDENTIFICATION}.estimation.noisy_scales:free_scales", lambda *_: ()
     ),
     Ablation(
@@ -79,11 +76,6 @@ ABLATIONS: tuple[Ablation, ...] = (
         "better_of_same_responses",
         f"{_IDENTIFICATION}.estimation.same_responses:better_of_same_responses",
         lambda search, optimum: optimum,
-    ),
-    Ablation(
-        "second_method",
-        f"{_IDENTIFICATION}.second_method:with_second_method",
-        lambda problem, first, **_: first,
     ),
     Ablation("twins", f"{_IDENTIFICATION}.identifiability.twins:twins_of", lambda *_, **__: ()),
     Ablation(

@@ -164,10 +164,11 @@ def steps(n: int, seed: int, dt: float = DT) -> np.ndarray:
 def two_axes(turned: float) -> Columns:
     """Roll and pitch, the gyro turned by so many degrees about the vertical."""
     rng, n = np.random.default_rng(5), 2000
-    sticks = {"da": 0.05 * steps(n, 6), "de": 0.05 * steps(n, 7)}
+    # Each step is taken back after half a second, so that the machine stays about level.
+    random = {"da": 0.05 * steps(n, 6), "de": 0.05 * steps(n, 7)}
+    sticks = {name: u - np.r_[np.zeros(25), u[:-25]] for name, u in random.items()}
     p, phi = simulated([[-4.0, 0.0], [1.0, 0.0]], [25.0, 0.0], sticks["da"]).T
     q, theta = simulated([[-3.0, 0.0], [1.0, 0.0]], [20.0, 0.0], sticks["de"]).T
-    # About level: steps about zero let the angles wander.
     c, s = np.cos(np.radians(turned)), np.sin(np.radians(turned))
     seen = {"p": c * p + s * q, "q": c * q - s * p, "phi": phi, "theta": theta}
     noisy_ones = {name: noisy(y, 0.03, rng) for name, y in seen.items()}

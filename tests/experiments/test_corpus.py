@@ -61,8 +61,8 @@ def test_a_key_of_a_sentence_has_no_numbers_and_no_names(corpus):
 
 def test_a_candidate_is_replaced_everywhere(corpus):
     matrix = importlib.import_module("corpus_matrix")
-    original = workflow.with_second_method
+    original = workflow.with_likelier_hold
     for one in matrix.ABLATIONS:
         with matrix.replaced(one.entry, lambda _: None):
-            assert (workflow.with_second_method is None) == (one.name == "second_method")
-    assert workflow.with_second_method is original
+            assert (workflow.with_likelier_hold is None) == (one.name == "likelier_hold")
+    assert workflow.with_likelier_hold is original
