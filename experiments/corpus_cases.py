@@ -350,7 +350,8 @@ def _written(path: Path, x: Mapping[str, np.ndarray]) -> None:
                 for n, v in x.items():
                     file[n] = v
         case ".npz":
-            np.savez(path, **x)
+            columns: Any = x
+            np.savez(path, **columns)
         case ".ulg":
             fields = [("uint64_t", "timestamp"), *(("float", n) for n in names)]
             path.write_bytes(writers.ulog([("rig", 0, fields, stamped)]))

@@ -218,12 +218,13 @@ def heave(gust: float, amplitude: float) -> Columns:
 def by_rotor_speed(felt: bool) -> Columns:
     """Heave by the rotor's speed, whose noise the machine felt (a command) or not (a sensor's)."""
     rng, n = np.random.default_rng(4), 3000
-    slow = np.asarray(scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(n)) * 8.0)
+    slow = 8.0 * np.asarray(scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(n)))
     noise, Zw, Zo = 0.2 * rng.standard_normal(n), -0.7, -0.22
-    om = slow + (noise if felt else 0.0)
+    om: np.ndarray = slow + (noise if felt else 0.0)
     system: Any = tuple(np.array([[v]]) for v in (Zw, Zo, 1.0, 0.0))
-    A, B, C, D, _ = scipy.signal.cont2discrete(system, DT, method="foh")
-    x = scipy.signal.dlsim((A, B, C, D, DT), om)[1][:, 0]
+    sampled: Any = scipy.signal.cont2discrete(system, DT, method="foh")
+    A, B, C, D, _ = sampled
+    x = np.asarray(scipy.signal.dlsim((A, B, C, D, DT), om)[1])[:, 0]
     w, az = x + 0.01 * rng.standard_normal(n), Zw * x + Zo * om + 0.05 * rng.standard_normal(n)
     return {"t": DT * np.arange(n), "om": om if felt else om + noise, "w": w, "az": az}
 

@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
             # once more at the end, and complain.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_output()
             return DONE
         except Exception as e:
             # Whatever it says: an interrupt of which a library has made an error of its own.
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(e, OSError):
                 # What was to be printed is still there, and would be tried again at the end.
                 with contextlib.suppress(OSError, AttributeError, ValueError):
-                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                    _discard_output()
                 e = InputError(f"{e.filename or 'standard output'}: {e.strerror or e}")
             terminal.say(" ".join(str(e).split()))
             return WRONG_INPUT
@@ -279,6 +279,12 @@ def _fit(options: argparse.Namespace) -> int:
     if failure is not None:
         raise failure
     return run.fit.exit_code
+
+
+def _discard_output() -> None:
+    """Send what is still to be printed nowhere."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _status_code(status: str) -> int:

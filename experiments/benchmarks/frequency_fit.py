@@ -64,7 +64,7 @@ def search(problem: Problem) -> None:
     """Estimates with covariance, as `fit` finds them from one start, and nothing else."""
     guess = first_guess(problem)
     over = Search(problem, guess.layout, guess.data, 200)
-    first = first_optima(over, guess, guess.z[None])
+    first = first_optima(over, guess, lambda *_: guess.z[None])
     found = relax_noise_covariance(over, first.noise, first.optima[0])
     assert bool(found.best.converged)
     deviations(evaluate(guess.layout, guess.data, found.noise, found.best.z).J)

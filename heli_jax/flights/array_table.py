@@ -328,12 +328,12 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
     watch.start()
     try:
         with process:
-            assert process.stdout is not None
-            head = json.loads(process.stdout.readline() or "{}")
+            answer: Any = process.stdout
+            head = json.loads(answer.readline() or "{}")
             arrays = {}
             for name, dtype, size in head.get("arrays", ()):
                 arrays[name] = np.empty(size, dtype)
-                process.stdout.readinto(arrays[name].view(np.uint8))
+                answer.readinto(arrays[name].view(np.uint8))
     finally:
         watch.cancel()
     if "error" in head:

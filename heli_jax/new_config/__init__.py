@@ -178,7 +178,7 @@ def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[s
     on_grid = [
         {n: np.interp(times, s.times, s.values) for n, s in of.items()} for of in (inputs, outputs)
     ]
-    followed = {f.input for f in feedback(Flight(dt, *on_grid)) if f.present}
+    followed = {f.input for f in feedback(Flight(dt, on_grid[0], on_grid[1])) if f.present}
     for output, y in on_grid[1].items():
         led = led_by(y, on_grid[0], dt)
         if led is not None:

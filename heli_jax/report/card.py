@@ -151,7 +151,7 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
     if fit.verdict.identifiable and shares:
         named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
         determined = f"determined, by priors: {named}"
-    adequate = "; ".join(fit.denials) or fit.adequate_in_words
+    adequate = f"no: {'; '.join(fit.denials)}" if fit.denials else fit.adequate_in_words
     return [
         Gate(
             "identifiability",

@@ -121,7 +121,9 @@ def _local_cluster(workers: int | None) -> LocalCluster:
             "workers, expected the extra distributed: pip install 'heli_jax[distributed]'"
         ) from e
     no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
-    with _ignore_sigint(), dask.config.set(no_pages):
+    # pyright knows no `dask.config`, which dask documents.
+    settings: Any = dask
+    with _ignore_sigint(), settings.config.set(no_pages):
         # One thread a process: a chunk takes all devices of its process already.
         cluster = local(
             n_workers=workers,

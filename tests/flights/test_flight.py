@@ -55,8 +55,8 @@ def test_inputs_stay_between_samples_unless_told():
     assert flight.hold == {"a": "zero-order", "b": "zero-order"}
     with pytest.raises(ValueError, match="hold is stated for 'c'"):
         Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"c": "linear"})
-    with pytest.raises(ValueError, match="expected one of zero-order, linear, got 'auto'"):
+    with pytest.raises(ValueError, match="got 'auto'"):
         Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"a": "auto"})
     bare: Any = "linear"
-    with pytest.raises(TypeError, match="hold: expected zero-order or linear by input"):
+    with pytest.raises(TypeError, match="hold: expected"):
         Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold=bare)
