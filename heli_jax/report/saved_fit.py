@@ -44,6 +44,10 @@ class SavedFit(NamedTuple):
     validation: dict[str, Metrics]
     """of the simulation, over the flights held out, by output"""
     signals: tuple[Signals, ...]
+    notes: tuple[str, ...]
+    """the sentences of the findings"""
+    untrusted: tuple[str, ...]
+    """the parameters whose intervals may not be used"""
     content: dict[str, Any]
     """all of fit.json"""
 
@@ -51,11 +55,6 @@ class SavedFit(NamedTuple):
     def adequacy(self) -> str:
         """`yes`, `no (...)` or `not judged`, as the fit had it."""
         return adequacy_of(self.content)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The sentences of the findings."""
-        return tuple(f["sentence"] for f in self.content.get("findings", ()))
 
     @property
     def distrust(self) -> str:
@@ -123,6 +122,8 @@ def load_fit(directory: str | Path) -> SavedFit:
             metrics={n: _metrics(m) for n, m in content["metrics"].items()},
             validation={n: _metrics(m) for n, m in content["validation"].items()},
             signals=_signals(directory / "signals.csv", content),
+            notes=tuple(str(f["sentence"]) for f in content.get("findings", ())),
+            untrusted=tuple(dict(content.get("untrusted", {}))),
             content=content,
         )
     except InputError:

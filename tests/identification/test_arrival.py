@@ -68,6 +68,6 @@ def test_a_search_along_what_the_data_leave_open_is_told_what_to_fix():
     found = fit(problem)
     open_before, told = found.verdict_before, found.verdict
     [note] = open_directions(open_before, open_before)
-    assert "Lp and Lda" in note
+    assert note.subjects == ("Lp", "Lda")
     assert open_directions(open_before, told) == []
     assert open_directions(told, open_before) == []

@@ -216,7 +216,7 @@ def test_wrong_runs_end_in_a_sentence(
         {"data": [{"flight": "flight 1", "sha256": "a", "window": 3}, 7]},
         {"data": 7},
         {"verdict": "all"},
-        {"notes": None},
+        {"findings": [3]},
         {"untrusted": 5},
         {"determined_combinations": [3]},
         {"residuals": [1]},
