@@ -103,7 +103,6 @@ def test_the_keys_of_fit_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["keys", "--fit", "NAME.prior_share"]) == 0
     shown = capsys.readouterr().out
     assert "parameters.NAME.prior_share: number" in shown
-    assert "share of the prior in the posterior precision" in shown
     assert cli.main(["keys", "--fit", "no such key"]) == 2
     assert "no such key" in capsys.readouterr().err
     assert cli.main(["keys", "--fit", "--json", "status"]) == 0

@@ -46,7 +46,7 @@ def test_hover_is_that_of_the_second_program(variant, hovers, xcell):
 
 def test_hover_has_the_numbers_of_the_reading(hovers, xcell):
     s, u = hovers["consistent"].state, hovers["consistent"].inputs
-    how = whole.Corrections(*[True] * len(whole.Corrections._fields))
+    how = models.helicopter("consistent").vector_field.args[0]
     air = whole.flow(how, xcell, s, u, whole.motion(how, s, u))
     force = whole.main_rotor(xcell, s, u, air)
     theta0 = xcell.K_theta0 * u.x_throttle

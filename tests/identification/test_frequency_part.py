@@ -60,9 +60,9 @@ def test_a_search_that_begins_with_a_quarter_ends_where_it_does_with_all(bench, 
     whole = fit(bench)
     guess = first_guess(bench)
     search = Search(bench, guess.layout, guess.data, 200)
-    assert float(first_optima(search, guess, guess.z[None]).noise.part) == 1.0
+    assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 1.0
     monkeypatch.setattr(frequency_error, "_MANY", 0)
-    assert float(first_optima(search, guess, guess.z[None]).noise.part) == 0.25
+    assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 0.25
     quick = fit(bench)
     assert quick.status == whole.status == "converged"
     assert float(quick.reached.noise.part) == 1.0
@@ -83,7 +83,7 @@ def test_where_a_quarter_tells_less_all_lines_are_used(bench, monkeypatch):
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     monkeypatch.setattr(frequency_error, "_NEARLY_ALL", share + 1e-6)
     search = Search(bench, guess.layout, guess.data, 200)
-    assert first_optima(search, guess, guess.z[None]).noise is guess.noise
+    assert first_optima(search, guess, lambda *_: guess.z[None]).noise is guess.noise
 
 
 def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):

@@ -60,7 +60,7 @@ def test_where_little_is_explained_the_search_begins_again_elsewhere(problem: Pr
 def test_a_search_that_left_stability_begins_again():
     # From a stable start frequency error ended with Zw = +0.25, whose mirror image has the same
     # gain: 8.7 in log-likelihood below the stable optimum.
-    _, plain = heave_problem(heave(0, 1.0, False, 0.04))
+    plain = heave_problem(heave(0, 1.0, False, 0.04))
     found = fit(plain)
     near = fit(dataclasses.replace(plain, free={"Zw": Free(-0.6), "Zcol": Free(-14.0)}))
     assert found.estimates["Zw"].value == pytest.approx(near.estimates["Zw"].value, rel=1e-3)

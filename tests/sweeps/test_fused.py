@@ -43,7 +43,6 @@ def agree(rtol, model, vehicle, flight, design, reduce, **options):
     [
         ("exact", "linear"),
         ("rk4", "zero-order"),
-        ("exact", "mixed"),
         pytest.param("exact", "zero-order", marks=pytest.mark.slow),
         pytest.param("rk4", "linear", marks=pytest.mark.slow),
     ],

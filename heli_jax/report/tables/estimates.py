@@ -13,7 +13,7 @@ from heli_jax.report.tables.table import NOT_DETERMINED, Table
 from heli_jax.report.unit_symbols import pretty
 
 _SHARE = 0.005
-"""of the posterior precision: less is 0 % in the table, or 0.00"""
+"""of the posterior variance: less is 0 % in the table, or 0.00"""
 
 
 def parameters(fit: Fit) -> Table:
