@@ -6,11 +6,12 @@ follow by Gauss and Newton, and only what has stayed is determined.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
@@ -120,23 +121,30 @@ class Valley(NamedTuple):
         added = sums(null, covariance, unknowns, units)
         if not (products or added):
             return ()
-        points = self._far_points(null, unknowns)
+        points: list[dict[str, float]] = []
+        # As many unknowns span the valley as it has directions; the others are asked only where
+        # these left a combination's own parameters nearly where they were.
+        for asked, more in enumerate(self._far_points(null, unknowns), start=1):
+            points += more
+            if asked >= len(null) and all(_told(c, unknowns, points) for c in (*products, *added)):
+                break
         return tuple(c for c in products if _stays(c, unknowns, points)) or tuple(
             c for c in added if _stays(c, unknowns, points)
         )
 
     def _far_points(
         self, null: list[np.ndarray], unknowns: tuple[Unknown, ...]
-    ) -> list[dict[str, float]]:
-        """Where the valley leads to, by value of the unknowns."""
+    ) -> Iterator[list[dict[str, float]]]:
+        """Where the valley leads to, by value of the unknowns: for each that is moved, first those
+        that together span the valley."""
         N = np.array(null) * np.array([u.per_log if u.logarithmic else 0.0 for u in unknowns])
         # Onto the null directions: how the logarithms of all go with that of one.
         onto = np.linalg.pinv(N) @ N
-        points = []
-        for i, u in enumerate(unknowns):
+        for i in scipy.linalg.qr(onto, mode="r", pivoting=True)[1].tolist():
+            u = unknowns[i]
             if not onto[i, i] > 1e-2:
                 continue
-            along = onto[i] / onto[i, i]
+            points, along = [], onto[i] / onto[i, i]
             for factor in (_FACTOR, 1.0 / _FACTOR):
                 held = {u.name: u.value * factor}
                 for guess in _tangents(along, factor, i, unknowns):
@@ -144,7 +152,7 @@ class Valley(NamedTuple):
                     if point is not None and point.excess <= SAME:
                         points.append(point.values)
                         break
-        return points
+            yield points
 
     def _coordinate(self, name: str, value: float) -> float | None:
         layout, data = self.at.layout, self.at.data
@@ -196,21 +204,35 @@ def _stays(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
 ) -> bool:
     """Whether a combination is the same at all points, and its parameters are not."""
+    changes = [_change(c, unknowns, point) for point in points]
+    return any(one.moved for one in changes) and all(one.same for one in changes)
+
+
+def _told(
+    c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
+) -> bool:
+    """Whether the points tell if a combination stays: it changed, or its parameters moved."""
+    return any(one.moved or not one.same for one in (_change(c, unknowns, p) for p in points))
+
+
+class _Change(NamedTuple):
+    """What became of a combination at a point."""
+
+    same: bool
+    moved: bool
+    """whether its own parameters moved far enough for that to tell"""
+
+
+def _change(c: Combination, unknowns: tuple[Unknown, ...], point: Mapping[str, float]) -> _Change:
     values = {u.name: u.value for u in unknowns}
-    has_moved = False
-    for point in points:
-        if c.kind == "sum":
-            parts = [w * (point[n] - values[n]) for n, w in c.exponents.items()]
-            size = max(abs(values[n]) for n in c.exponents)
-            sd = c.sd
-        else:
-            ratios = {n: point[n] / values[n] for n in c.exponents}
-            if any(ratio <= 0 for ratio in ratios.values()):
-                return False
-            parts = [w * math.log(ratios[n]) for n, w in c.exponents.items()]
-            size, sd = 1.0, c.sd / c.value if c.value else 0.0
-        moved = sum(abs(part) for part in parts)
-        has_moved = has_moved or moved > _MOVED * size
-        if abs(sum(parts)) > max(2.0 * sd, _STAYS * moved):
-            return False
-    return has_moved
+    if c.kind == "sum":
+        parts = [w * (point[n] - values[n]) for n, w in c.exponents.items()]
+        size, sd = max(abs(values[n]) for n in c.exponents), c.sd
+    else:
+        ratios = {n: point[n] / values[n] for n in c.exponents}
+        if any(ratio <= 0 for ratio in ratios.values()):
+            return _Change(same=False, moved=True)
+        parts = [w * math.log(ratios[n]) for n, w in c.exponents.items()]
+        size, sd = 1.0, c.sd / c.value if c.value else 0.0
+    moved = sum(abs(part) for part in parts)
+    return _Change(abs(sum(parts)) <= max(2.0 * sd, _STAYS * moved), moved > _MOVED * size)

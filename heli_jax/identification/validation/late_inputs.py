@@ -8,6 +8,7 @@ the output (C. A. Sims, Money, income, and causality, Am. Econ. Rev. 62, 1972).
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
@@ -128,8 +129,9 @@ def _basis(X: np.ndarray, size: float | None = None) -> np.ndarray:
     """Orthonormal columns (N, rank) that span those of X (N, m); of the columns' own size, or of
     `size`, what is rounding is left out."""
     norms = np.linalg.norm(X, axis=0) if size is None else np.full(X.shape[1], size)
-    U, values, _ = np.linalg.svd(X / np.maximum(norms, 1e-300), full_matrices=False)
-    return U[:, values > (1e-8 * values[0] if size is None else 1e-6)]
+    Q, R, _ = scipy.linalg.qr(X / np.maximum(norms, 1e-300), mode="economic", pivoting=True)
+    values = np.abs(np.diag(R))
+    return Q[:, values > (1e-8 * values[0] if size is None else 1e-6)]
 
 
 def _finding(label: str, name: str, share: float, lead: float, output: str) -> Finding:

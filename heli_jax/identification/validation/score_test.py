@@ -167,8 +167,9 @@ def strongest(
     freedom = 2 * e.size - known.shape[1]
     filters = _filters(records, bank, plain)
     back = np.exp(-1j * angles)
-    asked = _Asked(
-        np.stack([_filter(*one, back) for one in filters]),
+    responses = _responses(filters, back)
+    asked = _asked(
+        responses,
         _complex(known),
         np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
         [_pair(X[:, i], back) for i in drives],
@@ -195,7 +196,7 @@ def strongest(
     if _by_chance(gain, others) < _CLEARLY:
         others = np.concatenate([others, of_chance(turns[:, _FIRST:])])
     chance = _by_chance(gain, others)
-    G = asked.filters[k // len(drives), :, None]
+    G = responses[k // len(drives), :, None]
     columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
     return Strongest(gain, chance, drive, *one, *_steps(_real(J), columns, _real(e[:, None])))
 
@@ -218,12 +219,18 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
     if not shows.any():
         return 1.0
     basis, white = _span(own[:, shows]), _without(nuisances, _real(e[:, None]))
-    turns = 2.0 * np.pi * np.random.default_rng(0).random((e.size, _SURROGATES))
-    anew = _without(nuisances, _real(_complex(white) * np.exp(1j * turns)))
-    anew *= np.linalg.norm(white) / np.linalg.norm(anew, axis=0)
-    gain, by_chance = (float(np.mean(np.sum((basis.T @ v) ** 2, axis=0))) for v in (white, anew))
-    if not by_chance > 0:
+    power, whole = np.abs(_complex(white)[:, 0]) ** 2, float(np.sum(white**2))
+
+    def by_phases(columns: np.ndarray) -> float:
+        """The mean over phases drawn anew of the residual's squares in the columns' span."""
+        return 0.5 * float(power @ np.sum(np.abs(_complex(columns)) ** 2, axis=1))
+
+    left = whole - by_phases(nuisances)
+    gain, by_chance = float(np.sum((basis.T @ white) ** 2)), by_phases(basis)
+    if not (by_chance > 0 and left > 0):
         return 1.0
+    # With other phases a part of the residual is the nuisances', which a fit takes up.
+    by_chance *= whole / left
     rank = basis.shape[1]
     return float(scipy.special.chdtrc(rank, rank * gain / by_chance))
 
@@ -240,46 +247,74 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
 
 
 class _Asked(NamedTuple):
-    """What is asked of a residual; columns stand before the filter."""
+    """What is asked of a residual, by filter; columns stand before it."""
 
-    filters: Complex[np.ndarray, "F K"]
-    known: Complex[np.ndarray, "K q"]
-    """an orthonormal basis of the sensitivities; residuals have nothing of it"""
+    filters: Float[np.ndarray, "F K2"]
+    """real and imaginary parts side by side"""
     beside: Complex[np.ndarray, "K b"]
+    over: Float[np.ndarray, "F b b"]
+    """the inverse of their products, without what is known"""
     drives: list[Complex[np.ndarray, "K 2"]]
+    cross: list[Float[np.ndarray, "F b 2"]]
+    """products of the columns beside with each drive, without what is known"""
+    own: list[Float[np.ndarray, "F 2 2"]]
+    """the inverse of each drive's products, without what is known and the columns beside"""
 
 
-def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray, "F d r"]:
-    """What the squares of each residual lose to each drive through each filter.
+def _asked(
+    filters: Complex[np.ndarray, "F K"],
+    known: Complex[np.ndarray, "K q"],
+    beside: Complex[np.ndarray, "K b"],
+    drives: list[Complex[np.ndarray, "K 2"]],
+) -> _Asked:
+    """What does not depend on the residual.
 
     By products of columns, since the filters all act on the same ones: a basis for each filter and
     drive would take ten times as long.
+
+    Args:
+        filters: by line.
+        known: an orthonormal basis of the sensitivities; residuals have nothing of it.
+        beside: columns whose answer through the same filter is taken off first.
+        drives: each with itself one sample later.
     """
-    # In real numbers, of whose products only these are asked.
-    G = np.concatenate([np.real(asked.filters), np.imag(asked.filters)], axis=1)
-    of_tried = G.astype(np.real(tried).dtype)
-    power = np.real(asked.filters) ** 2 + np.imag(asked.filters) ** 2
+    G = np.concatenate([np.real(filters), np.imag(filters)], axis=1)
+    power = G[:, : len(known)] ** 2 + G[:, len(known) :] ** 2
 
-    def products(a: np.ndarray, b: np.ndarray, *, both: bool = False) -> np.ndarray:
-        """(F, a, b), of filtered columns a with columns b, these filtered too or not."""
-        a, filters = (a.astype(tried.dtype), of_tried) if b is tried else (a, G)
-        each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-        gains = power @ np.real(each) if both else filters @ _real(each)
-        return gains.reshape(len(G), a.shape[1], b.shape[1])
+    def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Products (F, a, b) of two columns that are filtered both."""
+        each = np.real(np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
+        return (power @ each).reshape(len(power), a.shape[1], b.shape[1])
 
-    n = asked.beside
-    known, right = products(n, asked.known), products(n, tried)
-    whole = products(n, n, both=True)
-    over = _inverse(whole - known @ _turned(known), whole)
-    out = np.zeros((len(G), len(asked.drives), tried.shape[1]))
-    for i, d in enumerate(asked.drives):
-        own = products(d, asked.known)
-        cross = products(n, d, both=True) - known @ _turned(own)
-        whole = products(d, d, both=True)
-        left = whole - own @ _turned(own) - _turned(cross) @ over @ cross
-        b = products(d, tried) - _turned(cross) @ over @ right
-        out[:, i] = np.sum(b * (_inverse(left, whole) @ b), axis=1)
-    return out
+    of_beside, whole = _products(G, beside, known), both(beside, beside)
+    over = _inverse(whole - of_beside @ _turned(of_beside), whole)
+    cross, own, b = [], [], beside.shape[1]
+    for d in drives:
+        of_drive, products = _products(G, d, known), both(np.concatenate([beside, d], axis=1), d)
+        cross.append(products[:, :b] - of_beside @ _turned(of_drive))
+        whole = products[:, b:]
+        left = whole - of_drive @ _turned(of_drive) - _turned(cross[-1]) @ over @ cross[-1]
+        own.append(_inverse(left, whole))
+    return _Asked(G, beside, over, drives, cross, own)
+
+
+def _products(
+    G: Float[np.ndarray, "F K2"], a: Complex[np.ndarray, "K a"], b: Complex[np.ndarray, "K b"]
+) -> Float[np.ndarray, "F a b"]:
+    """Real parts of the products of filtered columns a with columns b, in the precision of b."""
+    a, G = a.astype(b.dtype, copy=False), G.astype(np.real(b).dtype, copy=False)
+    each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
+    return (G @ _real(each)).reshape(len(G), a.shape[1], b.shape[1])
+
+
+def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray, "F d r"]:
+    """What the squares of each residual lose to each drive through each filter."""
+    right = asked.over @ _products(asked.filters, asked.beside, tried)
+    out = []
+    for d, cross, own in zip(asked.drives, asked.cross, asked.own, strict=True):
+        b = _products(asked.filters, d, tried) - _turned(cross) @ right
+        out.append(np.sum(b * (own @ b), axis=1))
+    return np.stack(out, axis=1)
 
 
 def _turned(M: np.ndarray) -> np.ndarray:
@@ -326,12 +361,17 @@ def _filters(
     return tried
 
 
-def _filter(damping: float, frequency: float, back: np.ndarray) -> Complex[np.ndarray, " K"]:
-    if not np.isfinite(damping):
-        return np.ones(back.size, complex)
-    turn = frequency * np.sqrt(max(1.0 - damping**2, 0.0))
-    pole = np.exp(-damping * frequency + 1j * turn)
-    return 1.0 / ((1.0 - pole * back) * (1.0 - np.conj(pole) * back))
+def _responses(
+    filters: Sequence[tuple[float, float]], back: np.ndarray
+) -> Complex[np.ndarray, "F K"]:
+    """Of the filters at the lines, whose delays by a sample are `back`."""
+    w, damping = (np.array([one[i] for one in filters]) for i in (1, 0))
+    plain = ~np.isfinite(damping)
+    damping = np.where(plain, 1.0, damping)
+    size = np.where(plain, 0.0, np.exp(-damping * w))
+    twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+    powers = np.stack([np.ones_like(back), back, back**2])
+    return 1.0 / (np.stack([np.ones(len(w)), -twice, size**2], axis=1) @ powers)
 
 
 def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray, "K 2"]]:
