@@ -235,4 +235,3 @@ def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
     found = fit(Problem(both, TRUTH, [record], free, Nuisance(bias=False)), starts=1)
     [still] = [f for f in found.findings if f.code == "quality.never-moves"]
     assert still.subjects == ("s",)
-    assert found.adequate
