@@ -18,11 +18,13 @@ class InputError(ValueError):
     """A file or a configuration is wrong.
 
     Its text is one whole sentence that names the file, the place, what was expected and what was
-    got. The command line prints it and ends with exit code 2.
+    got. The command line prints it and ends with exit code 2. `within` is the same without the
+    file, for who has named it already.
     """
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, within: str = "") -> None:
         super().__init__(shortened(text))
+        self.within = shortened(within or text)
 
 
 class VehicleError(ValueError):

@@ -55,9 +55,9 @@ def responses_of_log(
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
     asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
-    for note in (n for f in flights for n in (f.source.notes if f.source else ())):
+    for found in (n for f in flights for n in (f.source.notes if f.source else ())):
         if progress is not None:
-            progress(Note(note))
+            progress(Note(found.sentence))
     _require_samples(flights, experiment.path)
     try:
         estimate = flight_responses(flights, settings)
@@ -111,7 +111,7 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
             # The other way round nobody is misled: a stick that jumps is held. A low-passed one can
             # be no other than linear.
-            if is_low_passed(reason):
+            if is_low_passed(flights[0], name):
                 continue
             guessed[name] = reason
     notes = [

@@ -14,6 +14,7 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
+from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import terse
 from heli_jax.terminal_table import print_table, tell
@@ -63,7 +64,15 @@ def write_view(
     beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
     made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes, made)
+        write(
+            temporary,
+            simulated.runs,
+            simulated.model,
+            params,
+            title,
+            sentences(simulated.notes),
+            made,
+        )
 
 
 @contextlib.contextmanager

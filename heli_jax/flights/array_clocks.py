@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
@@ -49,10 +50,10 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
     cautions = [
-        words
+        caution
         for t in topics
         for rate in [1.0 / float(np.median(np.diff(t.times)))]
-        for words in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
+        for caution in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
     ]
     return ChannelLog(
         table.path,
@@ -86,7 +87,7 @@ def _stated(
     return stated
 
 
-def clock_notes(table: Table) -> tuple[str, ...]:
+def clock_notes(table: Table) -> tuple[Finding, ...]:
     """That arrays have clocks of their own, where they have.
 
     Args:
@@ -96,7 +97,8 @@ def clock_notes(table: Table) -> tuple[str, ...]:
     if log is None:
         return ()
     listed = ", ".join(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics[:_MOST_NAMED])
-    return (f"arrays have clocks of their own, read where no time is stated: {listed}",)
+    words = f"arrays have clocks of their own, read where no time is stated: {listed}"
+    return (note("clock.of-arrays", words, value=len(log.topics)),)
 
 
 def _clock(name: str, values: np.ndarray) -> _Clock | None:
@@ -153,10 +155,10 @@ def _topic(
     return Topic(clock, times, {n: arrays[n] for n in names}, units, clock)
 
 
-def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[Finding, ...]:
     if not names:
         return ()
     listed = ", ".join(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names[:_MOST_NAMED])
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
     words = "no time of their length, or several, stand in their groups"
-    return (f"left out, since {words}: {listed}{more}",)
+    return (note(LEFT_OUT, f"left out, since {words}: {listed}{more}", *names),)

@@ -19,6 +19,7 @@ import numpy as np
 
 from heli_jax import import_path
 from heli_jax.errors import InputError
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import mat_file, packed, stacked
 from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.mat_references import References
@@ -56,7 +57,7 @@ class ArrayTable:
         data: bytes,
         arrays: Mapping[str, np.ndarray],
         units: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        notes: tuple[Finding, ...] = (),
     ) -> None:
         self.path, self.format, self.size, self.notes = path, kind, len(data), notes
         self.sha256 = hashlib.sha256(data).hexdigest()
@@ -136,7 +137,7 @@ def open_mat(path: Path) -> ArrayTable:
     if read.objects:
         _require_arrays(path, whole, read.objects)
         listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
-        notes = (*notes, f"objects of MATLAB are left out: {listed}")
+        notes = (*notes, note(LEFT_OUT, f"objects of MATLAB are left out: {listed}", *read.objects))
     real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
     named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
@@ -146,9 +147,10 @@ def open_mat(path: Path) -> ArrayTable:
             arrays[called] = vector
             of_parts[called] = named.unit(name, i) or units.get(name, "")
     notes = (*notes, *of_stacks, *named.notes)
-    complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
-    words = f"complex numbers, of which the real part is read: {complex_ones}"
-    notes = (*notes, words) if complex_ones else notes
+    if complex_ones := [n for n, array in whole.items() if array.dtype.kind == "c"]:
+        listed = ", ".join(map(shown, complex_ones))
+        words = f"complex numbers, of which the real part is read: {listed}"
+        notes = (*notes, note("channels.complex", words, *complex_ones))
     return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
 
 
@@ -230,7 +232,7 @@ class DataSets:
         self._scaled: dict[str, None] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
-        self._notes: list[str] = []
+        self._notes: list[Finding] = []
         self.references = References()
 
     @property
@@ -238,9 +240,9 @@ class DataSets:
         """Of the data sets."""
         return tuple(self._stored)
 
-    def note(self, words: str) -> None:
+    def note(self, finding: Finding) -> None:
         """What else is to be said of the file."""
-        self._notes.append(words)
+        self._notes.append(finding)
 
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
@@ -272,7 +274,7 @@ class DataSets:
         """All of them."""
         return ArrayTable(path, kind, data, *self.vectors())
 
-    def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[str, ...]]:
+    def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
         notes = packed.notes_of(self._scaled, self._missing, self._left_out)
         paths = {name: self.references.path(name) for name in self._stored}
@@ -342,7 +344,10 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
         ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
         raise wrong(str(path), slow if ended else "is no whole HDF5 file (its reader crashed)")
-    return ArrayTable(str(path), kind, data, arrays, head["units"], tuple(head["notes"]))
+    notes = tuple(
+        note(code, words, *names, value=value) for code, words, names, value in head["notes"]
+    )
+    return ArrayTable(str(path), kind, data, arrays, head["units"], notes)
 
 
 def holds_numbers(kind: np.dtype, dimensions: int) -> bool:

@@ -2,14 +2,15 @@
 
 import codecs
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.table import wrong
 
 _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
 
 
-def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """The bytes of a file in UTF-8, and a note where they were in another encoding.
+def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[Finding, ...]]:
+    """The bytes of a file in UTF-8, and a note where their encoding was guessed.
 
     Spreadsheets save "Unicode text" as UTF-16 with a mark, and older programs write one byte a
     letter, of which the degree sign in a header is the commonest.
@@ -19,7 +20,7 @@ def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
-            return data.decode("utf-16").encode(), ("text in UTF-16 was read as such",)
+            return data.decode("utf-16").encode(), ()
         except UnicodeDecodeError as e:
             problem = f"begins as text in UTF-16, and is none ({e.reason})"
             raise wrong(path, f"{problem}, expected whole text") from e
@@ -33,7 +34,8 @@ def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     # `check_text` says where.
     except UnicodeDecodeError:
         return data, ()
-    return text, ("is no text in UTF-8, and was read as Latin-1 (Windows-1252)",)
+    words = "is no text in UTF-8, and was read as Latin-1 (Windows-1252)"
+    return text, (note("text.encoding-guessed", words),)
 
 
 def _is_utf8(data: bytes) -> bool:

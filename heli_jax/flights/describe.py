@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.array_clocks import clock_notes
 from heli_jax.flights.clock_guess import arrival_notes, counter_notes
 from heli_jax.flights.flight import Signal
@@ -140,7 +141,7 @@ class LogInfo:
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     filters: Mapping[str, str | int | float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     vibration: RotorLines | None = None
 
 
@@ -285,16 +286,21 @@ def describe_table(
     )
 
 
-def _other_lengths(surveys: list[Survey]) -> tuple[str, ...]:
-    """A sentence for each number of samples that is not the log's: arrays may have their own."""
+def _other_lengths(surveys: list[Survey]) -> tuple[Finding, ...]:
+    """A note for each number of samples that is not the log's: arrays may have their own."""
     by_size: dict[int, list[str]] = {}
     for each in surveys:
         if each.values is not None:
-            by_size.setdefault(each.values.size, []).append(shown(each.name))
+            by_size.setdefault(each.values.size, []).append(each.name)
     rows = _n_rows(surveys)
     return tuple(
-        f"{sample_count(size)}, not {rows}: {', '.join(names[:6])}"
-        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        note(
+            "channels.other-length",
+            f"{sample_count(size)}, not {rows}: {', '.join(map(shown, names[:6]))}"
+            + (f" and {len(names) - 6} more" if len(names) > 6 else ""),
+            *names,
+            value=size,
+        )
         for size, names in by_size.items()
         if size != rows
     )

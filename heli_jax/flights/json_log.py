@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.array_table import ArrayTable, DataSets
 from heli_jax.flights.csv_dates import is_date, seconds_of_dates
 from heli_jax.flights.table import Budget, shown, wrong
@@ -44,7 +45,8 @@ def open_json(path: Path) -> ArrayTable:
         _add(sets, name, values, texts)
     if texts:
         more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
-        sets.note(f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}")
+        words = f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}"
+        sets.note(note(LEFT_OUT, words, *texts))
     return sets.table(where, "json", data)
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import CALLED, Finding, note
 from heli_jax.flights.table import shown
 
 _LABELS, _UNITS = ("label", "name", "signalname"), ("unit", "units")
@@ -22,7 +23,7 @@ class Labelled(NamedTuple):
 
     arrays: dict[str, np.ndarray]
     units: dict[str, str]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 def labelled(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> Labelled:
@@ -57,7 +58,8 @@ def labelled(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> Labe
     names = {path: name for path, name in names.items() if taken.count(name) == 1}
     listed = ", ".join(f"{shown(n)} for {shown(p)}" for p, n in list(names.items())[:_MOST_NAMED])
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    notes = (f"arrays are called by the labels beside them: {listed}{more}",) if names else ()
+    words = f"arrays are called by the labels beside them: {listed}{more}"
+    notes = (note(CALLED, words, *names.values()),) if names else ()
     return Labelled(
         {names.get(path, path): values for path, values in arrays.items()},
         {names.get(path, path): unit for path, unit in units.items()},

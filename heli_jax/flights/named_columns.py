@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import CALLED, Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.table import shown
 from heli_jax.flights.time_units import time_unit
@@ -62,7 +63,7 @@ class NamedColumns:
         return units[column] if units else ""
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Finding, ...]:
         """Which matrices have columns with names."""
         if not self._names:
             return ()
@@ -72,10 +73,9 @@ class NamedColumns:
             for rest in (names[_MOST_NAMED:],)
         )
         more = len(self._names) - _MOST_NAMED
-        return (
-            f"columns are called by the names beside them: {listed}"
-            + (f" and {more} more" if more > 0 else ""),
-        )
+        words = f"columns are called by the names beside them: {listed}"
+        words += f" and {more} more" if more > 0 else ""
+        return (note(CALLED, words, *self._names),)
 
 
 def _columns(array: np.ndarray) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights import array_table
 from heli_jax.flights.array_table import ArrayTable, DataSets
 from heli_jax.flights.table import Budget, shown, wrong
@@ -49,7 +50,7 @@ def open_numpy(path: Path) -> ArrayTable:
         if not sets.names:
             problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
             raise wrong(where, problem)
-        sets.note(words)
+        sets.note(note(LEFT_OUT, words, *objects))
     return sets.table(where, "numpy", data)
 
 

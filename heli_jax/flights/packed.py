@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.flights.marks import MARKS
 from heli_jax.flights.table import shown
 
 ATTRIBUTES = (
@@ -63,8 +65,8 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> Unpacked:
 
 def notes_of(
     scaled: Mapping[str, None], missing: Mapping[str, int], left_out: Mapping[str, str]
-) -> tuple[str, ...]:
-    """What was made of a file's data sets, in sentences.
+) -> tuple[Finding, ...]:
+    """What was made of a file's data sets.
 
     Args:
         scaled: names of those whose numbers were scaled.
@@ -74,12 +76,14 @@ def notes_of(
     notes = []
     if scaled:
         words = "packed numbers are unpacked by the file's scale_factor and add_offset"
-        notes.append(f"{words}: {_listed(map(shown, scaled))}")
+        notes.append(note("channels.unpacked", f"{words}: {_listed(map(shown, scaled))}", *scaled))
     if missing:
         listed = _listed(f"{shown(name)} ({count})" for name, count in missing.items())
-        notes.append(f"the file's marks for no value are taken as missing samples: {listed}")
+        words = f"the file's marks for no value are taken as missing samples: {listed}"
+        notes.append(note(MARKS, words, *missing, value=sum(missing.values())))
     if left_out:
-        notes.append(f"left out: {_listed(f'{shown(n)}, {w}' for n, w in left_out.items())}")
+        words = f"left out: {_listed(f'{shown(n)}, {w}' for n, w in left_out.items())}"
+        notes.append(note(LEFT_OUT, words, *left_out))
     return tuple(notes)
 
 
