@@ -179,8 +179,8 @@ def print_sweep(out: Path) -> None:
             unit = totals["results"].get(name, {}).get("unit", "")
             value = f"{terse(element['value'])} {unit if unit != '1' else ''}".rstrip()
             tell(f"{words} {name}: {value}, element {element['element']}, {at}")
-    for note in totals["notes"]:
-        tell(f"! {note}")
+    for found in totals["notes"]:
+        tell(f"! {found['sentence']}")
     for name, result in totals["results"].items():
         # Quantiles are of the finite values alone: how many were not is part of the answer.
         apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}

@@ -139,7 +139,6 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         verdict=SimpleNamespace(resting=()),
         status=status,
         signals=[signals],
-        notes=("of the fit", "of a machine"),
         findings=(note("of.fit", "of the fit"), of_machine),
         adequacy=SimpleNamespace(
             findings=(of_machine,),
@@ -163,8 +162,9 @@ def test_a_fit_is_put_in_words(folder):
         "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more. Of b_r these "
         "channels do not tell."
     )
-    assert judged.doubts[0].startswith("lambda_p +23 %: more than a sensor's own error.")
-    assert judged.doubts[1:] == ("of the fit",)
+    (scale, of_fit) = judged.doubts
+    assert (scale.code, scale.value) == ("sensors.scale-too-large", 0.23)
+    assert of_fit.code == "of.fit"
     rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
     assert rows == [
         ("lambda_p", "0.2300 ± 0.0040", "yes"), ("b_p", "0.0010 ± 0.0020", "no"),

@@ -30,7 +30,7 @@ class SensorAgreement(NamedTuple):
 
     compatible: bool
     verdict: str
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     """on the errors that were found, beside the fit's own notes"""
     head: tuple[str, ...]
     errors: tuple[tuple[str, ...], ...]
@@ -122,7 +122,7 @@ def _sensors(agreement: SensorAgreement | None) -> dict[str, Any] | None:
     return {
         "compatible": agreement.compatible,
         "verdict": agreement.verdict,
-        "doubts": list(agreement.doubts),
+        "doubts": [as_data(f) for f in agreement.doubts],
         "shows": {row[0]: row[agreement.head.index("shows")] for row in agreement.errors},
     }
 

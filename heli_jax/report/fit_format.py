@@ -182,7 +182,7 @@ class Compatibility(TypedDict):
 
     compatible: bool
     verdict: str
-    doubts: list[str]
+    doubts: list[Finding]
     shows: dict[str, str]
     """by error of a sensor whether it shows"""
 

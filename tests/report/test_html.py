@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from heli_jax import numbers
+from heli_jax.finding import note
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import files, tables
 from heli_jax.report.drawings import Analysis
@@ -227,7 +228,7 @@ def test_what_sensors_say_of_each_other_comes_before_the_fit(sound, tmp_path):
     found = SensorAgreement(
         False,
         "Not compatible: no errors bring psi to 3.2e-07.",
-        ("lambda_p +23 %: much",),
+        (note("a.note", "lambda_p +23 %: much"),),
         ("error", "estimate, 95 %", "unit", "shows", "what it is"),
         (("lambda_p", "0.226 ± 0.061", "1", "yes", "scale"),),
     )
