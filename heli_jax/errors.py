@@ -42,8 +42,9 @@ class VehicleError(ValueError):
         return f"vehicle: {self.problem}"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
+def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> str:
+    """`"; did you mean 'x'?"` for the known name closest to `name`; where none is close
+    `otherwise`, or the first of what is known."""
     # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is
     # half.
     known = sorted(known)
@@ -56,6 +57,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
         close = [lower[c] for c in difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)]
     if close:
         return f"; did you mean {close[0]!r}?"
+    if otherwise is not None:
+        return otherwise
     # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""

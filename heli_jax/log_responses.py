@@ -17,7 +17,7 @@ from heli_jax.config.frequency import asked_handling, check_pairs, missing_handl
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
-from heli_jax.finding import HOLD_GUESSED, Finding, note, sentences
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
@@ -156,8 +156,7 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[Finding]:
         f"{'up to ' if several else ''}{half:.3g} ms, "
         f"shorter and bandwidths higher: state signals.inputs.{whose}.hold"
     )
-    criterion = "half of the longest step [s]"
-    return [Finding(HOLD_GUESSED, "note", words, 1e-3 * half, criterion, tuple(names))]
+    return [note("hold.guessed", words, *names, value=1e-3 * half)]
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:

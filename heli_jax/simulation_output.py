@@ -63,16 +63,9 @@ def write_view(
     # From the page's folder on, so that both can be moved together.
     beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
     made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
+    notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(
-            temporary,
-            simulated.runs,
-            simulated.model,
-            params,
-            title,
-            sentences(simulated.notes),
-            made,
-        )
+        write(temporary, simulated.runs, simulated.model, params, title, notes, made)
 
 
 @contextlib.contextmanager

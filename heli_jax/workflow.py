@@ -19,7 +19,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, require_kind
-from heli_jax.finding import HOLD_GUESSED, Finding, note, once
+from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -300,7 +300,7 @@ def log_notes(problem: Problem) -> list[Finding]:
         notes += [n.of(where) for n in (flight.source.notes if flight.source else ())]
         notes += [
             note(
-                HOLD_GUESSED,
+                "hold.guessed",
                 f"{where}: {name} is taken as {flight.hold[name]} between samples, since it "
                 f"{reason}",
                 name,

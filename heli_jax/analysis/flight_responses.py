@@ -19,7 +19,7 @@ from heli_jax.analysis.spectral import (
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
-from heli_jax.finding import INSTRUMENT_UNUSED, Finding, note, sentences
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
@@ -30,8 +30,6 @@ _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
 _ROUNDS = 2
 """in which a transfer function is fitted again without what the windows add to it"""
-STILL = "responses.still"
-"""code of a signal that does not move"""
 _MOST_SAID = 3
 """outputs of which a refusal says why they have no response"""
 _AS_ONE = 1e-6
@@ -148,7 +146,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         words = f"{n} was logged at {rate:.3g} Hz: no response to it above {half:.3g} Hz"
         notes.append(note("responses.logged-slowly", words, n, value=rate))
     if own:
-        notes.append(note(INSTRUMENT_UNUSED, f"{own_said(own)}; it is not used", *own))
+        notes.append(note("loop.instrument-unused", f"{own_said(own)}; it is not used", *own))
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)
@@ -226,12 +224,15 @@ def _frequencies(settings: Settings, window: float, dt: float, step: float) -> n
 
 def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) -> list[Finding]:
     still = [n for n in flights[0].inputs if n not in inputs]
-    notes = [note(STILL, f"{n} does not move: no response to it", n) for n in still]
+    notes = [note("responses.still", f"{n} does not move: no response to it", n) for n in still]
     outputs = dict.fromkeys(n for f in flights for n in f.outputs)
     resting = [
         n for n in outputs if not any(_moves(f.outputs[n]) for f in flights if n in f.outputs)
     ]
-    notes += [note(STILL, f"{n} does not move: no input is seen to move it", n) for n in resting]
+    notes += [
+        note("responses.still", f"{n} does not move: no input is seen to move it", n)
+        for n in resting
+    ]
     # The bias has no sign of its own in any of the numbers below: it has to be said.
     without = [n for n in inputs if n not in by]
     if without:

@@ -86,10 +86,6 @@ def read_corrections(path: Path, where: str) -> Corrections:
         raise InputError(f"{where}: {path}: {place}: {message}{got}") from None
 
 
-NOT_CORRECTED = "corrections.left-out"
-"""code of errors that were found and are not taken off"""
-
-
 class Logged(NamedTuple):
     """A signal of the model, and which of the log it is."""
 
@@ -155,7 +151,7 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
     notes += words
     if corrections.not_determined:
         words = f"not corrected, since undetermined: {', '.join(corrections.not_determined)}"
-        notes.append(note(NOT_CORRECTED, words, *corrections.not_determined))
+        notes.append(note("corrections.left-out", words, *corrections.not_determined))
     flight = dataclasses.replace(flight, **samples, known={**flight.known, **known})
     if flight.source is None:
         return flight
@@ -211,7 +207,7 @@ def _lever_arm(
     words = ", ".join(f"{n} {v:.3g} m" for n, v in arm.items())
     if not set(arm) <= set(naming.names(model.Params)):
         words = f"lever arm not used, model {model.name} has none: {words}"
-        return {}, [note(NOT_CORRECTED, words, *arm)]
+        return {}, [note("corrections.left-out", words, *arm)]
     # What the configuration says of this flight goes before.
     new = {n: v for n, v in arm.items() if n not in flight.known}
     return new, [note("corrections.applied", f"lever arm of the accelerometer: {words}", *arm)]

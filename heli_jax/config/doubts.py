@@ -4,7 +4,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.config.onboard import VibrationConfig
-from heli_jax.finding import UNIT_ASSUMED, UNIT_UNLIKELY, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 
 _PULSE = (800.0, 2200.0)
@@ -37,7 +37,7 @@ def pulse_width_doubts(flight: Flight) -> tuple[Finding, ...]:
             f"{name}: {low:.4g} to {high:.4g} in the log look like pulse widths in us, and are "
             f"taken as {taken}, with no offset: state offset and scale, {OFFSET_AND_SCALE}"
         )
-        doubts.append(Finding(UNIT_UNLIKELY, "doubt", words, high, "largest number", (name,)))
+        doubts.append(Finding("units.unlikely", "doubt", words, high, "largest number", (name,)))
     return tuple(doubts)
 
 
@@ -54,8 +54,8 @@ def rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...]
             f"expected less than {_FASTEST_ROTOR:g} rad/s; was unit: rpm meant?"
         )
         criterion = f"rad/s, {_FASTEST_ROTOR:g}"
-        return (Finding(UNIT_UNLIKELY, "doubt", words, speed, criterion),)
+        return (Finding("units.unlikely", "doubt", words, speed, criterion),)
     if "unit" not in vibration.model_fields_set:
         words = f"vibration: rotor: no unit stated, {speed:g} taken as rad/s"
-        return (note(UNIT_ASSUMED, words, value=speed),)
+        return (note("units.assumed", words, value=speed),)
     return ()

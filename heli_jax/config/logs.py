@@ -24,7 +24,7 @@ from heli_jax.config.unfiltered_noise import unfiltered_cautions
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
-from heli_jax.finding import LEFT_OUT, UNIT_ASSUMED, Finding, note
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.convert import Selection
 from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
@@ -335,7 +335,7 @@ def _unstated_units(
             si = naming.unit(record, name)
             if signal.unit is None and si is not None and not units.is_plain(si):
                 words = f"{name}: no unit stated, taken as {si}"
-                notes.append(note(UNIT_ASSUMED, words, name))
+                notes.append(note("units.assumed", words, name))
     return tuple(notes)
 
 

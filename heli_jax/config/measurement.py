@@ -183,8 +183,7 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
         f"that delay for the machine's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
         "under outputs to model it, or `filter: []` there if it is of no account"
     )
-    criterion = "seconds by which the filters delay it"
-    return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, criterion, (name,))
+    return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
 
 
 def _changed(output: OutputConfig) -> dict[str, float]:

@@ -9,7 +9,7 @@ from heli_jax.config.schema import InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
-from heli_jax.finding import LACKING, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import CCPM
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.preset import (
@@ -97,7 +97,7 @@ def resolve(
     # In the model's own order, whichever of the two named them.
     inputs = {n: inputs[n] for n in (*naming.names(model.Inputs), *inputs) if n in inputs}
     words = f"outputs that preset {stated.preset} left out: {', '.join(left.values())}"
-    notes = (note(LACKING, words, *left),) if left else ()
+    notes = (note("channels.lacking", words, *left),) if left else ()
     return Resolved(inputs, outputs, origins, notes)
 
 

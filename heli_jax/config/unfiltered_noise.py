@@ -57,8 +57,7 @@ def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> 
                 f"{percent(left, 0)}: was it logged before the filter? Then the lag of a filter "
                 "that is not there is taken off the machine's; leave the filter out and compare"
             )
-            criterion = f"part of the noise's power, {left:.2g} behind the filter"
-            said.append(Finding("filters.not-passed", "doubt", words, there, criterion, (name,)))
+            said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
     return tuple(said)
 
 

@@ -13,11 +13,10 @@ from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
 from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
 from heli_jax.flights.row_clock import rate_cautions, rate_of
-from heli_jax.flights.table import Table, sample_count, shown
+from heli_jax.flights.table import Table, listed, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
 _LEVEL = re.compile(r"[./]")
-_MOST_NAMED = 6
 
 
 class _Clock(NamedTuple):
@@ -96,8 +95,8 @@ def clock_notes(table: Table) -> tuple[Finding, ...]:
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()
-    listed = ", ".join(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics[:_MOST_NAMED])
-    words = f"arrays have clocks of their own, read where no time is stated: {listed}"
+    topics = listed(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics)
+    words = f"arrays have clocks of their own, read where no time is stated: {topics}"
     return (note("clock.of-arrays", words, value=len(log.topics)),)
 
 
@@ -158,7 +157,6 @@ def _topic(
 def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[Finding, ...]:
     if not names:
         return ()
-    listed = ", ".join(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names[:_MOST_NAMED])
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names)
     words = "no time of their length, or several, stand in their groups"
-    return (note(LEFT_OUT, f"left out, since {words}: {listed}{more}", *names),)
+    return (note(LEFT_OUT, f"left out, since {words}: {each}", *names),)

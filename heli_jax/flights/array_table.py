@@ -29,6 +29,7 @@ from heli_jax.flights.table import (
     Budget,
     Survey,
     column,
+    listed,
     require_columns,
     require_few_columns,
     shown,
@@ -131,13 +132,14 @@ def open_mat(path: Path) -> ArrayTable:
         return _from_hdf5(path, "mat 7.3", data)
     try:
         read = mat_file.read_mat(data, Budget(str(path), len(data)))
-        whole, units, notes = labelled(read.arrays, read.texts)
+        whole, units = labelled(read.arrays, read.texts)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    notes: tuple[Finding, ...] = ()
     if read.objects:
         _require_arrays(path, whole, read.objects)
-        listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
-        notes = (*notes, note(LEFT_OUT, f"objects of MATLAB are left out: {listed}", *read.objects))
+        each = listed(f"{shown(n)} ({kind})" for n, kind in read.objects.items())
+        notes = (note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects),)
     real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
     named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
@@ -146,10 +148,10 @@ def open_mat(path: Path) -> ArrayTable:
             called = named.name(name, i) or part
             arrays[called] = vector
             of_parts[called] = named.unit(name, i) or units.get(name, "")
-    notes = (*notes, *of_stacks, *named.notes)
+    notes = (*notes, *of_stacks)
     if complex_ones := [n for n, array in whole.items() if array.dtype.kind == "c"]:
-        listed = ", ".join(map(shown, complex_ones))
-        words = f"complex numbers, of which the real part is read: {listed}"
+        words = "complex numbers, of which the real part is read: "
+        words += listed(map(shown, complex_ones))
         notes = (*notes, note("channels.complex", words, *complex_ones))
     return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
 
@@ -229,7 +231,6 @@ class DataSets:
         self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
-        self._scaled: dict[str, None] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._notes: list[Finding] = []
@@ -249,12 +250,10 @@ class DataSets:
         self.budget.take_numbers(stored.size, stored.nbytes)
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
-            values, is_scaled, missing = packed.unpack(stored, packing)
+            values, missing = packed.unpack(stored, packing)
         except packed.Packing as e:
             self._left_out[name] = str(e)
             return
-        if is_scaled:
-            self._scaled[name] = None
         if missing:
             self._missing[name] = missing
         stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), "")
@@ -276,7 +275,7 @@ class DataSets:
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
-        notes = packed.notes_of(self._scaled, self._missing, self._left_out)
+        notes = packed.notes_of(self._missing, self._left_out)
         paths = {name: self.references.path(name) for name in self._stored}
         whole = labelled(
             {paths[name]: values for name, values in self._stored.items()}, self.references.texts
@@ -290,7 +289,7 @@ class DataSets:
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or stated.get(name, "")
-        return arrays, units, (*notes, *self._notes, *whole.notes, *of_stacks, *named.notes)
+        return arrays, units, (*notes, *self._notes, *of_stacks)
 
 
 def open_hdf5(path: Path) -> ArrayTable:

@@ -14,8 +14,6 @@ from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.flights.marks import (
-    KEPT,
-    MARKS,
     Counts,
     Marked,
     at_marks,
@@ -109,7 +107,7 @@ def _as_logged(
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
             words = f"{name} has {words}: taken as missing"
-            notes.append(note(MARKS, words, key[0], value=int(np.count_nonzero(at))))
+            notes.append(note("samples.marks", words, key[0], value=int(np.count_nonzero(at))))
         notes += source_notes(name, {n: marked.counts for n, marked in sources.items()})
         values = np.where(at, np.nan, timed.values)
         turn = units.turn(signal.si)
@@ -118,12 +116,9 @@ def _as_logged(
             notes.append(unwrapping)
         # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
         odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
-        notes += [
-            note(
-                KEPT, f"{name} has {stray_words(s)}: kept as measured", key[0], value=s.values.size
-            )
-            for s in odd[key]
-        ]
+        for s in odd[key]:
+            words = f"{name} has {stray_words(s)}: kept as measured"
+            notes.append(note("samples.stray-kept", words, key[0], value=s.values.size))
         made[key] = Timed(timed.seconds, values)
     return AsLogged(made, _facts(made, marks, odd), tuple(notes))
 
@@ -174,7 +169,7 @@ def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
         alike.setdefault(counts, []).append(shown(source))
     return [
         note(
-            MARKS,
+            "samples.marks",
             f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
             f"{mark_words(counts)}: taken as missing",
             value=sum(n for _, n in counts),
@@ -197,7 +192,7 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
     if at.any():
         size = int(np.sum(~np.isnan(numbers)))
         words = f"{name} has {mark_words(counted(numbers[at]), size)}: taken as missing"
-        notes.append(note(MARKS, words, value=int(np.count_nonzero(at))))
+        notes.append(note("samples.marks", words, value=int(np.count_nonzero(at))))
         numbers = np.where(at, np.nan, numbers)
     notes += suspect_notes(name, numbers)
     for turn in _TURNS:

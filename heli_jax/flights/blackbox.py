@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.finding import DAMAGE, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
 from heli_jax.flights.blackbox_columns import narrowed
 from heli_jax.flights.blackbox_frames import Frames, find_frames
@@ -194,4 +194,4 @@ def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
     words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
     if main.dropped:
         words += f", {main.dropped} more frames lost that were differences from a lost one"
-    return (note(DAMAGE, words, value=places + main.dropped),)
+    return (note("damage.skipped", words, value=places + main.dropped),)

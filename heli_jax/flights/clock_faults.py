@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from heli_jax import units
-from heli_jax.finding import UNIT_CONTRADICTED, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps
 from heli_jax.flights.runs import restarts
@@ -29,11 +29,11 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
     factor = units.factor(time.unit, "s")
     if stated and not math.isclose(units.factor(stated, "s"), factor):
         words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
-        return (note(UNIT_CONTRADICTED, f"{words}, and not in {time.unit}"),)
+        return (note("units.contradicted", f"{words}, and not in {time.unit}"),)
     if not stated and named and not math.isclose(units.factor(named, "s"), factor):
         words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
         words += f": if that is right, state unit: {named} beside it"
-        return (note(UNIT_CONTRADICTED, words),)
+        return (note("units.contradicted", words),)
     return ()
 
 

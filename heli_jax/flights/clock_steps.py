@@ -52,8 +52,7 @@ def step_notes(seconds: np.ndarray, rate: float, longest: float) -> tuple[Findin
         "usual: samples were lost there, or the clock was set; if it was set, what was flown "
         "before and after is farther apart than it was, and the estimates are off"
     )
-    criterion = "the longest step [s]"
-    return (Finding("clock.long-steps", "note", words, float(steps[worst]), criterion),)
+    return (note("clock.long-steps", words, value=float(steps[worst])),)
 
 
 def _second_rate(steps: np.ndarray) -> tuple[int, float, float] | None:

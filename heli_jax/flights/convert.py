@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
-from heli_jax.finding import LEFT_OUT, MISSING, Finding, note
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import MARKS, at_marks, counted, mark_words, suspect_notes
+from heli_jax.flights.marks import at_marks, counted, mark_words, suspect_notes
 from heli_jax.flights.named import NamedBy
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
-from heli_jax.flights.table import require_few_columns, shown, wrong
+from heli_jax.flights.table import listed, require_few_columns, shown, wrong
 from heli_jax.flights.table_topics import (
     as_channels,
     matching,
@@ -236,10 +236,9 @@ def _missing(columns: Mapping[str, np.ndarray]) -> list[Finding]:
     size = columns[TIME].size
     return [
         note(
-            MISSING,
+            "samples.missing",
             f"{count} of {size} samples {'is' if count == 1 else 'are'} missing, in "
-            + ", ".join(map(shown, names[:6]))
-            + (f" and {len(names) - 6} more" if len(names) > 6 else ""),
+            f"{listed(map(shown, names))}",
             *names,
             value=count,
         )
@@ -269,7 +268,7 @@ def _as_logged(
             words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
             words = f"{shown(name)} has {words}: {done}"
-            notes.append(note(MARKS, words, name, value=int(np.count_nonzero(at))))
+            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
         notes += suspect_notes(shown(name), np.where(at, np.nan, values))
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns

@@ -83,7 +83,7 @@ def open_csv(path: Path) -> "CsvTable":
     digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
     if is_gzipped(path):
         data = unpacked(where, data)
-    data, notes = as_utf8(where, data)
+    data = as_utf8(where, data)
     check_text(where, data)
     blanks = inner_ending(path) not in (".csv", ".tsv")
     head = find_head(where, data, blanks)
@@ -110,11 +110,9 @@ def open_csv(path: Path) -> "CsvTable":
     body = Body(where, rows, delimiter, head.first_line, quotes)
     groups = [header_names(where, text, delimiter, number) for text in head.above]
     names = as_wide(qualified(names, groups), body)
-    body, empty = body.filled()
-    body, cut = body.whole(len(names))
-    notes = (*notes, note("text.head", head.note)) if head.note else notes
+    body, cut = body.filled().whole(len(names))
     rate = rate_above(bytes(data[:after]).decode("utf-8", "replace"))
-    notes, units = (*notes, *empty, *cut), _units_below(body, names)
+    notes, units = cut, _units_below(body, names)
     if units is None:
         stated = dict(zip(names[1:], head.units, strict=False))
         return CsvTable(size, digest, names, body, head, notes, stated, rate)

@@ -88,22 +88,19 @@ class Body:
         cut = note("text.line-cut-off", words, value=cells)
         return replace(self, rows=self.data[: at - len(tail)]), (cut,)
 
-    def filled(self) -> tuple["Body", tuple[Finding, ...]]:
+    def filled(self) -> "Body":
         """The body without the rows of empty cells behind the last that holds something, as
-        spreadsheets write them, and a note of it."""
+        spreadsheets write them."""
         size, of_nothing = _LAST, b" \t\r\n" + self.delimiter.encode()
         while not (end := self._end(size)).rstrip(of_nothing) and size < self.size:
             size *= 16
         kept = end.rstrip(of_nothing)
         # To the end of its line, which may be of empty cells.
         _, at = _line_end(end, len(kept))
-        count = sum(self.delimiter in line for line in lines_of(end[at:].decode()))
-        if not kept or not count:
-            return self, ()
-        words = "row is" if count == 1 else f"{count} rows are"
-        empty = note("text.rows-empty", f"the last {words} empty, and left out", value=count)
+        if not kept or self.delimiter not in end[at:].decode():
+            return self
         # In memory from here on, as in `whole`.
-        return replace(self, rows=self.data[: at - len(end)]), (empty,)
+        return replace(self, rows=self.data[: at - len(end)])
 
     def _end(self, size: int) -> bytes:
         """The last `size` bytes, or fewer."""

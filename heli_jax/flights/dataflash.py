@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.finding import DAMAGE, note
+from heli_jax.finding import note
 from heli_jax.flights import progress
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
@@ -242,10 +242,7 @@ def make_log(
     notes = []
     if damaged:
         words = f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped"
-        notes.append(note(DAMAGE, words, value=damaged))
-    if anew := [t.name for t in tables if t.descriptions > 1 or "#" in t.name]:
-        words = f"described anew within the log, and read by each description: {', '.join(anew)}"
-        notes.append(note("channels.described-anew", words, *anew))
+        notes.append(note("damage.skipped", words, value=damaged))
     return ChannelLog(
         path=path,
         format="dataflash",

@@ -32,6 +32,7 @@ from heli_jax.flights.runs import clock_scale, numbering, numbering_notes, resta
 from heli_jax.flights.table import (
     Survey,
     Table,
+    listed,
     sample_count,
     shown,
     wrong,
@@ -296,8 +297,7 @@ def _other_lengths(surveys: list[Survey]) -> tuple[Finding, ...]:
     return tuple(
         note(
             "channels.other-length",
-            f"{sample_count(size)}, not {rows}: {', '.join(map(shown, names[:6]))}"
-            + (f" and {len(names) - 6} more" if len(names) > 6 else ""),
+            f"{sample_count(size)}, not {rows}: {listed(map(shown, names))}",
             *names,
             value=size,
         )
@@ -369,7 +369,7 @@ def _describe_stamps(
     if scale is None:
         scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
-        stamps, _ = without_overflow(stamps)
+        stamps = without_overflow(stamps)
         seconds = stamps * scale
         steps = np.diff(seconds)
     # A column that was named as the clock may be anything, so what follows has to hold: finite

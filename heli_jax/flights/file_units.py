@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from heli_jax import units
-from heli_jax.finding import UNIT_ASSUMED, UNIT_CONTRADICTED, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.request import Request
@@ -68,7 +68,7 @@ def other_units(request: Request) -> list[Finding]:
     """Notes on units that the file states otherwise than the configuration."""
     return [
         note(
-            UNIT_CONTRADICTED,
+            "units.contradicted",
             f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
             f" the file says {shown(signal.contradicted)}",
             name,
@@ -89,4 +89,4 @@ def taken_note(name: str, signal: Signal) -> Finding | None:
     if not signal.assumed or signal.unit == signal.si:
         return None
     words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"
-    return note(UNIT_ASSUMED, f"{name}: {words}", name)
+    return note("units.assumed", f"{name}: {words}", name)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding
 
 JITTER_ALLOWED = 0.1  # of a step, where rounding does not explain more
 LATEST = 1e12  # s, beyond any calendar; keeps sums and differences of stamps finite
@@ -80,21 +80,19 @@ _COUNTER = 2.0**32
 """ticks after which a counter of 32 bits begins anew: 71.6 minutes of microseconds"""
 
 
-def without_overflow(stamps: np.ndarray) -> tuple[np.ndarray, tuple[Finding, ...]]:
-    """Stamps (N,) of a counter of 32 bits that began anew, as going on, and a note of it."""
+def without_overflow(stamps: np.ndarray) -> np.ndarray:
+    """Stamps (N,) of a counter of 32 bits that began anew, as going on."""
     steps = np.diff(stamps)
     back = np.flatnonzero(steps < 0)
     # Whole numbers below its end, that fall by nearly all of it and then go on as before.
     if not back.size or not (stamps.min() >= 0 and stamps.max() < _COUNTER):
-        return stamps, ()
+        return stamps
     on = steps[back] + _COUNTER
     usual = float(np.median(steps))
     if not np.all((on > 0) & (on <= _ON * usual)) or np.any(stamps != np.rint(stamps)):
-        return stamps, ()
+        return stamps
     turns = np.cumsum(np.r_[0, steps < 0])
-    times = "once" if back.size == 1 else f"{back.size} times"
-    words = f"the time began anew at 2^32 ticks {times}, as a counter of 32 bits does: it goes on"
-    return stamps + _COUNTER * turns, (note("clock.overflow", words, value=back.size),)
+    return stamps + _COUNTER * turns
 
 
 def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:

@@ -41,10 +41,6 @@ _FAR = 10.0
 _SPACING = 3.0
 """times the largest distance between neighbouring values, by which what may be a mark is off"""
 _MOST_NOTES = 6
-MARKS = "samples.marks"
-"""code of numbers that stand for no value and are taken as missing"""
-KEPT = "samples.stray-kept"
-"""code of numbers that may stand for no value and are kept"""
 WHY_SUSPECTED = "which loggers write where they have no value"
 
 Counts = tuple[tuple[float, int], ...]
@@ -154,7 +150,7 @@ def suspect_notes(name: str, numbers: np.ndarray) -> list[Finding]:
     if not at.any():
         return []
     words = f"{name} has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"
-    return [note(KEPT, words, value=int(np.count_nonzero(at)))]
+    return [note("samples.stray-kept", words, value=int(np.count_nonzero(at)))]
 
 
 def at_sure_or_suspected(numbers: np.ndarray) -> np.ndarray:
@@ -184,11 +180,11 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
             stand = "stands" if np.count_nonzero(at) == 1 else "stand"
             words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
             words += ": a fit takes them as missing"
-            notes.append(note(MARKS, words, name, value=int(np.count_nonzero(at))))
+            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
     more = len(notes) - _MOST_NOTES
     if more <= 0:
         return notes
-    return [*notes[:_MOST_NOTES], note(MARKS, f"{more} more channels have such samples")]
+    return [*notes[:_MOST_NOTES], note("samples.marks", f"{more} more channels have such samples")]
 
 
 def counted(values: np.ndarray) -> Counts:

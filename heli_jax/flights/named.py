@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from heli_jax.finding import LACKING, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import DerivedLog, DerivedTable
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.preset import choose, meanings, preset, presets
@@ -56,7 +56,7 @@ def by_preset(name: str) -> NamedBy:
             raise wrong(log.path, problem)
         lacking = [signal for signal in chosen if signal not in signals]
         words = f"preset {table.title}: the log has no {', '.join(lacking)}"
-        notes = (note(LACKING, words, *lacking),) if lacking else ()
+        notes = (note("channels.lacking", words, *lacking),) if lacking else ()
         return Named(signals, notes, required=False)
 
     return named

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.finding import MISSING, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.holds import LOW_PASSED, Decision, decide, low_passed
 from heli_jax.flights.repeats import repeats_removed
@@ -38,8 +38,6 @@ from heli_jax.flights.table import shown
 Key = tuple[str, str]
 """a model's name, and `input` or `output`"""
 _NO_HOLD = Decision("", "")
-JUMPS_AVERAGED = "resampling.jumps-averaged"
-"""code of outputs that jump with an input whose mean over a step is taken"""
 FEWEST = 8
 """samples in a run"""
 MOST_UPSAMPLING = 100
@@ -116,7 +114,7 @@ def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Findi
             are = "is" if count == 1 else "are"
             words = f"{count} of {missing.size} samples of {name} {are} missing"
             words += f", {_where(signal.seconds[missing], missing)}"
-            notes.append(note(MISSING, words, key[0], value=count))
+            notes.append(note("samples.missing", words, key[0], value=count))
     return notes
 
 
@@ -212,8 +210,6 @@ def at_times(
                 # A low-pass filter would turn a stick that jumps into one that rings.
                 samples[key, kind] = held_mean(*signal, times)
                 if not np.isin(samples[key, kind], signal.values).all():
-                    words = f"{key} is held: each step of the grid has its mean over that step"
-                    notes.append(note("resampling.held-mean", words, key))
                     notes += _between(request, signals, key, times)
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
@@ -263,7 +259,7 @@ def _between(
         "its mean over a step is not what they show at the step's beginning, and estimates suffer; "
         f"a rate as high as that of {name} keeps both as they are"
     )
-    return [note(JUMPS_AVERAGED, words, name, *jump, value=hz)]
+    return [note("resampling.jumps-averaged", words, name, *jump, value=hz)]
 
 
 def _alike(

@@ -214,7 +214,6 @@ class _Clock:
     stamps: np.ndarray
     scale: float
     notes: tuple[Finding, ...] = ()
-    unit_notes: tuple[Finding, ...] = ()
     """where the file or a name says another unit"""
     cautions: tuple[Finding, ...] = ()
     """what speaks against the times"""
@@ -225,9 +224,9 @@ class _Clock:
         try:
             yield
         except InputError as e:
-            if not self.unit_notes:
+            if not self.notes:
                 raise
-            raise InputError("; ".join([str(e), *sentences(self.unit_notes)])) from e
+            raise InputError("; ".join([str(e), *sentences(self.notes)])) from e
 
     @property
     def elapsed(self) -> np.ndarray:
@@ -264,13 +263,13 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         row = int(bad[0])
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
         raise wrong(table.path, problem, table.place(row), place)
-    stamps, notes = without_overflow(stamps)
+    stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
     step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
     cautions = contradicted_rate(table, time.name, 1.0 / step)
     if not stated and time.scale == 1.0:
         cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return _Clock(stamps, scale, (*notes, *said), said, cautions)
+    return _Clock(stamps, scale, said, cautions)
 
 
 def _rows(

@@ -11,8 +11,6 @@ import numpy as np
 from heli_jax.finding import Finding, note
 from heli_jax.flights.slower import Timed, usual_step
 
-CARRIED_ON = "repeats.carried-on"
-"""code of outputs whose values rows between carry on"""
 REPEATS = ("auto", "keep", "missing")
 """What is made of repeated values: missing samples where that is unmistakable, or as stated."""
 
@@ -153,8 +151,6 @@ def repeats_removed(
             # Stated by somebody who knows: then no further sign is asked for.
             usual = usual or round(float(np.median(lengths))) if lengths.size else None
             if usual is None or usual < 2:
-                words = f"{name}: no value is repeated, though `repeats: missing` is stated"
-                notes.append(note("repeats.none", words, name))
                 continue
         elif usual is None:
             continue
@@ -183,7 +179,7 @@ def _carried_note(name: str, seconds: np.ndarray, made: np.ndarray) -> Finding:
         f"measured at the {np.count_nonzero(seen)} rows with a new one and missing at the others "
         "(`repeats: keep` leaves them)"
     )
-    return note(CARRIED_ON, words, name, value=hz)
+    return note("repeats.carried-on", words, name, value=hz)
 
 
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

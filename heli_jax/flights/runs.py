@@ -79,7 +79,7 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     none = np.zeros(0, int)
     if stamps.size < 2 * _SHORTEST or not np.isfinite(stamps).all():
         return none
-    stamps, _ = without_overflow(stamps)
+    stamps = without_overflow(stamps)
     steps = np.diff(stamps)
     # A stick that steps stands still in between.
     if np.any(steps == 0):

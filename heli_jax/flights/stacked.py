@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
-from heli_jax.flights.table import shown
+from heli_jax.flights.table import listed, shown
 from heli_jax.flights.time_units import split_unit
 
 NUMBER = "segment"
@@ -20,7 +20,6 @@ DEEPEST = 3
 """dimensions of an array that may be a stack"""
 _FEWEST = 10
 """samples of a segment, below which matrices of a few numbers are no stack"""
-_MOST_NAMED = 6
 
 
 class Unstacked(NamedTuple):
@@ -154,6 +153,4 @@ def _without_padding(
 
 
 def _listed(names: Mapping[str, np.ndarray] | list[str], arrays: Mapping[str, np.ndarray]) -> str:
-    listed = [f"{shown(n)} {arrays[n].shape}" for n in names if n in arrays]
-    more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
-    return f"{', '.join(listed[:_MOST_NAMED])}{more}"
+    return listed(f"{shown(n)} {arrays[n].shape}" for n in names if n in arrays)

@@ -1,7 +1,7 @@
 """A log as named columns of numbers, whatever the file's format."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -78,6 +78,13 @@ def shown(text: str) -> str:
     """Text from a file, quoted, cut to 40 characters."""
     # Cut, since a damaged file may have a name as long as itself.
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
+
+
+def listed(words: Iterable[str]) -> str:
+    """The first six, and how many more there are."""
+    each = list(words)
+    more = f" and {len(each) - 6} more" if len(each) > 6 else ""
+    return f"{', '.join(each[:6])}{more}"
 
 
 def column(name: str) -> str:

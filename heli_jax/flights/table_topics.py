@@ -14,7 +14,7 @@ from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.runs import clock_scale, with_runs
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import Table, listed, shown, wrong
 from heli_jax.flights.table_view import numbers_once
 
 _MOST_NAMED = 6
@@ -84,10 +84,10 @@ def require_clocks(
     asked = [n for p in patterns or ["*"] for n in matching(clockless, p)]
     for size in dict.fromkeys(clockless[name] for name in asked):
         names = [n for n in dict.fromkeys(asked) if clockless[n] == size]
-        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-        words = f"left out: {', '.join(map(shown, names[:6]))}{more}"
-        words += f", of {size} samples, for which there is no clock"
-        notes.append(note(LEFT_OUT, words, *names, value=size))
+        words = (
+            f"left out: {listed(map(shown, names))}, of {size} samples, for which there is no clock"
+        )
+        notes.append(note(LEFT_OUT, f"left out: {words}", *names, value=size))
 
 
 def in_runs(table: Table, clock: TimeInfo) -> Table:
@@ -158,8 +158,8 @@ def _table_topic(
         numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
     else:
         numbers, copies = numbers_once(table, clock.column, names)
-    stamps, more = without_overflow(numbers.pop(clock.column))
-    notes += (*copies, *more)
+    stamps = without_overflow(numbers.pop(clock.column))
+    notes += copies
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)

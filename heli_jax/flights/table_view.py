@@ -8,7 +8,7 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights.clock_parts import ClockParts, CompactClock, clock_parts
-from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.table import Survey, Table
 
 
 class TableView:
@@ -179,8 +179,4 @@ def with_joined_clock(table: Table) -> Table:
         return table
     if not clock.fits(columns):
         return table
-    *first, last = map(shown, clock.columns)
-    words = f"{', '.join(first)} and {last} are taken as one clock"
-    if not first:
-        words = f"{last} is taken for hours, minutes and seconds in one number, HHMMSS"
-    return TableView(table, clock=clock, note=note("clock.of-columns", words, *clock.columns))
+    return TableView(table, clock=clock)

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from heli_jax.finding import UNIT_UNLIKELY, Finding
+from heli_jax.finding import Finding
 from heli_jax.flights.table import column, shown, wrong
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
@@ -86,7 +86,7 @@ def require_likely(
     problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
     if named != likely and not assumed:
         words = f"time: {shown(name)}: {problem}."
-        return (Finding(UNIT_UNLIKELY, "doubt", words, step, "seconds between stamps", (name,)),)
+        return (Finding("units.unlikely", "doubt", words, step, "seconds between stamps", (name,)),)
     why = f", as its name says {named}" if named == likely else ""
     remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
     if named != likely:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heli_jax.finding import DAMAGE, note
+from heli_jax.finding import note
 from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples
 from heli_jax.flights.px4_commands import is_command
@@ -108,7 +108,7 @@ def open_ulog(path: Path) -> ChannelLog:
         share = 100 * content.lost / len(data)
         lost = f" ({share:.2g} % of the file)" if share >= _TOLD else ""
         words = f"{count} damaged message{'' if count == 1 else 's'} skipped{lost}"
-        notes.append(note(DAMAGE, words, value=count))
+        notes.append(note("damage.skipped", words, value=count))
     if content.dropouts:
         times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
         lost = content.dropped * 1e-3

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import INSTRUMENT_UNUSED, UNIT_IN_DOUBT, Finding, note, sentences
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, note, sentences
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
@@ -405,7 +405,7 @@ def cautions(problem: Problem) -> tuple[Finding, ...]:
     own = own if problem.instrument is None else ()
     return (
         *said.values(),
-        *((note(INSTRUMENT_UNUSED, f"{own_said(own)}; it is not used."),) if own else ()),
+        *((note("loop.instrument-unused", f"{own_said(own)}; it is not used."),) if own else ()),
         *_whole_band(problem),
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.errors import InputError
-from heli_jax.finding import LACKING, Finding, note
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.identification.validation.follows_response import feedback
@@ -31,8 +31,6 @@ from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
 from heli_jax.yaml_file import EDIT
 
-YOURS = "configuration.numbers-to-give"
-"""code of numbers that a new configuration leaves to its user"""
 _GRAVITY = ("g", "gravity", "g0")
 
 
@@ -109,19 +107,25 @@ def write_config(
     notes = [note("configuration.written", written), *read.notes]
     if todo:
         words = "1 number is" if todo == 1 else f"{todo} numbers are"
-        notes.append(note(YOURS, f"{words} yours to give, where {EDIT} stands", value=todo))
+        notes.append(
+            note(
+                "configuration.numbers-to-give",
+                f"{words} yours to give, where {EDIT} stands",
+                value=todo,
+            )
+        )
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
         outputs = ", ".join(naming.names(chosen.model.Outputs))
         words = f"found none of {outputs} by its name: say which were logged, and as what"
-        notes.append(note(LACKING, words, *naming.names(chosen.model.Outputs)))
+        notes.append(note("channels.lacking", words, *naming.names(chosen.model.Outputs)))
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
         words += (
             ": name the stick's, which no rate or angle is, or write {constant: 0} in "
             "place of {signal: EDIT} where it stayed where it was and was not logged"
         )
-        notes.append(note(LACKING, words, *lacking))
+        notes.append(note("channels.lacking", words, *lacking))
     if signals is not None:
         absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
         absent = [n for n in absent if n not in signals.wandering]

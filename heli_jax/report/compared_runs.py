@@ -157,18 +157,16 @@ class ComparedRuns(NamedTuple):
                     words += " Differences are from the first run: name one first that did."
                 notes.append(Finding("compared.not-converged", "doubt", words, subjects=(label,)))
                 continue
-            doubts = []
+            doubts = {}
             if run.distrust:
-                doubts.append(("not-trusted", f"{label}: {run.distrust}"))
+                doubts["not-trusted"] = f": {run.distrust}"
             if run.adequate is False:
-                words = f"{label} is not adequate: its intervals may be too narrow."
-                doubts.append(("not-adequate", words))
+                doubts["not-adequate"] = " is not adequate: its intervals may be too narrow."
             elif run.overconfident:
-                words = f"{label}: its sd are too small, since its residuals are not white."
-                doubts.append(("overconfident", words))
+                doubts["overconfident"] = ": its sd are too small: its residuals are not white."
             notes += [
-                Finding(f"compared.{what}", "doubt", words, subjects=(label,))
-                for what, words in doubts
+                Finding(f"compared.{what}", "doubt", f"{label}{words}", subjects=(label,))
+                for what, words in doubts.items()
             ]
         return tuple(notes)
 

@@ -62,7 +62,6 @@ class FittedPair(NamedTuple):
     """half of a 95 % interval of what was measured, in sd"""
 
 
-NONE_HELD_OUT = "responses.none-held-out"
 NO_RESPONSES = "responses.none-of-fit"
 """code of flights of which none could be taken"""
 
@@ -223,7 +222,7 @@ def _of_held_out(
     try:
         responses = flight_responses(held, settings)
     except ValueError as e:
-        return (), (note(NONE_HELD_OUT, f"no responses of the flights held out: {e}"),)
+        return (), (note("responses.none-held-out", f"no responses of the flights held out: {e}"),)
     pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
@@ -231,7 +230,7 @@ def _of_held_out(
         f"no figure of the flights held out: none of their responses, taken together, has a "
         f"coherence of {COHERENT:g} in the mean over an octave"
     )
-    return (), (note(NONE_HELD_OUT, words),)
+    return (), (note("responses.none-held-out", words),)
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:

@@ -196,7 +196,6 @@ def test_labels_in_arrays_of_structures_are_names(tmp_path, fields, packed):
     for i, (name, unit) in enumerate(wanted.items()):
         np.testing.assert_array_equal(table.numbers([name])[name], np.sin((i + 1) * T))
         assert table.units[name] == unit
-    assert [n.subjects for n in table.notes if n.code == "channels.called"] == [tuple(wanted)]
     info = describe_log(path)
     assert info.time is not None
     assert info.time.column == "out.time"

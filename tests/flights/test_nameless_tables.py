@@ -51,7 +51,6 @@ def test_columns_without_names_are_called_by_their_numbers(tmp_path, lines, name
     values, table = columns(of_lines(tmp_path, lines, name))
     assert table.names == ("column1", "column2", "column3")
     np.testing.assert_allclose(values, TABLE, atol=2e-6)
-    assert table.notes[0].code == "text.head"
 
 
 @pytest.mark.parametrize("sign", ["%", "#", "//", "!", "*", "C ", "'"])

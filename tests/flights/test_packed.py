@@ -55,7 +55,6 @@ def test_all_files_are_unpacked_as_xarray_does(tmp_path, name):
     units = {c.name: c.unit for c in info.columns}
     assert (units["roll"], units["p"]) == ("degrees", "rad/s")
     said = {n.code: n for n in info.notes}
-    assert "roll" in said["channels.unpacked"].subjects
     assert "p" in said["samples.marks"].subjects
     # In radians at last, as a fit reads it; and as `new` guesses and `convert` writes it.
     signals = {"inputs": {}, "outputs": {"phi": Signal("roll", "deg", "rad")}}
