@@ -1,17 +1,12 @@
-"""Sweeps on a GPU: each run as one program of its own against XLA's loop, by batch and precision.
+"""Sweeps on a GPU by XLA beside the processor, by batch and precision.
 
-Where JAX finds a GPU, the compiled part alone is timed, whole batches at once, of the roll model
-and of the whole helicopter. Without one it says what can be said: what the programs are made of,
-and, where CUDA's `ptxas` is installed, how many registers they take and what lies in memory.
+Whole batches of the roll model and of the whole helicopter, the compiled part alone: by XLA on the
+GPU, and on the processor by XLA and by the fused kernel. Without a GPU it ends with a sentence.
 
     .venv/bin/python experiments/benchmarks/gpu_sweeps.py [--quick] [SAMPLES]
 """
 
-import re
-import shutil
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,9 +16,8 @@ import jax
 import numpy as np
 
 from heli_jax import Flight, load_vehicle, models, naming
-from heli_jax.fused.ptx import ptx
 from heli_jax.sweeps import Range, Reduce, sobol
-from heli_jax.sweeps.fused_program import FusedProgram, run_of
+from heli_jax.sweeps.fused_program import FusedProgram
 from heli_jax.sweeps.program import Program, arguments
 from heli_jax.sweeps.spec import Job, RunOptions, job
 
@@ -59,9 +53,10 @@ def cases() -> Iterator[tuple[str, str, str]]:
         yield from ((f"helicopter{k}", "rk4", precision) for k in ("", "-paper", "-consistent"))
 
 
-def timed(kind: Any, wanted: Job, n: int) -> float:
+def timed(kind: Any, wanted: Job, n: int, platform: str) -> float:
     """The least seconds of three batches, after one that compiles."""
-    program = kind(wanted, 0, jax.local_devices()[:1], n)
+    devices = jax.devices(platform)
+    program = kind(wanted, 0, devices[:1] if platform != "cpu" else devices, n // len(devices))
     values = arguments(wanted, wanted.design.values(0, n))
     taken = []
     for _ in range(4):
@@ -71,55 +66,21 @@ def timed(kind: Any, wanted: Job, n: int) -> float:
     return min(taken[1:])
 
 
-def on_gpu(samples: int, batches: tuple[int, ...]) -> None:
-    print(f"{jax.local_devices()[0].device_kind}, {samples} samples, flights a second")
-    print(f"{'':30}{'vehicles':>10}{'one program':>14}{'XLA':>14}{'times':>8}")
-    for name, solver, precision in cases():
-        for n in batches:
-            wanted = described(name, solver, precision, samples, n)
-            ours, xla = (n / timed(kind, wanted, n) for kind in (FusedProgram, Program))
-            what = f"{name}, {solver}, {precision}"
-            print(f"{what:38}{n:>10}{ours:14.3g}{xla:14.3g}{ours / xla:8.1f}", flush=True)
-
-
-def without(samples: int, capability: int = 90) -> None:
-    """What of the programs can be said without a GPU."""
-    tool = shutil.which("ptxas")
-    print(f"no GPU here: programs for compute capability {capability / 10}, {samples} samples")
-    if tool is None:
-        print("no ptxas here: registers and memory are not known")
-    for name, solver, precision in cases():
-        begin = time.process_time()
-        run = run_of(described(name, solver, precision, samples, 64), 0)
-        text, _ = ptx(run, capability)
-        taken = time.process_time() - begin
-        line = f"{name}, {solver}, {precision}: {text.count(chr(10))} lines, made in {taken:.1f} s"
-        if tool is not None:
-            line += assembled(tool, text, capability)
-        print(line, flush=True)
-
-
-def assembled(tool: str, text: str, capability: int) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "run.ptx"
-        path.write_text(text)
-        out = Path(folder) / "run.cubin"
-        done = subprocess.run(
-            [tool, "-v", f"-arch=sm_{capability}", "-o", out, path],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    registers = re.findall(r"Used (\d+) registers", done.stderr)
-    spilled = re.findall(r"(\d+) bytes spill stores", done.stderr)
-    return f"; {registers[0]} registers, {spilled[0]} bytes of them in memory"
-
-
 def main() -> None:
     samples = Size("samples", 6000, 200, "samples of a record")
-    options = asked(__doc__, "half a minute without a GPU (with one not known)", samples)
+    options = asked(__doc__, "not known with a GPU", samples)
     if jax.default_backend() == "cpu":
-        without(options.samples)
-    else:
-        on_gpu(options.samples, BATCHES[:2] if options.quick else BATCHES)
+        print("no GPU here")
+        return
+    print(f"{jax.local_devices()[0].device_kind}, {options.samples} samples, flights a second")
+    print(f"{'':38}{'vehicles':>10}{'GPU, XLA':>14}{'CPU, XLA':>14}{'CPU, fused':>14}")
+    ways = ((Program, jax.default_backend()), (Program, "cpu"), (FusedProgram, "cpu"))
+    for name, solver, precision in cases():
+        for n in BATCHES[:2] if options.quick else BATCHES:
+            wanted = described(name, solver, precision, options.samples, n)
+            rates = [n / timed(kind, wanted, n, platform) for kind, platform in ways]
+            what = f"{name}, {solver}, {precision}"
+            print(f"{what:38}{n:>10}{''.join(f'{r:14.3g}' for r in rates)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """LLVM assembly, line by line: scalars that all vehicles share, and vectors over vehicles."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-
-from heli_jax.fused.cuda_driver import CudaError
 
 
 class UnsupportedError(Exception):
@@ -33,7 +31,7 @@ def translating() -> Iterator[None]:
     """
     try:
         yield
-    except (UnsupportedError, CudaError):
+    except UnsupportedError:
         raise
     except Exception as e:
         raise UnsupportedError(f"this model, whose translation failed ({said(e)})") from e
@@ -53,20 +51,6 @@ class Value(NamedTuple):
     dtype: np.dtype
     shared: bool
     """the same for all vehicles: a scalar, no vector"""
-
-
-class Target(NamedTuple):
-    """What a program is written for."""
-
-    lanes: int
-    """vehicles in flight at once in one thread: vectors of so many; with one, plain numbers"""
-    threads: bool = False
-    """whether each thread has a place of its own among many, as on a GPU"""
-    memory: str = ""
-    """LLVM's address space of arrays"""
-    functions: Callable[[str, str], str | None] = lambda name, kind: None
-    """of LLVM's name of a function and the kind of number (`float`, `double`): another that is
-    called instead; None for LLVM's own"""
 
 
 _TYPES = {
@@ -113,10 +97,9 @@ class Code:
     stands for all that comes after.
     """
 
-    def __init__(self, target: Target) -> None:
-        self.target, self.lanes = target, target.lanes
-        self.memory = f"ptr{target.memory}"
-        """the type of a pointer to an array"""
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        """vehicles in flight at once in one thread: vectors of so many; with one, plain numbers"""
         self.lines: list[str] = []
         self.block = "entry"
         self.taken: Value | None = None
@@ -148,14 +131,9 @@ class Code:
     def pointer(self, table: str, i: int) -> str:
         """The i-th of a table of pointers."""
         place, pointer = self.register(), self.register()
-        self.write(f"{place} = getelementptr ptr, {self.memory} {table}, i64 {i}")
-        self.write(f"{pointer} = load {self.memory}, {self.memory} {place}{self.unchanging}")
+        self.write(f"{place} = getelementptr ptr, ptr {table}, i64 {i}")
+        self.write(f"{pointer} = load ptr, ptr {place}")
         return pointer
-
-    @property
-    def unchanging(self) -> str:
-        """Behind a load of what no thread writes: a GPU reads it by a shorter way."""
-        return ", !invariant.load !0" if self.target.threads else ""
 
     def made(self, right: str, dtype: np.dtype, shared: bool) -> Value:
         """The value of an instruction."""
@@ -217,8 +195,7 @@ class Code:
         kind = self.typed(values[0].dtype, shared)
         suffix = {"double": "f64", "float": "f32"}.get(type_of(values[0].dtype))
         suffix = suffix or type_of(values[0].dtype)
-        own = self.target.functions(name, type_of(values[0].dtype))
-        full = f"@llvm.{name}.{self.many(shared)}{suffix}" if own is None else f"@{own}"
+        full = f"@llvm.{name}.{self.many(shared)}{suffix}"
         self.declared[full] = f"declare {kind} {full}({', '.join([kind] * len(values))})"
         operands = ", ".join(f"{kind} {self.of(v, shared)}" for v in values)
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
@@ -228,7 +205,7 @@ class Code:
         each vehicle."""
         dtype = values[0].dtype
         kind, shared = type_of(dtype), all(v.shared for v in values)
-        own = self.target.functions(name, kind) or f"{name}{'f' if kind == 'float' else ''}"
+        own = f"{name}{'f' if kind == 'float' else ''}"
         takes = ", ".join([kind] * len(values))
         self.declared[f"@{own}"] = f"declare {kind} @{own}({takes}) nounwind memory(none)"
         operands = [self.of(v, shared) for v in values]
@@ -289,8 +266,8 @@ class Code:
             return self._load_each(pointer, index, np.dtype(dtype))
         stored = "i8" if kind == "i1" else kind
         place = f"{type_of(index.dtype)} {index.operand}"
-        self.write(f"{at} = getelementptr {stored}, {self.memory} {pointer}, {place}")
-        right = f"load {stored}, {self.memory} {at}{self.unchanging}"
+        self.write(f"{at} = getelementptr {stored}, ptr {pointer}, {place}")
+        right = f"load {stored}, ptr {at}"
         value = self.made(right, np.dtype(dtype), index.shared)
         if kind != "i1":
             return value
@@ -314,9 +291,7 @@ class Code:
         if kind == "i1":
             kind, values = "i8", values.astype(np.uint8)
         each = ", ".join(f"{kind} {constant(v, values.dtype).operand}" for v in values.ravel())
-        text = (
-            f"private unnamed_addr{self.target.memory} constant [{values.size} x {kind}] [{each}]"
-        )
+        text = f"private unnamed_addr constant [{values.size} x {kind}] [{each}]"
         name = next((n for n, t in self.globals.items() if t == text), None)
         if name is None:
             name = f"@table{len(self.globals)}"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.fused.code import Target, UnsupportedError
+from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.program import Argument, Run, whole, write
 
 
@@ -43,7 +43,7 @@ class Kernel:
             UnsupportedError: an operation that has no translation.
         """
         self._run, self.lanes = run, lanes
-        self.assembly, self._results = write(run, Target(lanes))
+        self.assembly, self._results = write(run, lanes)
         self._engine = _compiled(self.assembly)
         pointer, size = ctypes.c_void_p, ctypes.c_int64
         kind = ctypes.CFUNCTYPE(None, *([pointer] * 4), size, size, size)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heli_jax.fused.code import Code, Target, UnsupportedError, Value, constant, type_of
+from heli_jax.fused.code import Code, UnsupportedError, Value, constant, type_of
 from heli_jax.fused.loops import loop
 from heli_jax.fused.operands import INDEX, LONG, Elements, Operand, Stored, elements, flat
 from heli_jax.fused.translate import translate
@@ -53,24 +53,24 @@ class Text(NamedTuple):
     results: list[Argument]
 
 
-def write(run: Run, target: Target) -> Text:
+def write(run: Run, lanes: int) -> Text:
     """Write the program of a run.
 
     Args:
         run: what is computed.
-        target: for what.
+        lanes: vehicles in flight at once in one thread.
 
     Raises:
         UnsupportedError: an operation that has no translation.
     """
-    code = Code(target)
+    code = Code(lanes)
     stored = _stored(code, run.stored)
     rows, shared = _tables(code, "%stays", run.stays)
     starts, _ = _tables(code, "%carry", run.carry)
-    first, stride = _first_vehicle(code)
+    code.write("br label %vehicles")
     entry = code.block
     code.label("vehicles")
-    code.write(f"%b = phi i64 [ {first}, %{entry} ], [ %following, %done ]")
+    code.write(f"%b = phi i64 [ %begin, %{entry} ], [ %following, %done ]")
     stays = [_of_row(code, *v) if v[1] else shared[i] for i, v in enumerate(rows)]
     carry = [_of_row(code, *v) for v in starts]
     # How many there are is known: an index that cannot leave the record need not be clipped to it.
@@ -89,48 +89,21 @@ def write(run: Run, target: Target) -> Text:
         _store(code, value, code.pointer("%results", i))
     code.write("br label %done")
     code.label("done")
-    code.write(f"%following = add i64 %b, {stride}")
+    code.write(f"%following = add i64 %b, {lanes}")
     code.write("%more = icmp slt i64 %following, %end")
     code.write("br i1 %more, label %vehicles, label %out")
     code.label("out")
     code.write("ret void")
     head = [f"{name} = {text}" for name, text in code.globals.items()]
     head += code.declared.values()
-    tables = ", ".join(f"{code.memory} %{n}" for n in ("stays", "stored", "carry", "results"))
+    tables = ", ".join(f"ptr %{n}" for n in ("stays", "stored", "carry", "results"))
     arguments = f"{tables}, i64 %begin, i64 %end, i64 %count"
     body = "\n".join(code.lines)
     # Without the attributes LLVM would take half of AVX-512's width, and what does not stay in
     # registers would lie across lines of the cache: a quarter of the time of an exact step.
     attributes = 'alignstack(64) "prefer-vector-width"="512" "min-legal-vector-width"="512"'
-    convention, attributes = ("ptx_kernel ", "") if target.threads else ("", attributes)
-    function = (
-        f"define {convention}void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
-    )
-    return Text("\n".join([*head, function, "!0 = !{}", ""]), kinds)
-
-
-def _first_vehicle(code: Code) -> tuple[str, str]:
-    """The first vehicle that this thread computes, and how far on the next one is."""
-    if not code.target.threads:
-        code.write("br label %vehicles")
-        return "%begin", str(code.lanes)
-    read = {}
-    for name in ("tid", "ctaid", "ntid", "nctaid"):
-        function = f"@llvm.nvvm.read.ptx.sreg.{name}.x"
-        code.declared[function] = f"declare i32 {function}()"
-        narrow, read[name] = code.register(), code.register()
-        code.write(f"{narrow} = call i32 {function}()")
-        code.write(f"{read[name]} = zext i32 {narrow} to i64")
-    before, own, first, stride = (code.register() for _ in range(4))
-    code.write(f"{before} = mul i64 {read['ctaid']}, {read['ntid']}")
-    code.write(f"{own} = add i64 {before}, {read['tid']}")
-    code.write(f"{first} = add i64 %begin, {own}")
-    code.write(f"{stride} = mul i64 {read['nctaid']}, {read['ntid']}")
-    # More threads than vehicles: the last ones have none.
-    some = code.register()
-    code.write(f"{some} = icmp slt i64 {first}, %end")
-    code.write(f"br i1 {some}, label %vehicles, label %out")
-    return first, stride
+    function = f"define void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
+    return Text("\n".join([*head, function, ""]), kinds)
 
 
 def _single(value: Value) -> Elements:
@@ -215,8 +188,8 @@ def _vector(code: Code, pointer: str, first: str, dtype: np.dtype) -> Value:
     kind = type_of(dtype)
     kept, size = ("i8", 1) if kind == "i1" else (kind, dtype.itemsize)
     place = code.register()
-    code.write(f"{place} = getelementptr {kept}, {code.memory} {pointer}, i64 {first}")
-    right = f"load {code.vector(kept)}, {code.memory} {place}, align {size}{code.unchanging}"
+    code.write(f"{place} = getelementptr {kept}, ptr {pointer}, i64 {first}")
+    right = f"load {code.vector(kept)}, ptr {place}, align {size}"
     value = code.made(right, dtype, False)
     if kind != "i1":
         return value
@@ -232,6 +205,6 @@ def _store(code: Code, value: Value, row: str) -> None:
         operand = code.made(f"zext {vector} {operand} to {wide}", value.dtype, False).operand
         kind, vector = "i8", wide
     place = code.register()
-    code.write(f"{place} = getelementptr {kind}, {code.memory} {row}, i64 %b")
+    code.write(f"{place} = getelementptr {kind}, ptr {row}, i64 %b")
     size = 1 if kind == "i8" else value.dtype.itemsize
-    code.write(f"store {vector} {operand}, {code.memory} {place}, align {size}")
+    code.write(f"store {vector} {operand}, ptr {place}, align {size}")

@@ -89,9 +89,6 @@ def split_for(
 def _fused_or_xla(
     job: Job, devices: tuple[Any, ...], lanes: int, backend: str, say: Callable[[str], None]
 ) -> str:
-    # On a GPU it was never timed: there only who asks for it gets it.
-    if devices[0].platform != "cpu" and backend == "auto":
-        return "xla"
     # Here, since it loads another compiler.
     from heli_jax.sweeps.fused_program import refusal
 

@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax.fused.code import UnsupportedError, translating
-from heli_jax.fused.cuda_driver import CudaError, Gpu
-from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
-from heli_jax.fused.program import Run
 from heli_jax.fused.traced import Traced, traced
 from heli_jax.simulation.accumulate import Steps
 from heli_jax.sweeps.design_point import ElementResults, of_steps, steps_of
@@ -26,11 +22,8 @@ from heli_jax.sweeps.flight_numbers import (
 from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
 
-_NVIDIA = ("gpu", "cuda")
 _SOLVERS = ("exact", "rk4", "Euler")
 """those with a translation: the others of diffrax's are made with operations of their own"""
-_COMPARED = 32
-"""elements that a GPU and the processor both compute, before the GPU is believed"""
 
 # `Any` below: trees of arrays, jaxprs, the functions that JAX compiles and its devices.
 
@@ -38,7 +31,7 @@ _COMPARED = 32
 class _Parts(NamedTuple):
     """A plan's program for flights of one shape."""
 
-    kernel: Kernel | GpuKernel
+    kernel: Kernel
     run: Traced
     begin: Any
     """of (numbers, (values, trim)): what an element begins with, `Traced.own`"""
@@ -58,13 +51,10 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
         devices: of JAX, that would compute it.
         lanes: as a program takes it.
     """
-    on_gpu = devices[0].platform != "cpu"
-    if on_gpu and (devices[0].platform not in _NVIDIA or len(devices) > 1):
-        return "it is for CPUs, or for one GPU of NVIDIA's"
+    if devices[0].platform != "cpu":
+        return "it is for CPUs alone"
     if not job.streamed or not job.simulated:
         return "its runs are kept whole, or none is made"
-    if on_gpu and not _has_processor():
-        return "JAX_PLATFORMS leaves no processor to compare a GPU's numbers with"
     if job.solver not in _SOLVERS:
         return f"there is no translation of the solver {job.solver}"
     if importlib.util.find_spec("llvmlite") is None:
@@ -72,51 +62,10 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
     try:
         # What it compiles is remembered, for the sweep that follows.
         for index in range(len(job.flights)):
-            program = FusedProgram(job, index, devices, lanes)
-            if on_gpu and not _agrees(job, index, program):
-                return "the GPU gives other numbers than the processor"
+            FusedProgram(job, index, devices, lanes)
     except UnsupportedError as e:
         return f"there is no translation of {e}"
-    except CudaError as e:
-        return str(e)
     return None
-
-
-def _has_processor() -> bool:
-    try:
-        return len(jax.devices("cpu")) > 0
-    except RuntimeError:
-        return False
-
-
-def run_of(job: Job, index: int) -> Run:
-    """What the program of one of the job's flights is translated from.
-
-    Raises:
-        UnsupportedError: a part of it has no translation.
-    """
-    return _traced(*_example(job, index)).run
-
-
-def _agrees(job: Job, index: int, program: "FusedProgram") -> bool:
-    """Whether a GPU gives what the processor gives, for a few elements.
-
-    The driver compiles the program, and JAX knows nothing of it: a wrong number would be seen by
-    nobody.
-    """
-    count = min(_COMPARED, job.design.size)
-    values = arguments(job, job.design.values(0, count))
-    here = FusedProgram(job, index, jax.devices("cpu")[:1], count)
-    own, expected = (
-        [np.asarray(v)[:count] for v in jax.tree.leaves(p(values, count))] for p in (program, here)
-    )
-    tolerance = np.sqrt(np.finfo(job.precision).eps)
-    close = [
-        np.isclose(a, b, tolerance, tolerance * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)
-        for a, b in zip(own, expected, strict=True)
-    ]
-    # Of most: a run that leaves its steady flight by itself magnifies any rounding.
-    return all(np.mean(c) >= 0.5 for c in close)
 
 
 class FusedProgram:
@@ -125,7 +74,6 @@ class FusedProgram:
     def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         plan, numbers, values, trim = _example(job, index)
         self._numbers, self._threads = numbers, len(devices)
-        self._on_gpu = devices[0].platform != "cpu"
         leaves, structure = jax.tree.flatten((numbers, values, trim))
         kinds = tuple((np.shape(v), np.asarray(v).dtype) for v in leaves)
         self._parts = _compiled(plan, structure, kinds, tuple(devices), lanes)
@@ -140,28 +88,17 @@ class FusedProgram:
         mapped = jax.device_put((filled, trims), parts.split)
         carry, own = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        carry, own = _rows((carry, own)) if self._on_gpu else _rows_here((carry, own))
+        carry, own = _rows((carry, own))
         stays = parts.run.stays(own, parts.common(numbers, *first))
-        results = self._run(stays, jax.tree.leaves(_records(numbers)), carry)
+        stored = jax.tree.leaves(_records(numbers))
+        stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
+        results = parts.kernel(stays, stored, carry, self._threads)
         reduced = jax.tree.unflatten(parts.run.results, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
 
-    def _run(self, stays: Any, stored: Any, carry: Any) -> Any:
-        kernel = self._parts.kernel
-        if isinstance(kernel, GpuKernel):
-            return kernel(stays, stored, carry)
-        stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
-        return kernel(stays, stored, carry, self._threads)
 
-
-@jax.jit
 def _rows(tree: Any) -> Any:
-    """With the elements as the last dimension."""
-    return jax.tree.map(lambda v: jnp.moveaxis(v, 0, -1), tree)
-
-
-def _rows_here(tree: Any) -> Any:
-    """The same, where it takes no copy."""
+    """The same with the elements as the last dimension, where it takes no copy."""
     return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), tree)
 
 
@@ -244,8 +181,5 @@ def _compiled(
 
     before, split = spread(own, devices, lanes)
     conclude, _ = spread(functools.partial(of_steps, plan), devices, lanes)
-    if devices[0].platform == "cpu":
-        kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision), plan.solver == "exact"))
-    else:
-        kernel = GpuKernel(run.run, Gpu(devices[0].local_hardware_id), devices[0])
+    kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision), plan.solver == "exact"))
     return _Parts(kernel, run, before, common, conclude, split, trims_of(plan, lanes))

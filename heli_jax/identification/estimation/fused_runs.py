@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax.fused.code import UnsupportedError, translating
-from heli_jax.fused.cuda_driver import CudaError, Gpu
-from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.sensitivities import Products, Sensitive, full
 from heli_jax.fused.traced import Traced, traced
@@ -27,8 +25,6 @@ from heli_jax.numerics.cores import cores
 from heli_jax.simulation.accumulate import Steps, in_steps
 from heli_jax.simulation.options import SimulationOptions
 
-_COMPARED = 32
-"""runs that a GPU and the processor both compute, before the GPU is believed"""
 _MOST = 6000
 """operations of a sample, derivatives included: more would take longer to compile than to run"""
 
@@ -46,7 +42,7 @@ class Own(NamedTuple):
 class _Part(NamedTuple):
     """One flight's program."""
 
-    kernel: Kernel | GpuKernel
+    kernel: Kernel
     run: Traced
     begin: Any
     """of (what is shared, records, unknowns (b, q)): what a run begins with, `Traced.own`"""
@@ -59,9 +55,7 @@ class _Part(NamedTuple):
 class FusedRuns:
     """Residuals and Jacobians of a problem at many points, or of many records."""
 
-    def __init__(
-        self, layout: Layout, data: Data, noise: Noise, own: Own, device: Any = None
-    ) -> None:
+    def __init__(self, layout: Layout, data: Data, noise: Noise, own: Own) -> None:
         """Translate and compile, or take what was compiled for the same.
 
         Args:
@@ -69,11 +63,9 @@ class FusedRuns:
             data: the numbers of the problem.
             noise: of the measurements, by which the rows are divided.
             own: what of the records each run has of its own.
-            device: a GPU of NVIDIA's, as JAX has it; the processor unless given.
 
         Raises:
             UnsupportedError: this has no such program.
-            CudaError: the GPU's driver does not take it.
         """
         if reason := _refused(layout):
             raise UnsupportedError(reason)
@@ -82,11 +74,7 @@ class FusedRuns:
         self._own = own
         leaves, structure = jax.tree.flatten((data, noise.sd))
         kinds = tuple((np.shape(v), np.asarray(v).dtype) for v in leaves)
-        self._parts = _compiled(layout, structure, kinds, own, device)
-        # The driver compiles a GPU's program, and JAX knows nothing of it: a wrong number would be
-        # seen by nobody.
-        on_gpu = device is not None and device.platform != "cpu"
-        self._unproved = FusedRuns(layout, data, noise, own) if on_gpu else None
+        self._parts = _compiled(layout, structure, kinds, own)
 
     def __call__(self, data: Data, z: Array) -> tuple[Array, Array]:
         """Rows (b, n) and Jacobians (b, n, q): of each run those of a triangle that stands for its
@@ -95,16 +83,8 @@ class FusedRuns:
         Args:
             data: the numbers of the problem; all of it has a leading axis (b,).
             z: the unknowns (b, q).
-
-        Raises:
-            CudaError: the GPU gives other numbers than the processor.
         """
-        sums = self._sums(data, np.asarray(z))
-        if self._unproved is not None:
-            few = jax.tree.map(lambda v: v[:_COMPARED], (data, z))
-            _compare(sums[:_COMPARED], self._unproved._sums(few[0], np.asarray(few[1])))
-            self._unproved = None
-        triangle = _triangles(sums)
+        triangle = _triangles(self._sums(data, np.asarray(z)))
         r, J = _priors(self._layout, data, z)
         rows = jnp.concatenate([jnp.asarray(triangle[:, :, 0], z.dtype), r], axis=1)
         return rows, jnp.concatenate([jnp.asarray(triangle[:, :, 1:], z.dtype), J], axis=1)
@@ -138,11 +118,7 @@ class FusedRuns:
         carry, own = ([np.moveaxis(np.asarray(v), 0, -1) for v in p] for p in (carry, own))
         stays = part.run.stays(own, common)
         stored = [np.asarray(v) for v in jax.tree.leaves(records)]
-        if not isinstance(part.kernel, Kernel):
-            arguments = [[jnp.asarray(v) for v in of] for of in (stays, stored, carry)]
-            (triangle,) = part.kernel(*arguments)
-        else:
-            (triangle,) = part.kernel([np.asarray(v) for v in stays], stored, carry, cores())
+        (triangle,) = part.kernel([np.asarray(v) for v in stays], stored, carry, cores())
         return full(np.asarray(triangle))
 
 
@@ -271,12 +247,11 @@ def _compiled(
     structure: Any,
     kinds: tuple[tuple[tuple[int, ...], np.dtype], ...],
     own: Own,
-    device: Any,
 ) -> tuple[_Part, ...]:
     data, sd = jax.tree.unflatten(structure, [np.zeros(*kind) for kind in kinds])
     samples = tuple(next(iter(f.outputs.values())).shape[0] for f in data.flights)
     return tuple(
-        _part(layout, i, (_bare(data), sd), data.flights[i], samples, own, device)
+        _part(layout, i, (_bare(data), sd), data.flights[i], samples, own)
         for i in range(len(data.flights))
     )
 
@@ -288,7 +263,6 @@ def _part(
     flight: FlightData,
     samples: tuple[int, ...],
     own: Own,
-    device: Any,
 ) -> _Part:
     records = flight.inputs, flight.outputs
     each = [o for o, of in zip(own, records, strict=True) for _ in jax.tree.leaves(of)]
@@ -298,12 +272,8 @@ def _part(
         raise UnsupportedError(f"a sample of {size} operations, more than {_MOST}")
     columns = _columns(layout, i)
     places = np.array([0, *(1 + j for part in columns for j in part)])
-    if device is None or device.platform == "cpu":
-        kernel = Kernel(run.run, lanes_for(np.dtype(np.float64)))
-    else:
-        kernel = GpuKernel(run.run, Gpu(device.local_hardware_id), device)
     return _Part(
-        kernel,
+        Kernel(run.run, lanes_for(np.dtype(np.float64))),
         run,
         jax.jit(jax.vmap(run.own, in_axes=(None, None, 0))),
         jax.jit(run.common),
@@ -319,15 +289,6 @@ def _size(jaxpr: Any) -> int:
         passes = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
         total += max(1, passes * sum(_size(getattr(v, "jaxpr", v)) for v in inner))
     return total
-
-
-def _compare(computed: np.ndarray, expected: np.ndarray) -> None:
-    size = np.sqrt(np.abs(np.diagonal(expected, axis1=1, axis2=2)))
-    near = np.abs(computed - expected) <= 1e-6 * size[:, :, None] * size[:, None, :]
-    alike = (near | (np.isnan(computed) & np.isnan(expected))).all(axis=(1, 2))
-    # Of most: a run that leaves its steady flight by itself magnifies any rounding.
-    if np.mean(alike) < 0.5:
-        raise CudaError("the GPU gives other numbers than the processor")
 
 
 def _triangles(sums: np.ndarray) -> np.ndarray:

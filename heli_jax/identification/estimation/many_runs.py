@@ -51,7 +51,6 @@ def optimise_many(
     *,
     hold: int | None = None,
     batch: int = 8,
-    device: Any = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Optimum:
     """Optima (k, ...) for many starts or records near an optimum.
@@ -63,17 +62,11 @@ def optimise_many(
         each: what differs between the runs, a pytree of arrays (k, ...).
         hold: the unknown that stays at its start, by its number.
         batch: runs side by side, by vmap.
-        device: a GPU of NVIDIA's, as JAX has it, for runs that are programs of machine code; the
-            processor unless given.
         say: called with a sentence where many runs are no programs of machine code.
-
-    Raises:
-        ValueError: the runs cannot be programs of a GPU, though one was given.
     """
     layout, noise = reached.layout, reached.noise
     units = _units_at(reached)
-    many = starts.shape[0] >= _MANY or device is not None
-    fused = _fused(reached, data, each, device, say) if many else None
+    fused = _fused(reached, data, each, say) if starts.shape[0] >= _MANY else None
     if fused is not None:
         batch = _SIDE_BY_SIDE
     if hold is not None:
@@ -99,30 +92,10 @@ def optimise_many(
     return jax.tree.map(lambda *v: np.concatenate(v), *optima)
 
 
-def check_device(device: Any) -> None:
-    """Refuse what `optimise_many` cannot take as a device, before anything is computed.
-
-    Raises:
-        TypeError: no device of JAX.
-        ValueError: one that is neither a processor nor a GPU of NVIDIA's.
-    """
-    if device is None:
-        return
-    if not (hasattr(device, "platform") and hasattr(device, "local_hardware_id")):
-        raise TypeError(
-            f"device: expected a device of JAX, such as jax.devices('gpu')[0], got {device!r}"
-        )
-    if device.platform not in ("cpu", "gpu", "cuda"):
-        raise ValueError(
-            f"device: expected a GPU of NVIDIA's or a processor, got {device.platform}"
-        )
-
-
 def _fused(
     reached: Solution,
     data: Callable[[Any], Data],
     each: Any,
-    device: Any,
     say: Callable[[str], None],
 ) -> FusedRuns | None:
     """The runs as programs of machine code; None where they cannot be."""
@@ -135,10 +108,8 @@ def _fused(
         any(made.outputs is not given.outputs for made, given in flights),
     )
     try:
-        return FusedRuns(layout, numbers, noise, own, device)
+        return FusedRuns(layout, numbers, noise, own)
     except UnsupportedError as e:
-        if device is not None:
-            raise ValueError(f"device: these runs are no program for a GPU: {e}") from e
         say(
             "each record is fitted by XLA step by step, not by one program of machine code: "
             f"there is no translation of {e}"

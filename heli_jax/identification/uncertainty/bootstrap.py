@@ -1,13 +1,13 @@
 """Bootstrap: records about the estimated machine's response are identified again, many times."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.identification.estimation.many_runs import check_device, optimise_many
+from heli_jax.identification.estimation.many_runs import optimise_many
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.uncertainty.spectrum_bootstrap import refits
@@ -35,7 +35,7 @@ class Bootstrap(NamedTuple):
         return float(low), float(high)
 
 
-def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -> Bootstrap:
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
@@ -46,15 +46,11 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
         fit: with the estimates, and the optimum that all refits begin from.
         runs: how many records.
         seed: of noise and disturbance.
-        device: a GPU of NVIDIA's, as `jax.devices()` has it, that computes the refits of output
-            error; the processor unless given, and where it is one of JAX's CPU devices.
 
     Raises:
-        TypeError: a device that is none of JAX's.
-        ValueError: no run; the fit has no program for a GPU, though one was given; the time shift
-            is free in a fit in time, or the data do not determine every parameter.
+        ValueError: no run; the time shift is free in a fit in time, or the data do not determine
+            every parameter.
     """
-    check_device(device)
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
     at = fit.reached
@@ -66,19 +62,13 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -
     rng = np.random.default_rng(seed)
     notes: list[str] = []
     if in_frequency:
-        if device is not None and device.platform != "cpu":
-            raise ValueError(
-                f"device: refits by method {fit.method} are no program for a GPU, expected none"
-            )
         optima = refits(at, _prior_means(fit, at, runs, rng), rng)
     else:
         outputs = _records(fit, at, runs, seed, rng)
         # Every refit from the optimum, which is where the record was simulated.
         starts = jnp.tile(at.z[None, :], (runs, 1))
         each = (outputs, jnp.asarray(_prior_means(fit, at, runs, rng), at.z.dtype))
-        optima = optimise_many(
-            at, _data_of(at), starts, each, batch=_BATCH, device=device, say=notes.append
-        )
+        optima = optimise_many(at, _data_of(at), starts, each, batch=_BATCH, say=notes.append)
     converged = np.asarray(optima.converged)
     # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
     # than they are uncertain.

@@ -9,7 +9,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.many_runs import check_device, optimise_many
+from heli_jax.identification.estimation.many_runs import optimise_many
 from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Data, value_of
@@ -33,7 +33,7 @@ class Refits(NamedTuple):
     """why many records were not fitted by programs of machine code, where they were not"""
 
 
-def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any = None) -> Refits:
+def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
     """Estimate the parameters of a fit anew from other records, side by side.
 
     Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
@@ -44,15 +44,12 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any
     Args:
         fit: with output error or filter error.
         records: each a Flight, or as many as the fit has.
-        device: a GPU of NVIDIA's, as `jax.devices()` has it, for output error; the processor unless
-            given, and where it is one of JAX's CPU devices.
 
     Raises:
-        TypeError: a device that is none of JAX's, or a record that is no flights.
+        TypeError: a record that is no flights.
         ValueError: a record is not like that of the fit, with what differs; a method that estimates
-            the noise's spectrum; no program for a GPU, though one was given.
+            the noise's spectrum.
     """
-    check_device(device)
     at = fit.reached
     if at.layout.estimator.noise_spectrum:
         raise ValueError(f"refit: not available with method {fit.method}")
@@ -84,7 +81,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any
 
     starts = jnp.tile(at.z[None, :], (len(flights), 1))
     notes: list[str] = []
-    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device, say=notes.append)
+    optima = optimise_many(at, data, starts, each, batch=_BATCH, say=notes.append)
     enough = np.array([_enough(record) for record in flights])
     converged = np.asarray(optima.converged) & enough
     z = jnp.asarray(optima.z)
