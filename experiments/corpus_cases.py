@@ -83,8 +83,9 @@ def fit_config(config: Path, *more: str) -> Result:
     ended, names = command("fit", config, "--out", "fit", *more), names_of(config)
     if not Path("fit/fit.json").exists():
         return refused(ended, names)
-    result = of_fit(json.loads(Path("fit/fit.json").read_text()), ended.code)
-    said = {f"log {code_of(n, names)}" for n in ended.notes}
+    content = json.loads(Path("fit/fit.json").read_text())
+    result = of_fit(content, ended.code)
+    said = {f"log {n['code']}" for source in content["data"] for n in source.get("notes", ())}
     result["codes"]["note"] = sorted({*result["codes"].get("note", ()), *said})
     return result
 
@@ -104,7 +105,7 @@ def check_config(config: Path, *more: str) -> Result:
     by = {s: [code_of(f, names) for f in findings if f["severity"] == s] for s in SEVERITIES}
     exits = [] if content["identifiable"] else ["exit not-identifiable"]
     notes = [f["code"] for f in content["notes"]]
-    notes += [f"log {code_of(n, names)}" for n in content["log_notes"]]
+    notes += [f"log {f['code']}" for f in content["log_notes"]]
     return {
         "exit": ended.code,
         "codes": coded([*exits, *by["refuse"]], by["doubt"], [*by["note"], *notes]),

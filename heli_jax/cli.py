@@ -296,15 +296,10 @@ def _check(options: argparse.Namespace) -> int:
     from heli_jax import output, workflow
     from heli_jax.report import files
 
-    notes: list[str] = []
-
-    def said(note: str) -> None:
-        notes.append(note)
-        options.say(note)
-
-    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=said)
+    config = workflow.load_config(options.config, options.set)
+    check = workflow.run_check(config, progress=options.say)
     if options.json:
-        print(files.as_json(files.check_json(check, notes)))
+        print(files.as_json(files.check_json(check)))
     else:
         output.print_check(check)
     hopeless = any(f.severity == "refuse" for f in check.findings)
@@ -367,8 +362,8 @@ def _simulate(options: argparse.Namespace) -> int:
         simulated = generate.generate(experiment)
     else:
         simulated = generate.follow(experiment)
-    for note in simulated.notes:
-        options.say(Note(f"{options.config}: {note}"))
+    for found in simulated.notes:
+        options.say(Note(found.of(options.config).sentence))
     simulation_output.write_table(out, simulated.columns)
     if out is not None:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
@@ -450,8 +445,8 @@ def _convert(options: argparse.Namespace) -> int:
     converted = convert.convert_log(options.log, selection)
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)
-    for note in converted.notes:
-        options.say(Note(f"{options.log}: {note}"))
+    for found in converted.notes:
+        options.say(Note(found.of(options.log).sentence))
     columns = converted.columns
     count = len(columns) - 1
     of = "1 signal" if count == 1 else f"{count} signals"

@@ -18,7 +18,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
-from heli_jax.finding import sentences
+from heli_jax.finding import Finding, once
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import FAR
 from heli_jax.numbers import with_sd
@@ -74,7 +74,7 @@ class Compatibility:
     """by output, of what the corrected rates and specific forces reconstruct"""
     compatible: bool
     verdict: str
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     """sentences on what speaks against the estimates"""
     corrections: dict[str, Any]
     """what `compatibility.yaml` holds"""
@@ -110,7 +110,8 @@ def run_compatibility(
     run = workflow.run_fit(experiment, progress=progress)
     compatibility = judged(run)
     if _without_noise(run):
-        reason = _SMOOTH if _smooth(run) else _BEYOND_NOISE
+        words = _SMOOTH if _smooth(run) else _BEYOND_NOISE
+        reason = Finding("sensors.noise-not-told", "doubt", words)
         progress("filter error has no end: once more by output error")
         compatibility = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
         compatibility = dataclasses.replace(compatibility, doubts=(reason, *compatibility.doubts))
@@ -130,8 +131,8 @@ def run_compatibility(
 def _agreement(compatibility: Compatibility) -> SensorAgreement:
     """What the page says before it shows the fit, whose own first line knows nothing of sensors."""
     head, rows = table(compatibility)
-    # The fit's notes stand on its page already.
-    doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.notes)
+    # The fit's findings stand on its page already.
+    doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.findings)
     return SensorAgreement(
         compatibility.compatible, compatibility.verdict, doubts, head, tuple(rows)
     )
@@ -276,24 +277,27 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
     return f" Of {', '.join(e.name for e in untold)} these channels do not tell."
 
 
-def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
+def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
     """What a fit says of itself, and errors that no sensor has."""
     # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
-    notes = tuple(sentences(f for f in run.fit.findings if f not in run.fit.adequacy.findings))
+    notes = once(f for f in run.fit.findings if f not in run.fit.adequacy.findings)
     scales = [
         e
         for e in errors
         if e.shows and e.name.startswith("lambda_") and abs(e.estimate.value) > _LARGEST_SCALE
     ]
     if not scales:
-        return notes
-    words = ", ".join(f"{e.name} {100 * e.estimate.value:+.0f} %" for e in scales)
-    return (
-        f"{words}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
+        return tuple(notes)
+    each = ", ".join(f"{e.name} {100 * e.estimate.value:+.0f} %" for e in scales)
+    words = (
+        f"{each}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
         "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
-        "the log's signals together; which of them is wrong they do not say.",
-        *notes,
+        "the log's signals together; which of them is wrong they do not say."
     )
+    largest = max((e.estimate.value for e in scales), key=abs)
+    criterion = f"scale error, {_LARGEST_SCALE:g}"
+    names = tuple(e.name for e in scales)
+    return (Finding("sensors.scale-too-large", "doubt", words, largest, criterion, names), *notes)
 
 
 def _corrections(

@@ -18,11 +18,13 @@ class InputError(ValueError):
     """A file or a configuration is wrong.
 
     Its text is one whole sentence that names the file, the place, what was expected and what was
-    got. The command line prints it and ends with exit code 2.
+    got. The command line prints it and ends with exit code 2. `within` is the same without the
+    file, for who has named it already.
     """
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, within: str = "") -> None:
         super().__init__(shortened(text))
+        self.within = shortened(within or text)
 
 
 class VehicleError(ValueError):
@@ -40,8 +42,9 @@ class VehicleError(ValueError):
         return f"vehicle: {self.problem}"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
+def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> str:
+    """`"; did you mean 'x'?"` for the known name closest to `name`; where none is close
+    `otherwise`, or the first of what is known."""
     # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is
     # half.
     known = sorted(known)
@@ -54,6 +57,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
         close = [lower[c] for c in difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)]
     if close:
         return f"; did you mean {close[0]!r}?"
+    if otherwise is not None:
+        return otherwise
     # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""

@@ -16,8 +16,8 @@ def new(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
     chosen = (options.model, options.vehicle, options.flight, options.time_rate)
     written = write_config(log, out, *chosen)
-    for note in written.notes:
-        say(note)
+    for found in written.notes:
+        say(found.sentence)
     return 0
 
 

@@ -14,6 +14,8 @@ this record says nothing of what is asked"""
 
 UNIT_IN_DOUBT = "units.in-doubt"
 """code of a signal that may be in another unit than it is read in"""
+LEFT_OUT = "channels.left-out"
+"""code of what of a log is not read"""
 _HALF_INTERVAL = 1.96
 """standard deviations from an estimate to the end of its 95 % interval; a misfit that moves it
 further leaves an interval without the truth in it"""
@@ -40,6 +42,10 @@ class Finding(NamedTuple):
     distrusts: tuple[str, ...] = ()
     """parameters whose intervals it makes unusable by an amount that is not known"""
 
+    def of(self, whose: str) -> "Finding":
+        """The same, whose sentence says first of which log, flight or signal it is."""
+        return self._replace(sentence=f"{whose}: {self.sentence}")
+
     @property
     def topic(self) -> str:
         """What was found, as a heading: the part of the code after the dot."""
@@ -62,14 +68,27 @@ class Distrust(NamedTuple):
     brief: str
 
 
-def note(code: str, sentence: str, *subjects: str) -> Finding:
+def note(code: str, sentence: str, *subjects: str, value: float | None = None) -> Finding:
     """A finding for information alone."""
-    return Finding(code, "note", sentence, subjects=subjects)
+    return Finding(code, "note", sentence, value, subjects=subjects)
+
+
+def as_data(finding: Finding) -> dict[str, Any]:
+    """A finding as plain data."""
+    return {**finding._asdict(), "shifts": dict(finding.shifts)}
+
+
+def once(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings, each sentence once."""
+    by_sentence: dict[str, Finding] = {}
+    for finding in findings:
+        by_sentence.setdefault(finding.sentence, finding)
+    return list(by_sentence.values())
 
 
 def sentences(findings: Iterable[Finding]) -> list[str]:
     """The sentences of findings, each once."""
-    return list(dict.fromkeys(f.sentence for f in findings))
+    return [f.sentence for f in once(findings)]
 
 
 def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dict[str, Distrust]:

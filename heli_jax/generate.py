@@ -21,6 +21,7 @@ from heli_jax.config import (
 from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import decide
 from heli_jax.naming import Record
@@ -43,8 +44,8 @@ class Simulated(NamedTuple):
     """what was simulated, with wind where there is some, and without the disturbance"""
     runs: dict[str, Trajectory]
     """the runs by name, without noise, in SI, as NumPy arrays"""
-    notes: tuple[str, ...]
-    """what is to be said of them, a sentence each"""
+    notes: tuple[Finding, ...]
+    """what is to be said of them"""
 
     @property
     def whole(self) -> bool:
@@ -274,30 +275,33 @@ def _diverged_at(run: Trajectory) -> float:
     return float(run.times[np.argmin(good)])
 
 
-def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
+def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
     """What is to be said of a run: its end, and where it left the range of model and sticks."""
     notes = []
     if np.isfinite(run.ended):
         settings = experiment.config.simulate
         assert settings is not None
-        notes.append(
-            f"the machine comes down to {settings.ground:g} m at {float(run.ended):.4g} s: nothing "
+        ended = float(run.ended)
+        words = (
+            f"the machine comes down to {settings.ground:g} m at {ended:.4g} s: nothing "
             "is written after that"
         )
+        notes.append(note("simulation.ends-on-ground", words, value=ended))
     # After an event the state stands still; what it does there says nothing of the flight.
     flown = np.asarray(run.times <= float(run.ended))
     for name, out in run.outside.items():
         left = np.asarray(out) & flown
         if left.any():
             share = left.sum() / flown.sum()
-            notes.append(
+            words = (
                 f"the run leaves the model's range at {run.times[np.argmax(left)]:g} s: {name} "
                 f"({100 * share:.2g} % of the samples)"
             )
+            notes.append(note("simulation.outside-model", words, name, value=float(share)))
     return (*notes, *_stick_notes(experiment, run, flown))
 
 
-def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[str]:
+def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[Finding]:
     """Where sticks are past their ends, in the samples that are `flown`."""
     # Other models' inputs are lengths or anyone's own, without known ends.
     if not is_full_nonlinear(experiment.model):
@@ -310,11 +314,12 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
         beyond = (stick < low - _MIDDLE) | (stick > high + _MIDDLE)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
-            notes.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
+            words = f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s"
+            notes.append(note("simulation.stick-beyond-ends", words, name, value=float(first)))
     return notes
 
 
-def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[str]:
+def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[Finding]:
     """Sticks are held here whatever they do; what to say where a reader of the log would not know.
 
     A chirp and a pilot's feedback move at every sample, as sampled sticks do.
@@ -326,10 +331,11 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[s
     moving = [n for n in auto if decide(logged[n]).hold != "zero-order"]
     if not moving:
         return []
-    return [
+    words = (
         f"{', '.join(moving)}: held between samples here, but moving at nearly every one; to fit "
         "this log say hold: zero-order in flights[].signals.inputs (docs/inputs.md)"
-    ]
+    )
+    return [note("hold.moving-held", words, *moving)]
 
 
 def follow(experiment: Experiment) -> Simulated:
@@ -341,7 +347,7 @@ def follow(experiment: Experiment) -> Simulated:
     model = experiment.model
     parts: list[dict[str, Any]] = []
     runs: dict[str, Trajectory] = {}
-    notes: list[str] = []
+    notes: list[Finding] = []
     gain = experiment.config.fit is not None and experiment.config.fit.nuisance.input_gain
     for flight in read_flights(experiment, gain=gain):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
@@ -352,13 +358,13 @@ def follow(experiment: Experiment) -> Simulated:
         run = jax.device_get(run)._replace(times=flight.times)
         # Numbered, since two flights may have the same name.
         runs[f"{len(runs) + 1}: {flight.name}"] = run
-        notes += [f"{flight.name}: {note}" for note in _notes(experiment, run)]
+        notes += [n.of(flight.name) for n in _notes(experiment, run)]
         if not run.finite:
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             params = naming.replace(experiment.vehicle.params, **known)
             reason = "" if is_full_nonlinear(model) else cannot_start(model, params, first)
             reason = reason or f"the run is not finite from {_diverged_at(run):g} s on"
-            notes.append(f"{flight.name}: {reason}")
+            notes.append(Finding("simulation.diverged", "doubt", f"{flight.name}: {reason}"))
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     return Simulated(columns, model, runs, tuple(notes))
 

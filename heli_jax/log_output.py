@@ -15,6 +15,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from heli_jax.finding import as_data
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.rotor_lines import LEAST, RotorLines
@@ -82,7 +83,7 @@ def as_json(flights: Sequence[LogInfo]) -> str:
 def _flight_content(flight: LogInfo) -> dict[str, Any]:
     """Any: text, numbers, lists and records, as JSON has them."""
     whole = {"number": flight.flight[0], "of": flight.flight[1], "firmware": flight.firmware}
-    whole |= {"duration": flight.duration, "notes": flight.notes}
+    whole |= {"duration": flight.duration, "notes": [as_data(n) for n in flight.notes]}
     # A table of rows is shown as a log of one topic, so that a script needs to know one shape.
     topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
     whole["vibration"] = _vibration_content(flight.vibration)
@@ -115,7 +116,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) 
     # A table has one clock and no firmware, so most of the lines below would be empty.
     if not flight.topics:
         yield from _clock_lines(flight.time)
-        yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
+        yield from (f"! {n.sentence}" for n in flight.notes[:_MOST_LINES])
         yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern, width)
         return
     number, of = flight.flight
@@ -131,7 +132,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) 
     )
     yield f"duration: {length or f'{flight.duration:.6g} s'}"
     # What was lost or assumed stands before the numbers, which are read with that in mind.
-    yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
+    yield from (f"! {n.sentence}" for n in flight.notes[:_MOST_LINES])
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"

@@ -17,6 +17,7 @@ from heli_jax.config.frequency import asked_handling, check_pairs, missing_handl
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
@@ -55,9 +56,9 @@ def responses_of_log(
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
     asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
-    for note in (n for f in flights for n in (f.source.notes if f.source else ())):
+    for found in (n for f in flights for n in (f.source.notes if f.source else ())):
         if progress is not None:
-            progress(Note(note))
+            progress(Note(found.sentence))
     _require_samples(flights, experiment.path)
     try:
         estimate = flight_responses(flights, settings)
@@ -80,7 +81,7 @@ def responses_of_log(
     return estimate._replace(notes=(*estimate.notes, *notes))
 
 
-def _held_out(flights: Sequence[Flight]) -> tuple[str, ...]:
+def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
     """That flights which a fit holds out count here: its report shows other responses."""
     from heli_jax.identification.unknowns.nuisances import labels
 
@@ -88,13 +89,14 @@ def _held_out(flights: Sequence[Flight]) -> tuple[str, ...]:
     names = [label for label, flight in named if flight.hold_out]
     if not names:
         return ()
-    return (
+    words = (
         f"{', '.join(names)}: used here as the other flights are, hold_out: true or not; a fit, "
-        "and the responses in its report, leave held-out flights out",
+        "and the responses in its report, leave held-out flights out"
     )
+    return (note("responses.held-out-used", words, *names),)
 
 
-def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[str]:
+def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
     """What inputs were taken to do between samples where a log decided it, and what hangs on it.
 
     Args:
@@ -111,20 +113,24 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         elif holds[0] == "linear" and (reason := flights[0].hold_reason.get(name)):
             # The other way round nobody is misled: a stick that jumps is held. A low-passed one can
             # be no other than linear.
-            if is_low_passed(reason):
+            if is_low_passed(flights[0], name):
                 continue
             guessed[name] = reason
     notes = [
-        f"{', '.join(names)}: of the first flight {_HOLDS[first]} between samples, of others "
-        f"{_HOLDS[other]}; all are taken as the first: state signals.inputs.*.hold, or take "
-        "responses of like flights together"
+        note(
+            "hold.differs",
+            f"{', '.join(names)}: of the first flight {_HOLDS[first]} between samples, of others "
+            f"{_HOLDS[other]}; all are taken as the first: state signals.inputs.*.hold, or take "
+            "responses of like flights together",
+            *names,
+        )
         for (first, other), names in mixed.items()
     ]
     steps = [flights[0].logged_step(name, "input") for name in guessed]
     return [*notes, *_straight_lines(guessed, 500.0 * max(steps, default=0.0))]
 
 
-def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
+def _straight_lines(guessed: Mapping[str, str], half: float) -> list[Finding]:
     """In one sentence that inputs were taken to move in straight lines, which is a guess.
 
     Args:
@@ -143,16 +149,17 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[str]:
         else "as " + "; ".join(f"{n} {r}" for n, r in guessed.items())
     )
     whose = "NAME" if several else names[0]
-    return [
+    words = (
         f"{', '.join(names)}: {_HOLDS['linear']} between samples, {why}, which is a guess; if "
         f"{'one' if several else 'it'} is a command that is held from sample to sample, "
         f"{'its ' if several else ''}delays and phase delays are half a sample, "
         f"{'up to ' if several else ''}{half:.3g} ms, "
         f"shorter and bandwidths higher: state signals.inputs.{whose}.hold"
-    ]
+    )
+    return [note("hold.guessed", words, *names, value=1e-3 * half)]
 
 
-def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[str, ...]:
+def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:
     """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
     shows it."""
     # Not before it is needed: it brings what fits are judged by.
@@ -160,7 +167,7 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     from heli_jax.identification.validation.misread import degrees_for_radians
 
     return tuple(
-        doubt.sentence
+        doubt
         for label, flight in zip(labels(tuple(flights)), flights, strict=True)
         for doubt in degrees_for_radians(experiment.model, label, flight)
     )
@@ -218,18 +225,18 @@ def run_responses(
         units, png = units_of(experiment), experiment.config.report.png
         config = as_yaml(resolved(_of_log(experiment, log)))
         write_responses(temporary, written, units, title, handling, config=config, png=png)
-    for note in responses.notes:
-        say(Note(note))
+    for found in responses.notes:
+        say(Note(found.sentence))
     print_responses(responses)
     for line in handling_lines(handling):
         tell(plain_words(line))
-    for sentence in (*handling_sentences(handling), *gaps):
+    for sentence in (*handling_sentences(handling), *sentences(gaps)):
         tell(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
     return [transfer_status(fit) for _, fit in responses.fits]
 
 
-def not_usable(responses: FlightResponses) -> tuple[str, ...]:
+def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
     """That no response is coherent with its input, where none is.
 
     Args:
@@ -238,10 +245,11 @@ def not_usable(responses: FlightResponses) -> tuple[str, ...]:
     pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()
-    return (
+    words = (
         f"no response is usable: none has a coherence of {COHERENT:g} in the mean over an octave; "
-        "little was excited, or gusts and noise are larger than the response",
+        "little was excited, or gusts and noise are larger than the response"
     )
+    return (Finding("responses.not-usable", "doubt", words),)
 
 
 def print_responses(responses: FlightResponses) -> None:

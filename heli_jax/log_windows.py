@@ -59,9 +59,9 @@ def rank_log(
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
     for flight in problem.flights:
-        for note in flight.source.notes if flight.source else ():
+        for found in flight.source.notes if flight.source else ():
             if progress is not None:
-                progress(Note(note))
+                progress(Note(found.sentence))
     try:
         # Before the work, and not after it: with many windows that takes a while.
         seconds = window_samples(problem, length) * problem.training[0].dt

@@ -126,14 +126,14 @@ def _print_handling(run: FitRun) -> None:
         return
     # Whoever states a band or a window asks for them.
     if run.config.config.frequency is not None:
-        for note in run.supplementary.responses.notes:
-            if note.startswith(NO_RESPONSES):
-                tell(f"! {note}")
+        for found in run.supplementary.responses.notes:
+            if found.code == NO_RESPONSES:
+                tell(f"! {found.sentence}")
     for line in handling_lines(run.supplementary.responses.handling):
         tell(plain_words(line))
     logged = {n for f in run.problem.training for n in f.outputs}
-    for sentence in missing_handling(run.config, logged):
-        tell(f"! {sentence}")
+    for found in missing_handling(run.config, logged):
+        tell(f"! {found.sentence}")
 
 
 def run_compatibility(
@@ -155,8 +155,8 @@ def run_compatibility(
 
     result = compatibility.run_compatibility(config, out, overrides=overrides, progress=say)
     tell(result.verdict)
-    for line in result.doubts:
-        tell(f"! {line}")
+    for found in result.doubts:
+        tell(f"! {found.sentence}")
     head, rows = compatibility.table(result)
     print_table(head, [tuple(map(plain_cell, row)) for row in rows])
     tell(

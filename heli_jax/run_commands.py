@@ -88,8 +88,8 @@ def compare(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     print_table(numbered.estimates.head, list(numbered.estimates.rows))
     # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
     print_table(numbered.agreement.head, list(numbered.agreement.rows), keys=3)
-    for note in numbered.notes:
-        tell(f"! {note}")
+    for found in numbered.notes:
+        tell(f"! {found.sentence}")
     if place is None:
         return 0
     run_directory.require_place(place, f"--out {place}")

@@ -14,6 +14,7 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
+from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import terse
 from heli_jax.terminal_table import print_table, tell
@@ -62,8 +63,9 @@ def write_view(
     # From the page's folder on, so that both can be moved together.
     beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
     made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
+    notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes, made)
+        write(temporary, simulated.runs, simulated.model, params, title, notes, made)
 
 
 @contextlib.contextmanager
@@ -170,8 +172,8 @@ def print_sweep(out: Path) -> None:
             unit = totals["results"].get(name, {}).get("unit", "")
             value = f"{terse(element['value'])} {unit if unit != '1' else ''}".rstrip()
             tell(f"{words} {name}: {value}, element {element['element']}, {at}")
-    for note in totals["notes"]:
-        tell(f"! {note}")
+    for found in totals["notes"]:
+        tell(f"! {found['sentence']}")
     for name, result in totals["results"].items():
         # Quantiles are of the finite values alone: how many were not is part of the answer.
         apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}

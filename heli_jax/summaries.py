@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.finding import sentences
 from heli_jax.numbers import NOTHING, measured, number, percent, vaf_percent
 
 type Row = tuple[str, ...]
@@ -67,7 +68,7 @@ def of_flight(flight: Any) -> Summary:
         f"{flight.duration:.6g} s{used}",
         ("", "signal", "lowest", "highest", "hold"),
         tuple(rows),
-        (*known, *(flight.source.notes if flight.source else ())),
+        (*known, *(sentences(flight.source.notes) if flight.source else ())),
     )
 
 

@@ -8,6 +8,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.config import Experiment
 from heli_jax.errors import InputError
+from heli_jax.finding import note
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def run_sweep(
     notes = []
     # Not refused: a fit's configuration has its disturbance, and a sweep over Ixx may do without.
     if config.config.disturbance is not None and "seed" not in job.design.names:
-        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
+        words = "disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}"
+        notes.append(note("sweep.nothing-drawn", words))
     out = None if out is None else Path(out)
     # What is given here goes before what the configuration says.
     carrying = Options(

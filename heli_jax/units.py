@@ -141,10 +141,9 @@ def _unknown(unit: str, text: str) -> str:
         place = f" in {unit[:60]!r}"
     # Case first: `hz` is nearer to Hz than to h.
     alike = [n for n in _EXAMPLES if n.lower() == wrong.lower()]
-    near = nearest(wrong, alike or _EXAMPLES)
-    # `nearest` cuts a long list off; units are few enough to be all of use.
-    if not near.startswith("; did you mean"):
-        near = f"; known are {', '.join(_EXAMPLES)} and their products, as N m/A"
+    # Units are few enough to be all of use.
+    every = f"; known are {', '.join(_EXAMPLES)} and their products, as N m/A"
+    near = nearest(wrong, alike or _EXAMPLES, every)
     return f"unknown unit {(wrong if place else unit[:60])!r}{place}{near}"
 
 

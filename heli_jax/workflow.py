@@ -19,7 +19,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, require_kind
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
 from heli_jax.identification.likelier_hold import with_likelier_hold
@@ -176,7 +176,7 @@ def _fit_run(
         problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for said in reading_notes(problem):
-        progress(said)
+        progress(Note(said.sentence))
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
     try:
@@ -274,38 +274,43 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     """
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
-    for said in reading_notes(problem):
-        progress(said)
+    notes = reading_notes(problem)
+    for said in notes:
+        progress(Note(said.sentence))
     try:
         with stage("what the log can determine"):
-            return check(problem)
+            return replace(check(problem), log_notes=tuple(notes))
     except ValueError as e:
         raise InputError(f"{config.path}: fit: {e}") from e
 
 
-def reading_notes(problem: Problem) -> list[str]:
-    """What the reader of each log assumed or did, a sentence each that begins with the log; and
-    where the starts come from, if they were found."""
+def reading_notes(problem: Problem) -> list[Finding]:
+    """What the reader of each log assumed or did; and where the starts come from, if they were
+    found."""
     guess = problem.first_guess
-    return [
-        Note(n) for n in dict.fromkeys((*log_notes(problem), *(guess.sentences if guess else ())))
-    ]
+    begun = guess.sentences if guess else ()
+    return once((*log_notes(problem), *(note("search.first-guess", words) for words in begun)))
 
 
-def log_notes(problem: Problem) -> list[str]:
-    """What the reader of each log assumed or did, a sentence each that begins with the log."""
+def log_notes(problem: Problem) -> list[Finding]:
+    """What the reader of each log assumed or did, in sentences that begin with the log."""
     notes = []
     for flight in problem.flights:
         where = flight.source.path if flight.source else flight.name
-        notes += [f"{where}: {note}" for note in (flight.source.notes if flight.source else ())]
+        notes += [n.of(where) for n in (flight.source.notes if flight.source else ())]
         notes += [
-            f"{where}: {name} is taken as {flight.hold[name]} between samples, since it {reason}"
+            note(
+                "hold.guessed",
+                f"{where}: {name} is taken as {flight.hold[name]} between samples, since it "
+                f"{reason}",
+                name,
+            )
             for name, reason in flight.hold_reason.items()
             # Held inputs are what a reader expects of a stick, and need no word.
             if flight.hold[name] != "zero-order"
         ]
     # Several flights may be windows of one log: what is the same for all of them is said once.
-    return list(dict.fromkeys(notes))
+    return once(notes)
 
 
 def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) -> Baseline | None:

@@ -71,8 +71,9 @@ def configured(folder, name="sensors.yaml", **more):
 
 
 def notes_of(flight):
+    """By code the signals and errors that the notes are about."""
     assert flight.source is not None
-    return flight.source.notes
+    return [(n.code, n.subjects) for n in flight.source.notes]
 
 
 @pytest.mark.slow
@@ -114,9 +115,7 @@ def test_errors_are_taken_off(folder, true):
     error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
     assert np.std(error) < 0.008
     assert np.isnan(flight.outputs["phi"][-1])
-    assert any(
-        note.startswith("p: corrected by scale +0.08, bias 1.5 deg/s") for note in notes_of(flight)
-    )
+    assert ("corrections.applied", ("p",)) in notes_of(flight)
 
 
 def test_a_model_of_the_machine_is_refused(folder, capsys):
@@ -140,7 +139,6 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         verdict=SimpleNamespace(resting=()),
         status=status,
         signals=[signals],
-        notes=("of the fit", "of a machine"),
         findings=(note("of.fit", "of the fit"), of_machine),
         adequacy=SimpleNamespace(
             findings=(of_machine,),
@@ -164,8 +162,9 @@ def test_a_fit_is_put_in_words(folder):
         "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more. Of b_r these "
         "channels do not tell."
     )
-    assert judged.doubts[0].startswith("lambda_p +23 %: more than a sensor's own error.")
-    assert judged.doubts[1:] == ("of the fit",)
+    (scale, of_fit) = judged.doubts
+    assert (scale.code, scale.value) == ("sensors.scale-too-large", 0.23)
+    assert of_fit.code == "of.fit"
     rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
     assert rows == [
         ("lambda_p", "0.2300 ± 0.0040", "yes"), ("b_p", "0.0010 ± 0.0020", "no"),
@@ -231,8 +230,8 @@ def test_a_lever_arm_goes_to_a_model_that_has_one(folder):
     [flight] = config.read_flights(experiment)
     assert flight.known == {}
     said = notes_of(flight)
-    assert "lever arm not used, model kinematics-attitude has none: x_imu 0.2 m" in said
-    assert "not corrected, since undetermined: b_r" in said
+    assert ("corrections.left-out", ("x_imu",)) in said
+    assert ("corrections.left-out", ("b_r",)) in said
 
 
 @pytest.mark.slow

@@ -60,8 +60,8 @@ def test_start_wind_pilot_and_ground(made):
         noise={"roll": {"sd": 2, "unit": "mrad"}},
     )
     # A trimmed descent at 1 m/s is at -1 m after one second; the row at that moment may be there.
-    assert len(found.notes) == 1
-    assert "comes down to -1 m at 1 s" in found.notes[0]
+    (ended,) = found.notes
+    assert (ended.code, ended.value) == ("simulation.ends-on-ground", pytest.approx(1.0, abs=1e-3))
     c = found.columns
     assert c["time"].size in (50, 51)
     assert set(c) >= {"x_throttle", "rotor_speed", "dz"}
@@ -83,10 +83,9 @@ def test_what_leaves_the_range_is_told(made):
         },
         disturbance={"axis": "roll", "sigma_w": 0.1, "tau_w": 1.0},
     )
-    notes = " / ".join(found.notes)
-    assert "leaves the model's range at" in notes
-    assert "nose up or down" in notes
-    assert "x_throttle is beyond its ends of 0 and 1" in notes
+    said = {(n.code, n.subjects) for n in found.notes}
+    assert "simulation.outside-model" in {code for code, _ in said}
+    assert ("simulation.stick-beyond-ends", ("x_throttle",)) in said
     assert np.ptp(found.columns["roll"]) > 1e-5
 
 

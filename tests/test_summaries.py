@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Prior, Problem, fit, load_vehicle, models, simulate
+from heli_jax.finding import note
 from heli_jax.flights.flight import Source
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.naming import replace
@@ -37,7 +38,7 @@ def flight(run):
         {"x_roll": np.asarray(run.inputs.x_roll)},
         {"roll": roll},
         name=SCRIPT,
-        source=Source("log.csv", "0", (f"a note {SCRIPT}",)),
+        source=Source("log.csv", "0", (note("a.note", f"a note {SCRIPT}"),)),
     )
 
 

@@ -22,7 +22,7 @@ fit:
 """
 
 
-def notes(folder, kind, hz, passed, step):
+def cautions(folder, kind, hz, passed, step):
     rng = np.random.default_rng(5)
     stick = 0.4 * np.sign(np.sin(2.1 * T)) * np.sin(0.31 * T)
     rate = lfilter([0.01], [1, -0.99], stick) + 0.05 * rng.standard_normal(T.size)
@@ -38,19 +38,18 @@ def notes(folder, kind, hz, passed, step):
     path = folder / "flight.yaml"
     path.write_text(CONFIG.replace("KIND", kind).replace("HZ", str(hz)))
     (flight,) = read_flights(load_config(path))
-    said = (*flight.source.notes, *flight.source.cautions)
-    return [note for note in said if "was it logged before the filter" in note]
+    return [c for c in flight.source.cautions if c.code == "filters.not-passed"]
 
 
 @pytest.mark.parametrize(("kind", "hz"), [("biquad", 20), ("pt1", 8)])
 @pytest.mark.parametrize("step", [0.0, 0.0175])
 def test_noise_above_a_stated_low_pass_is_told(tmp_path, kind, hz, step):
-    (note,) = notes(tmp_path, kind, hz, passed=False, step=step)
-    assert note.startswith("p: its noise at ")
-    assert f"low-pass of {hz} Hz" in note
-    assert not notes(tmp_path, kind, hz, passed=True, step=step)
+    (caution,) = cautions(tmp_path, kind, hz, passed=False, step=step)
+    assert caution.subjects == ("p",)
+    assert caution.value > 0.6
+    assert not cautions(tmp_path, kind, hz, passed=True, step=step)
 
 
 def test_a_low_pass_that_leaves_the_noise_is_not_doubted(tmp_path):
     # Logged at 100 Hz, noise behind 30 Hz folds, and is nearly white with the filter and without.
-    assert not notes(tmp_path, "biquad", 30, passed=False, step=0.0)
+    assert not cautions(tmp_path, "biquad", 30, passed=False, step=0.0)

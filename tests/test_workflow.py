@@ -171,10 +171,8 @@ def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
     assert "bench.csv: x_roll: no unit stated, taken as m\n" in printed
     assert "bench.csv: roll: no unit stated, taken as rad\n" in printed
     saved = heli_jax.load_fit(tmp_path / "fit")
-    assert saved.content["data"][0]["notes"] == [
-        "x_roll: no unit stated, taken as m",
-        "roll: no unit stated, taken as rad",
-    ]
+    notes = [(n["code"], n["subjects"]) for n in saved.content["data"][0]["notes"]]
+    assert notes == [("units.assumed", ["x_roll"]), ("units.assumed", ["roll"])]
     page = (tmp_path / "fit/report.html").read_text()
     assert "x_roll: no unit stated, taken as m" in page
     with_units = heli_jax.run_fit(config)

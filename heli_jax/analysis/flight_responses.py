@@ -19,6 +19,7 @@ from heli_jax.analysis.spectral import (
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.analysis.window_ends import without_ends
 from heli_jax.analysis.window_resolution import Windows, window_error
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
@@ -106,7 +107,7 @@ class FlightResponses(NamedTuple):
     """in the order in which they were asked for; in words why there is none"""
     holds: dict[str, Hold]
     """by input what it does between samples"""
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def flight_responses(flights: Sequence[Flight], settings: Settings = Settings()) -> FlightResponses:
@@ -140,16 +141,16 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     own = own_instruments(flights, instruments)
     instruments = tuple(n for n in instruments if n not in own)
     notes = _notes(flights, inputs, instruments)
-    notes += [
-        f"{n} was logged at {1.0 / step[n]:.3g} Hz: no response to it above {0.5 / step[n]:.3g} Hz"
-        for n in inputs
-        if omega[-1] * step[n] >= np.pi
-    ]
-    notes += [f"{own_said(own)}; it is not used"] if own else []
+    for n in (n for n in inputs if omega[-1] * step[n] >= np.pi):
+        rate, half = 1.0 / step[n], 0.5 / step[n]
+        words = f"{n} was logged at {rate:.3g} Hz: no response to it above {half:.3g} Hz"
+        notes.append(note("responses.logged-slowly", words, n, value=rate))
+    if own:
+        notes.append(note("loop.instrument-unused", f"{own_said(own)}; it is not used", *own))
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)
-    without: list[str] = []
+    without: list[Finding] = []
     for group, parts in groups(flights, round(window / dt), without):
         records = records_of(flights, names, group, parts)
         made = _windows(records, omega, window, names)
@@ -157,10 +158,10 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
             outputs |= _outputs(made, dt, (names, group), np.array(list(step.values())))
         except TooFewAveragesError as e:
             # Outputs with fewer averages than inputs are no reason to keep back the others.
-            without.append(f"{', '.join(group)}: no response, {e}")
+            without.append(note("responses.none", f"{', '.join(group)}: no response, {e}", *group))
         windows |= dict.fromkeys(group, made)
     if not outputs:
-        raise ValueError("; ".join(without[:_MOST_SAID]))
+        raise ValueError("; ".join(sentences(without[:_MOST_SAID])))
     notes += without
     notes += _moving_as_one(flights, inputs, outputs)
     notes += _weak(omega, instruments, outputs)
@@ -221,23 +222,27 @@ def _frequencies(settings: Settings, window: float, dt: float, step: float) -> n
     return 2.0 * np.pi * np.geomspace(low, high, settings.points)
 
 
-def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) -> list[str]:
+def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) -> list[Finding]:
     still = [n for n in flights[0].inputs if n not in inputs]
-    notes = [f"{n} does not move: no response to it" for n in still]
+    notes = [note("responses.still", f"{n} does not move: no response to it", n) for n in still]
     outputs = dict.fromkeys(n for f in flights for n in f.outputs)
     resting = [
         n for n in outputs if not any(_moves(f.outputs[n]) for f in flights if n in f.outputs)
     ]
-    notes += [f"{n} does not move: no input is seen to move it" for n in resting]
+    notes += [
+        note("responses.still", f"{n} does not move: no input is seen to move it", n)
+        for n in resting
+    ]
     # The bias has no sign of its own in any of the numbers below: it has to be said.
     without = [n for n in inputs if n not in by]
     if without:
         taken = "inputs that do not follow" if len(without) > 1 else "an input that does not follow"
-        notes.append(
+        words = (
             f"{', '.join(without)}: taken for {taken} the outputs; where a pilot "
             "or an autopilot closes a loop the response is biased towards minus one over its gain, "
             "and a logged excitation (signals.instruments) or a fit by filter error is needed"
         )
+        notes.append(note("loop.responses-direct", words, *without))
     return notes
 
 
@@ -255,8 +260,8 @@ def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names:
 
 def _moving_as_one(
     flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
-) -> list[str]:
-    """Which inputs no response can be told apart of, in words."""
+) -> list[Finding]:
+    """Which inputs no response can be told apart of."""
     pairs = (pair for output in outputs.values() for pair in output.pairs.values())
     if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
         return []
@@ -264,13 +269,16 @@ def _moving_as_one(
     alike = np.abs(np.corrcoef(np.concatenate(U, axis=1))) > 1.0 - _AS_ONE
     # Where none is another's multiple one is a sum of others.
     those = [n for n, one in zip(inputs, alike, strict=True) if np.sum(one) > 1] or inputs
-    return [
+    words = (
         f"{' and '.join(those)} move as one: no response tells what each of them does; move them "
         "apart, or leave one of them out"
-    ]
+    )
+    return [Finding("excitation.inputs-as-one", "doubt", words, subjects=tuple(those))]
 
 
-def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]) -> list[str]:
+def _weak(
+    omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]
+) -> list[Finding]:
     """Where an instrument hardly moves its input, so that nothing is known of the responses."""
     notes = []
     for name in instruments:
@@ -281,11 +289,12 @@ def _weak(omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Ou
         hz, at = omega / (2.0 * np.pi), np.flatnonzero(weak)
         runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
         bands = ", ".join(f"{hz[run[0]]:.3g} to {hz[run[-1]]:.3g} Hz" for run in runs)
-        notes.append(
+        words = (
             f"{name}: at {at.size} of {omega.size} frequencies ({bands}) the excitation hardly "
             "moves the input beside what feedback and pilot make of it: no response is given "
             "there; a larger or longer excitation tells"
         )
+        notes.append(note("excitation.weak-instrument", words, name, value=at.size))
     return notes
 
 

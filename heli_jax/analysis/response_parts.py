@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import spans
 
@@ -18,7 +19,7 @@ type Names = tuple[list[str], tuple[str, ...]]
 
 
 def groups(
-    flights: Sequence[Flight], window: int, without: list[str]
+    flights: Sequence[Flight], window: int, without: list[Finding]
 ) -> list[tuple[list[str], Parts]]:
     """Outputs by the parts that they are known in, so that inputs are transformed once for all of
     them.
@@ -33,7 +34,7 @@ def groups(
     for name in order:
         parts = parts_of(flights, name, window)
         if isinstance(parts, str):
-            without.append(parts)
+            without.append(note("responses.none", parts, name))
         else:
             by_parts.setdefault(parts, []).append(name)
     return [(names, parts) for parts, names in by_parts.items()]

@@ -13,6 +13,7 @@ from heli_jax import naming, units
 from heli_jax.config.section import Section
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.yaml_file import read_mapping
 
@@ -136,10 +137,11 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
         x = samples[each.role][each.name]
         x = (x - correction.bias * factor) / (1.0 + correction.scale)
         samples[each.role][each.name] = _earlier(x, correction.delay / flight.dt, each.role)
-        notes.append(
+        words = (
             f"{each.name}: corrected by scale {correction.scale:+.3g}, bias {correction.bias:.3g} "
             f"{correction.unit}, delay {correction.delay:.3g} s"
         )
+        notes.append(note("corrections.applied", words, each.name))
     if not notes:
         raise InputError(
             f"{where}.corrections: expected a signal of this flight, got corrections of "
@@ -148,7 +150,8 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
     known, words = _lever_arm(model, flight, corrections)
     notes += words
     if corrections.not_determined:
-        notes.append(f"not corrected, since undetermined: {', '.join(corrections.not_determined)}")
+        words = f"not corrected, since undetermined: {', '.join(corrections.not_determined)}"
+        notes.append(note("corrections.left-out", words, *corrections.not_determined))
     flight = dataclasses.replace(flight, **samples, known={**flight.known, **known})
     if flight.source is None:
         return flight
@@ -196,14 +199,15 @@ def _earlier(x: np.ndarray, samples: float, role: str) -> np.ndarray:
 
 def _lever_arm(
     model: Model, flight: Flight, corrections: Corrections
-) -> tuple[dict[str, float], list[str]]:
+) -> tuple[dict[str, float], list[Finding]]:
     """What a model gets to know of its accelerometers' place, and a note of it."""
     arm = corrections.lever_arm
     if not arm:
         return {}, []
     words = ", ".join(f"{n} {v:.3g} m" for n, v in arm.items())
     if not set(arm) <= set(naming.names(model.Params)):
-        return {}, [f"lever arm not used, model {model.name} has none: {words}"]
+        words = f"lever arm not used, model {model.name} has none: {words}"
+        return {}, [note("corrections.left-out", words, *arm)]
     # What the configuration says of this flight goes before.
     new = {n: v for n, v in arm.items() if n not in flight.known}
-    return new, [f"lever arm of the accelerometer: {words}"]
+    return new, [note("corrections.applied", f"lever arm of the accelerometer: {words}", *arm)]

@@ -7,6 +7,7 @@ from heli_jax.analysis.attitude_responses import HandlingPair, handling_gaps, ha
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.frequency_section import FrequencyConfig, HandlingConfig, TransferConfig
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import Finding, note
 
 
 def asked_handling(
@@ -55,7 +56,7 @@ def _is(unit: str, si: str) -> bool:
     return True
 
 
-def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[str, ...]:
+def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[Finding, ...]:
     """Why axes that were logged have no handling qualities, where none are asked for by name.
 
     Args:
@@ -63,7 +64,8 @@ def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[s
         logged: outputs of the flights.
     """
     config = experiment.config.frequency or FrequencyConfig()
-    return handling_gaps(experiment.model, logged) if config.handling is None else ()
+    gaps = handling_gaps(experiment.model, logged) if config.handling is None else ()
+    return tuple(note("responses.no-handling", words) for words in gaps)
 
 
 def check_pairs(

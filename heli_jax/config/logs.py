@@ -24,6 +24,7 @@ from heli_jax.config.unfiltered_noise import unfiltered_cautions
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.convert import Selection
 from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
@@ -254,8 +255,12 @@ def _columns(experiment: Experiment) -> NamedBy:
         inputs, outputs = _of_model(experiment.model, everything, f"{where}.signals", gain)
         both = {n: inputs[n] for n in own.inputs} | {n: outputs[n] for n in own.outputs}
         constants = [n for n, signal in both.items() if signal.constant is not None]
-        notes = [f"{n} is a constant of {path}, and no column" for n in constants]
-        notes += [f"what {path} takes from {also.log} is left out" for also in first.also]
+        notes = [
+            note(LEFT_OUT, f"{n} is a constant of {path}, and no column", n) for n in constants
+        ]
+        notes += [
+            note(LEFT_OUT, f"what {path} takes from {also.log} is left out") for also in first.also
+        ]
         notes += [*_unstated_units(experiment.model, own), *own.notes]
         signals = {n: signal for n, signal in both.items() if n not in constants}
         return Named(signals, tuple(notes))
@@ -312,8 +317,8 @@ def _of_model(
 
 def _unstated_units(
     model: Model, stated: Resolved, source: Source | None = None
-) -> tuple[str, ...]:
-    """A sentence for each signal whose numbers are read as SI, or in the file's unit, because no
+) -> tuple[Finding, ...]:
+    """A note for each signal whose numbers are read as SI, or in the file's unit, because no
     unit is stated.
 
     Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
@@ -323,17 +328,20 @@ def _unstated_units(
     both = ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs))
     for (record, signals), read in zip(both, as_read, strict=True):
         for name, signal in signals.items():
-            if name in read and (note := taken_note(name, read[name])):
-                notes.append(note)
+            if name in read and (taken := taken_note(name, read[name])):
+                notes.append(taken)
                 continue
             # Plain numbers have no unit to mistake.
             si = naming.unit(record, name)
             if signal.unit is None and si is not None and not units.is_plain(si):
-                notes.append(f"{name}: no unit stated, taken as {si}")
+                words = f"{name}: no unit stated, taken as {si}"
+                notes.append(note("units.assumed", words, name))
     return tuple(notes)
 
 
-def _with_notes(flight: Flight, notes: tuple[str, ...], cautions: tuple[str, ...]) -> Flight:
+def _with_notes(
+    flight: Flight, notes: tuple[Finding, ...], cautions: tuple[Finding, ...]
+) -> Flight:
     # A flight that a script made has no source, and nobody who would read a note on it.
     if not (notes or cautions) or flight.source is None:
         return flight

@@ -13,6 +13,7 @@ from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, cutoff, with_filters
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import shown
@@ -113,7 +114,9 @@ def filter_words(filter: Filter) -> str:
     return f"{filter.kind} {filter.hz:.4g} Hz{more}"
 
 
-def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) -> tuple[str, ...]:
+def filter_cautions(
+    source: Source | None, outputs: Mapping[str, OutputConfig]
+) -> tuple[Finding, ...]:
     """What the log's settings say of an output's filter and the configuration does not model.
 
     Args:
@@ -130,14 +133,15 @@ def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) 
         if output.filter is None and logged.filters:
             said.append(_not_modelled(name, output, logged))
         if logged.unknown:
-            said.append(
+            words = (
                 f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}: such "
                 "filters move in flight or are of an unknown kind, and are not modelled"
             )
+            said.append(Finding("filters.unknown", "doubt", words, subjects=(name,)))
     return tuple(said)
 
 
-def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[str, ...]:
+def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]:
     """Outputs whose noise went through a modelled low-pass and is not white at the flight's rate,
     where filter error is told the measurement noise and so estimates no other.
 
@@ -148,15 +152,22 @@ def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[str, ...]:
         model: with the filters of its outputs.
     """
     return tuple(
-        f"{p.output}: its noise went through the low-pass of {p.hz:.3g} Hz too, and is not white "
-        f"at {1.0 / flight.dt:.4g} Hz, for which `disturbance.fixed: [sigma_y]` takes it: "
-        "estimates may be off by several standard deviations; leave sigma_y out of it, and the "
-        "noise before the filter is estimated"
+        Finding(
+            "filters.noise-coloured",
+            "doubt",
+            f"{p.output}: its noise went through the low-pass of {p.hz:.3g} Hz too, and is not "
+            f"white at {1.0 / flight.dt:.4g} Hz, for which `disturbance.fixed: [sigma_y]` takes "
+            "it: estimates may be off by several standard deviations; leave sigma_y out of it, and "
+            "the noise before the filter is estimated",
+            p.hz,
+            "Hz, the cut-off",
+            (p.output,),
+        )
         for p in filtered_noise(model.low_passes, (flight,))
     )
 
 
-def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> str:
+def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Finding:
     filters = logged.filters
     lowpasses = [f for f in filters if f.kind != "notch"]
     what = f"low-passed at {cutoff(lowpasses):.3g} Hz" if lowpasses else "notched"
@@ -166,12 +177,13 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> str
     line += [f"{key}: {value:g}" for key, value in _changed(output).items()]
     line += ["invert: true"] * output.invert
     # The inputs were not: were both filtered alike, the machine would look the same.
-    return (
+    words = (
         f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
         f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
         f"that delay for the machine's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
         "under outputs to model it, or `filter: []` there if it is of no account"
     )
+    return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
 
 
 def _changed(output: OutputConfig) -> dict[str, float]:

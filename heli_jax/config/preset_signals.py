@@ -9,6 +9,7 @@ from heli_jax.config.schema import InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import CCPM
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.preset import (
@@ -40,7 +41,7 @@ class Resolved(NamedTuple):
     inputs: dict[str, InputConfig]
     outputs: dict[str, OutputConfig]
     origins: dict[tuple[str, str], str]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def resolve(
@@ -78,7 +79,7 @@ def resolve(
             chosen = search.input(model, name, name in pilot)
             inputs[name] = InputConfig(**_keys(chosen))
             origins["inputs", name] = search.origin(chosen)
-    left: list[str] = []
+    left: dict[str, str] = {}
     for name in _wanted(model, stated, where):
         if name in outputs or name in elsewhere:
             continue
@@ -86,16 +87,17 @@ def resolve(
         if chosen is None and stated.preset_outputs is not None:
             raise InputError(f"{where}.preset_outputs: {name}: {why}{search.holdings()}")
         if chosen is None:
-            left.append(f"{name} ({why})")
+            left[name] = f"{name} ({why})"
             continue
         outputs[name] = OutputConfig(**_keys(chosen))
         origins["outputs", name] = search.origin(chosen)
     if not outputs and not elsewhere:
         problem = f"{where}: preset {stated.preset} supplies no output of model {model.name}: "
-        raise InputError(problem + ", ".join(left) + search.holdings())
+        raise InputError(problem + ", ".join(left.values()) + search.holdings())
     # In the model's own order, whichever of the two named them.
     inputs = {n: inputs[n] for n in (*naming.names(model.Inputs), *inputs) if n in inputs}
-    notes = (f"outputs that preset {stated.preset} left out: {', '.join(left)}",) if left else ()
+    words = f"outputs that preset {stated.preset} left out: {', '.join(left.values())}"
+    notes = (note("channels.lacking", words, *left),) if left else ()
     return Resolved(inputs, outputs, origins, notes)
 
 

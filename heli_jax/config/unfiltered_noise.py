@@ -14,6 +14,7 @@ from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.config.onboard import FROM_LOG
 from heli_jax.config.schema import OutputConfig
 from heli_jax.dynamics.onboard.filters import Filter, cutoff, gain
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import quantum
 from heli_jax.numbers import percent
@@ -34,8 +35,8 @@ _SEGMENT, _FEWEST = 256, 1500
 """samples of a spectrum, and of a record to have one: its bands are known to a tenth then"""
 
 
-def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[str, ...]:
-    """A sentence for each output whose noise did not come through its filter.
+def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:
+    """A doubt for each output whose noise did not come through its filter.
 
     Args:
         flight: as read.
@@ -50,12 +51,13 @@ def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> 
         found = _not_taken(y, flight.dt, filters)
         if found is not None:
             slow, fast, there, left = found
-            said.append(
+            words = (
                 f"{name}: its noise at {fast:.3g} Hz has {percent(there, 0)} of its power at "
                 f"{slow:.3g} Hz, of which the stated low-pass of {cutoff(filters):.3g} Hz leaves "
                 f"{percent(left, 0)}: was it logged before the filter? Then the lag of a filter "
                 "that is not there is taken off the machine's; leave the filter out and compare"
             )
+            said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
     return tuple(said)
 
 

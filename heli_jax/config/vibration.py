@@ -11,6 +11,7 @@ from heli_jax.config.doubts import rotor_doubt
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.onto_grid import FEWEST
 from heli_jax.flights.vibration import (
@@ -69,15 +70,15 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
     source = flight.source
     if source is not None:
         listed = ", ".join(f"{hz:g}" for hz in frequencies)
-        note = f"inputs and outputs notched at {listed} Hz (Q {_Q:g})"
-        source = dataclasses.replace(source, notes=(*source.notes, note, *slow, *lost))
+        done = note("notches.taken-out", f"inputs and outputs notched at {listed} Hz (Q {_Q:g})")
+        source = dataclasses.replace(source, notes=(*source.notes, done, *slow, *lost))
     return dataclasses.replace(
         flight, inputs=inputs, outputs=outputs, instruments=instruments, source=source
     )
 
 
-def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[str, ...]:
-    """A sentence for each output without samples enough to have some frequencies."""
+def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ...]:
+    """A note for each output without samples enough to have some frequencies."""
     notes = []
     for name, y in flight.outputs.items():
         rate = 1.0 / (slow_step(y) * flight.dt)
@@ -85,17 +86,18 @@ def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[str, ...]:
         if above:
             listed = ", ".join(f"{hz:g}" for hz in above)
             at = ", ".join(f"{folded(hz, rate):.3g}" for hz in above)
-            notes.append(
+            words = (
                 f"{name} at about {rate:.4g} Hz is not notched at {listed} Hz: what it may have of "
                 f"that is folded to {at} Hz, where a notch would take the machine's motion too"
             )
+            notes.append(note("notches.too-slow", words, name, value=rate))
     return tuple(notes)
 
 
 def _lost(
     flight: Flight, outputs: Mapping[str, np.ndarray], settled: float, where: str
-) -> tuple[str, ...]:
-    """What notches that begin anew behind missing samples cost, a sentence for each output."""
+) -> tuple[Finding, ...]:
+    """What notches that begin anew behind missing samples cost, a note for each output."""
     notes = []
     for name, y in flight.outputs.items():
         there, left = int(np.isfinite(y).sum()), int(np.isfinite(outputs[name]).sum())
@@ -108,14 +110,15 @@ def _lost(
                 "with fewer gaps, `gaps: split` where they are long, a rate as low as that of the "
                 "slowest output, or no notch"
             )
-        notes.append(f"{words}, and {there - left} of {there} samples are left out for it")
+        words += f", and {there - left} of {there} samples are left out for it"
+        notes.append(note("notches.samples-lost", words, name, value=there - left))
     return tuple(notes)
 
 
 def vibration_notes(
     experiment: Experiment, flight: Flight, config: FlightConfig, where: str
-) -> tuple[str, ...]:
-    """A sentence for each output with strong lines in its spectrum.
+) -> tuple[Finding, ...]:
+    """A note for each output with strong lines in its spectrum.
 
     Args:
         experiment: whose vehicle may know the rotor's speed, Omega.
@@ -134,7 +137,8 @@ def vibration_notes(
         vibration = lines(y, flight.dt, rotor, rates.get(name))
         if vibration:
             words = "; ".join(line_words(line, rotor) for line in vibration[:_NAMED])
-            notes.append(f"{name} vibrates: {words}")
+            largest = max(line.share for line in vibration)
+            notes.append(note("vibration.lines", f"{name} vibrates: {words}", name, value=largest))
     return tuple(notes)
 
 

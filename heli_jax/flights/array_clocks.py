@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
 from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
 from heli_jax.flights.row_clock import rate_cautions, rate_of
-from heli_jax.flights.table import Table, sample_count, shown
+from heli_jax.flights.table import Table, listed, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
 _LEVEL = re.compile(r"[./]")
-_MOST_NAMED = 6
 
 
 class _Clock(NamedTuple):
@@ -49,10 +49,10 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
     cautions = [
-        words
+        caution
         for t in topics
         for rate in [1.0 / float(np.median(np.diff(t.times)))]
-        for words in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
+        for caution in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
     ]
     return ChannelLog(
         table.path,
@@ -86,7 +86,7 @@ def _stated(
     return stated
 
 
-def clock_notes(table: Table) -> tuple[str, ...]:
+def clock_notes(table: Table) -> tuple[Finding, ...]:
     """That arrays have clocks of their own, where they have.
 
     Args:
@@ -95,8 +95,9 @@ def clock_notes(table: Table) -> tuple[str, ...]:
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()
-    listed = ", ".join(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics[:_MOST_NAMED])
-    return (f"arrays have clocks of their own, read where no time is stated: {listed}",)
+    topics = listed(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics)
+    words = f"arrays have clocks of their own, read where no time is stated: {topics}"
+    return (note("clock.of-arrays", words, value=len(log.topics)),)
 
 
 def _clock(name: str, values: np.ndarray) -> _Clock | None:
@@ -153,10 +154,9 @@ def _topic(
     return Topic(clock, times, {n: arrays[n] for n in names}, units, clock)
 
 
-def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[Finding, ...]:
     if not names:
         return ()
-    listed = ", ".join(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names[:_MOST_NAMED])
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names)
     words = "no time of their length, or several, stand in their groups"
-    return (f"left out, since {words}: {listed}{more}",)
+    return (note(LEFT_OUT, f"left out, since {words}: {each}", *names),)

@@ -19,6 +19,7 @@ import numpy as np
 
 from heli_jax import import_path
 from heli_jax.errors import InputError
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import mat_file, packed, stacked
 from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.mat_references import References
@@ -28,6 +29,7 @@ from heli_jax.flights.table import (
     Budget,
     Survey,
     column,
+    listed,
     require_columns,
     require_few_columns,
     shown,
@@ -56,7 +58,7 @@ class ArrayTable:
         data: bytes,
         arrays: Mapping[str, np.ndarray],
         units: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        notes: tuple[Finding, ...] = (),
     ) -> None:
         self.path, self.format, self.size, self.notes = path, kind, len(data), notes
         self.sha256 = hashlib.sha256(data).hexdigest()
@@ -130,13 +132,14 @@ def open_mat(path: Path) -> ArrayTable:
         return _from_hdf5(path, "mat 7.3", data)
     try:
         read = mat_file.read_mat(data, Budget(str(path), len(data)))
-        whole, units, notes = labelled(read.arrays, read.texts)
+        whole, units = labelled(read.arrays, read.texts)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    notes: tuple[Finding, ...] = ()
     if read.objects:
         _require_arrays(path, whole, read.objects)
-        listed = ", ".join(f"{shown(n)} ({kind})" for n, kind in list(read.objects.items())[:6])
-        notes = (*notes, f"objects of MATLAB are left out: {listed}")
+        each = listed(f"{shown(n)} ({kind})" for n, kind in read.objects.items())
+        notes = (note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects),)
     real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
     named = NamedColumns(real, as_lists(read.texts))
     arrays, of_parts = {}, {}
@@ -145,10 +148,11 @@ def open_mat(path: Path) -> ArrayTable:
             called = named.name(name, i) or part
             arrays[called] = vector
             of_parts[called] = named.unit(name, i) or units.get(name, "")
-    notes = (*notes, *of_stacks, *named.notes)
-    complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
-    words = f"complex numbers, of which the real part is read: {complex_ones}"
-    notes = (*notes, words) if complex_ones else notes
+    notes = (*notes, *of_stacks)
+    if complex_ones := [n for n, array in whole.items() if array.dtype.kind == "c"]:
+        words = "complex numbers, of which the real part is read: "
+        words += listed(map(shown, complex_ones))
+        notes = (*notes, note("channels.complex", words, *complex_ones))
     return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
 
 
@@ -227,10 +231,9 @@ class DataSets:
         self._stored: dict[str, np.ndarray] = {}
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
-        self._scaled: dict[str, None] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
-        self._notes: list[str] = []
+        self._notes: list[Finding] = []
         self.references = References()
 
     @property
@@ -238,21 +241,19 @@ class DataSets:
         """Of the data sets."""
         return tuple(self._stored)
 
-    def note(self, words: str) -> None:
+    def note(self, finding: Finding) -> None:
         """What else is to be said of the file."""
-        self._notes.append(words)
+        self._notes.append(finding)
 
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
         self.budget.take_numbers(stored.size, stored.nbytes)
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
-            values, is_scaled, missing = packed.unpack(stored, packing)
+            values, missing = packed.unpack(stored, packing)
         except packed.Packing as e:
             self._left_out[name] = str(e)
             return
-        if is_scaled:
-            self._scaled[name] = None
         if missing:
             self._missing[name] = missing
         stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), "")
@@ -272,9 +273,9 @@ class DataSets:
         """All of them."""
         return ArrayTable(path, kind, data, *self.vectors())
 
-    def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[str, ...]]:
+    def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
-        notes = packed.notes_of(self._scaled, self._missing, self._left_out)
+        notes = packed.notes_of(self._missing, self._left_out)
         paths = {name: self.references.path(name) for name in self._stored}
         whole = labelled(
             {paths[name]: values for name, values in self._stored.items()}, self.references.texts
@@ -288,7 +289,7 @@ class DataSets:
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or stated.get(name, "")
-        return arrays, units, (*notes, *self._notes, *whole.notes, *of_stacks, *named.notes)
+        return arrays, units, (*notes, *self._notes, *of_stacks)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -342,7 +343,10 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
         ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
         raise wrong(str(path), slow if ended else "is no whole HDF5 file (its reader crashed)")
-    return ArrayTable(str(path), kind, data, arrays, head["units"], tuple(head["notes"]))
+    notes = tuple(
+        note(code, words, *names, value=value) for code, words, names, value in head["notes"]
+    )
+    return ArrayTable(str(path), kind, data, arrays, head["units"], notes)
 
 
 def holds_numbers(kind: np.dtype, dimensions: int) -> bool:

@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.flights.marks import (
     Counts,
@@ -47,12 +48,12 @@ _NONE: Mapping[Key, Mapping[str, Marked]] = MappingProxyType({})
 class AsLogged:
     """Signals as they were logged, by key: each on its clock, in SI, without marks and turns.
 
-    `notes` say what was done, in sentences.
+    `notes` say what was done.
     """
 
     signals: dict[Key, Timed]
     facts: dict[Key, SignalFacts]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
     def source(self, source: Source, begin: float, end: float) -> Source:
         """Of a flight from `begin` to `end` [s] on the signals' clocks, with what they were."""
@@ -90,8 +91,9 @@ def _as_logged(
         numbers = _in_log(signal, timed.values)
         stated = _at_stated(signal, numbers)
         if stated.any():
-            values, note = _without(timed.values, stated, key[1])
-            notes.append(f"{name} {note}")
+            values, words = _without(timed.values, stated, key[1])
+            count = int(np.count_nonzero(stated))
+            notes.append(note("samples.missing-as-stated", f"{name} {words}", key[0], value=count))
             timed = timed._replace(values=values)
             numbers = _in_log(signal, values)
         at = at_marks(numbers)
@@ -104,16 +106,19 @@ def _as_logged(
                 problem = f"has {words}, first at {first:.6g} s"
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
-            notes.append(f"{name} has {words}: taken as missing")
+            words = f"{name} has {words}: taken as missing"
+            notes.append(note("samples.marks", words, key[0], value=int(np.count_nonzero(at))))
         notes += source_notes(name, {n: marked.counts for n, marked in sources.items()})
         values = np.where(at, np.nan, timed.values)
         turn = units.turn(signal.si)
         if turn is not None and is_wrapped(values, turn):
-            values, note = unwrapped(values, turn)
-            notes.append(f"{name} {note}")
+            values, unwrapping = unwrapped(values, turn, name)
+            notes.append(unwrapping)
         # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
         odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
-        notes += [f"{name} has {stray_words(stray)}: kept as measured" for stray in odd[key]]
+        for s in odd[key]:
+            words = f"{name} has {stray_words(s)}: kept as measured"
+            notes.append(note("samples.stray-kept", words, key[0], value=s.values.size))
         made[key] = Timed(timed.seconds, values)
     return AsLogged(made, _facts(made, marks, odd), tuple(notes))
 
@@ -151,7 +156,7 @@ def _facts(
     return {key: replace(f, marked=marks[key], strays=odd[key]) for key, f in facts.items()}
 
 
-def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
+def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
     """Notes on the marks in the channels that a derived one is computed from.
 
     Args:
@@ -163,8 +168,12 @@ def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
     for source, counts in marks.items():
         alike.setdefault(counts, []).append(shown(source))
     return [
-        f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
-        f"{mark_words(counts)}: taken as missing"
+        note(
+            "samples.marks",
+            f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
+            f"{mark_words(counts)}: taken as missing",
+            value=sum(n for _, n in counts),
+        )
         for counts, sources in alike.items()
     ]
 
@@ -176,24 +185,25 @@ def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
     return np.where(none, np.nan, values)
 
 
-def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
     """Numbers (N,) of a log whose unit nobody states, with marks as missing and angles unwrapped
-    that are surely some, and what was done in words."""
+    that are surely some, and what was done; `name` is the channel's, as it is shown."""
     notes, at = [], at_marks(numbers)
     if at.any():
         size = int(np.sum(~np.isnan(numbers)))
-        notes.append(f"has {mark_words(counted(numbers[at]), size)}: taken as missing")
+        words = f"{name} has {mark_words(counted(numbers[at]), size)}: taken as missing"
+        notes.append(note("samples.marks", words, value=int(np.count_nonzero(at))))
         numbers = np.where(at, np.nan, numbers)
-    notes += suspect_notes(numbers)
+    notes += suspect_notes(name, numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]
         if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
-            after, words = unwrapped(numbers, turn)
+            after, unwrapping = unwrapped(numbers, turn, name)
             steps = np.abs(np.diff(after[np.isfinite(after)]))
             # Beside its jumps it goes through all of a turn by small steps: a mode or a switch
             # between 0 and 360 does not.
             if steps.max() < (1 - _JUMP[0]) * turn and steps.sum() > _NEARLY * turn:
-                return after, [*notes, words]
+                return after, [*notes, unwrapping]
     return numbers, notes
 
 
@@ -218,12 +228,13 @@ def is_wrapped(values: np.ndarray, turn: float) -> bool:
     return bool(wraps.any() and np.max(jumps[~wraps], initial=0.0) <= _STEP)
 
 
-def unwrapped(values: np.ndarray, turn: float) -> tuple[np.ndarray, str]:
-    """An angle (N,) without its jumps of a turn, and in words what was done.
+def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, Finding]:
+    """An angle (N,) without its jumps of a turn, and what was done.
 
     Args:
         values: NaN where one is missing.
         turn: in their unit.
+        name: as it is shown.
     """
     seen = np.isfinite(values)
     before = values[seen]
@@ -232,8 +243,10 @@ def unwrapped(values: np.ndarray, turn: float) -> tuple[np.ndarray, str]:
     made[seen] = after
     n = int(np.count_nonzero(np.abs(np.diff(after) - np.diff(before)) > 0.5 * turn))
     often = "once" if n == 1 else f"{n} times"
-    words = f"jumps by a turn {often}, at the ends of its range: taken as going on (unwrapped)"
+    words = (
+        f"{name} jumps by a turn {often}, at the ends of its range: taken as going on (unwrapped)"
+    )
     unsure = int(np.count_nonzero(np.abs(np.diff(after)) > (1 - _JUMP[0]) * turn))
     if unsure:
         words += f"; {unsure} steps of more than a quarter of a turn remain, and may be wrong"
-    return made, words
+    return made, note("angles.unwrapped", words, value=n)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
 from heli_jax.flights.blackbox_columns import narrowed
 from heli_jax.flights.blackbox_frames import Frames, find_frames
@@ -186,11 +187,11 @@ def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, n
     return homes[np.maximum(before, 0)], before >= 0
 
 
-def _losses(frames: Frames, main: MainFrames) -> tuple[str, ...]:
+def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
     if not frames.damage and not main.dropped:
         return ()
     places = len(frames.damage)
     words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
     if main.dropped:
         words += f", {main.dropped} more frames lost that were differences from a lost one"
-    return (words,)
+    return (note("damage.skipped", words, value=places + main.dropped),)

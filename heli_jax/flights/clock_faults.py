@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps
 from heli_jax.flights.runs import restarts
@@ -17,7 +18,7 @@ _FEW_ROWS = 10
 """rows out of order that are left out by hand"""
 
 
-def unit_notes(time: Signal, stated: str | None) -> tuple[str, ...]:
+def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
     """A note where the file, or the name of its clock, says another unit than the configuration.
 
     Args:
@@ -28,10 +29,11 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[str, ...]:
     factor = units.factor(time.unit, "s")
     if stated and not math.isclose(units.factor(stated, "s"), factor):
         words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
-        return (f"{words}, and not in {time.unit}",)
+        return (note("units.contradicted", f"{words}, and not in {time.unit}"),)
     if not stated and named and not math.isclose(units.factor(named, "s"), factor):
         words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
-        return (f"{words}: if that is right, state unit: {named} beside it",)
+        words += f": if that is right, state unit: {named} beside it"
+        return (note("units.contradicted", words),)
     return ()
 
 

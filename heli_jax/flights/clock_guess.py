@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.px4_commands import are_commands
@@ -24,6 +25,8 @@ TIME_NAMES = {
     "elapsed",
     "clock",
 }
+COUNTS_ROWS = "clock.counts-rows"
+"""code of a column that might be taken for a clock"""
 _STAMP = ("header", "stamp")
 _SAMPLED = "timestamp_sample"
 """of a topic of PX4, beside `timestamp`, when it was published"""
@@ -98,7 +101,7 @@ def is_called_time(name: str) -> bool:
     return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
 
 
-def arrival_notes(table: Table, clock: str) -> tuple[str, ...]:
+def arrival_notes(table: Table, clock: str) -> tuple[Finding, ...]:
     """Which of two clocks was taken, and why, where one is that of a message's arrival.
 
     Args:
@@ -109,13 +112,16 @@ def arrival_notes(table: Table, clock: str) -> tuple[str, ...]:
         sampled = clock + "_sample"
         if sampled not in table.names or not are_commands(table.path, sampled, table.names):
             return ()
-        words = "is taken for the clock, since commands act from when they are published"
-        return (f"{shown(clock)} {words}; {shown(sampled)} is of the gyro's sample they answer",)
-    other = next((name for name in table.names if name in _ARRIVALS), None)
-    if other is None:
-        return ()
-    words = "is taken for the clock, since it says when a sample was taken"
-    return (f"{shown(clock)} {words}; {shown(other)} says when its message arrived",)
+        why = "commands act from when they are published"
+        beside = f"{shown(sampled)} is of the gyro's sample they answer"
+    else:
+        other = next((name for name in table.names if name in _ARRIVALS), None)
+        if other is None:
+            return ()
+        why = "it says when a sample was taken"
+        beside = f"{shown(other)} says when its message arrived"
+    words = f"{shown(clock)} is taken for the clock, since {why}; {beside}"
+    return (note("clock.of-several", words, clock),)
 
 
 def _says_when_sampled(table: Table, name: str) -> bool:
@@ -135,7 +141,7 @@ def _is_of_sample(name: str) -> bool:
     return path[-2:] == _STAMP or last == _SAMPLED
 
 
-def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:
+def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
     """That a column which might be taken for a clock counts rows, where one does.
 
     Args:
@@ -144,7 +150,7 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:
     name = counter_of(surveys)
     if name is None:
         return ()
-    return (f"{shown(name)} counts rows and is taken for no time",)
+    return (note(COUNTS_ROWS, f"{shown(name)} counts rows and is taken for no time", name),)
 
 
 def counter_of(surveys: Sequence[Survey]) -> str | None:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
+
 _BLOCKS = 20
 """parts of a log of which each has a usual step"""
 _SAME, _OTHER = 1.15, 1.4
@@ -14,7 +16,7 @@ _MOST = 0.002
 """part of the steps that are long, at most, for them to be told one by one"""
 
 
-def step_notes(seconds: np.ndarray, rate: float, longest: float) -> tuple[str, ...]:
+def step_notes(seconds: np.ndarray, rate: float, longest: float) -> tuple[Finding, ...]:
     """Notes on a clock that was set or lost samples now and then, or went on at another rate.
 
     Args:
@@ -36,7 +38,7 @@ def step_notes(seconds: np.ndarray, rate: float, longest: float) -> tuple[str, .
                 f": at {rate:.6g} Hz the slower part has samples that were not measured; "
                 f"`rate: {slower:.4g}` has none"
             )
-        return (words,)
+        return (note("clock.other-rate", words, value=float(seconds[row])),)
     usual = float(np.median(steps))
     long = np.flatnonzero((steps > _LONG * usual) & (steps <= longest))
     if not 0 < long.size <= max(3, _MOST * steps.size):
@@ -45,11 +47,12 @@ def step_notes(seconds: np.ndarray, rate: float, longest: float) -> tuple[str, .
     which = "a step" if long.size == 1 else f"{long.size} steps"
     size = f"of {steps[worst]:.4g} s" if long.size == 1 else f"of up to {steps[worst]:.4g} s"
     at = "at" if long.size == 1 else "the longest at"
-    return (
+    words = (
         f"the clock has {which} {size}, {at} {seconds[worst]:.6g} s, where {usual:.4g} s is "
         "usual: samples were lost there, or the clock was set; if it was set, what was flown "
-        "before and after is farther apart than it was, and the estimates are off",
+        "before and after is farther apart than it was, and the estimates are off"
     )
+    return (note("clock.long-steps", words, value=float(steps[worst])),)
 
 
 def _second_rate(steps: np.ndarray) -> tuple[int, float, float] | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
@@ -19,7 +20,7 @@ from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
-from heli_jax.flights.table import require_few_columns, shown, wrong
+from heli_jax.flights.table import listed, require_few_columns, shown, wrong
 from heli_jax.flights.table_topics import (
     as_channels,
     matching,
@@ -70,11 +71,11 @@ class Selection:
 @dataclass(frozen=True, eq=False)
 class Converted:
     """Columns (M,) float64 by name, `time` [s] first, NaN where a sample is missing; `units` where
-    the log states them; `notes` on what was assumed, resampled or is missing, in sentences."""
+    the log states them; `notes` on what was assumed, resampled or is missing."""
 
     columns: Mapping[str, np.ndarray]
     units: Mapping[str, str]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def convert_log(path: str | Path, selection: Selection) -> Converted:
@@ -120,10 +121,11 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     else:
         columns = _resampled(log, names, clocks, selection.rate, notes)
         for clock in clocks.values():
-            notes += [f"{clock.words}: {n}" for n in new_clock(clock.seconds, selection.rate).notes]
+            notes += [n.of(clock.words) for n in new_clock(clock.seconds, selection.rate).notes]
             # A table has a value in every row; a fit takes slow outputs as missing in between.
             if selection.rate * clock.usual > _INTERPOLATED:
-                notes.append(f"{clock.words}: interpolated, so its noise is no longer white")
+                words = f"{clock.words}: interpolated, so its noise is no longer white"
+                notes.append(note("resampling.interpolated", words))
     for name in names:
         times = log.channel(name).times[clocks[log.topic_of(name).name].rows]
         marks = marks_of_sources(log, name, (times[0], times[-1]))
@@ -186,7 +188,7 @@ def _clocks(
     names: Sequence[str],
     window: tuple[float, float] | None,
     required: bool,
-    notes: list[str],
+    notes: list[Finding],
 ) -> dict[str, TopicClock]:
     """The clocks of the topics that hold the channels, by the topics' names.
 
@@ -205,7 +207,7 @@ def _clocks(
             if required:
                 raise
             problems.append(e)
-            notes.append(f"left out: {str(e).removeprefix(f'{log.path}, ')}")
+            notes.append(note(LEFT_OUT, f"left out: {e.within}", topic.name))
     if not clocks:
         raise problems[0]
     longest = max(
@@ -220,21 +222,26 @@ def _clocks(
         # Only where nothing is asked for: who names a short topic wants just that.
         if not required and span < _SHARE * max(spans.values()):
             del clocks[name]
-            notes.append(f"left out: topic {shown(name)}, which covers {span:.3g} s")
+            words = f"left out: topic {shown(name)}, which covers {span:.3g} s"
+            notes.append(note(LEFT_OUT, words, name, value=span))
     return clocks
 
 
-def _missing(columns: Mapping[str, np.ndarray]) -> list[str]:
+def _missing(columns: Mapping[str, np.ndarray]) -> list[Finding]:
     """Notes on missing samples, one for all signals that miss as many."""
     by_count: dict[int, list[str]] = {}
     for name, values in columns.items():
-        by_count.setdefault(int(np.isnan(values).sum()), []).append(shown(name))
+        by_count.setdefault(int(np.isnan(values).sum()), []).append(name)
     by_count.pop(0, None)
     size = columns[TIME].size
     return [
-        f"{count} of {size} samples {'is' if count == 1 else 'are'} missing, in "
-        + ", ".join(names[:6])
-        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        note(
+            "samples.missing",
+            f"{count} of {size} samples {'is' if count == 1 else 'are'} missing, in "
+            f"{listed(map(shown, names))}",
+            *names,
+            value=count,
+        )
         for count, names in by_count.items()
     ]
 
@@ -244,7 +251,7 @@ def _as_logged(
     names: Sequence[str],
     clocks: Mapping[str, TopicClock],
     converted: bool,
-    notes: list[str],
+    notes: list[Finding],
 ) -> dict[str, np.ndarray]:
     """The samples as they are, which needs one clock for all; marks are missing where the numbers
     are `converted` to another unit, in which nobody would know them again."""
@@ -260,8 +267,9 @@ def _as_logged(
         if (at := at_marks(values)).any():
             words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
-            notes.append(f"{shown(name)} has {words}: {done}")
-        notes += [f"{shown(name)} {said}" for said in suspect_notes(np.where(at, np.nan, values))]
+            words = f"{shown(name)} has {words}: {done}"
+            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
+        notes += suspect_notes(shown(name), np.where(at, np.nan, values))
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns
 
@@ -271,7 +279,7 @@ def _resampled(
     names: Sequence[str],
     clocks: Mapping[str, TopicClock],
     rate: float,
-    notes: list[str],
+    notes: list[Finding],
 ) -> dict[str, np.ndarray]:
     # Counted before any signal is resampled, so that a slip in the rate is refused before it fills
     # the memory.
@@ -284,8 +292,9 @@ def _resampled(
     for name in names:
         topic = log.topic_of(name).name
         clock = clocks[topic]
-        values, said = without_marks_and_turns(_finite(log.channel(name).values[clock.rows]))
-        notes += [f"{shown(name)} {words}" for words in said]
+        logged = _finite(log.channel(name).values[clock.rows])
+        values, said = without_marks_and_turns(shown(name), logged)
+        notes += said
         # How a signal moves is asked of the samples that there are: a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.csv_text import Body, first_row
 from heli_jax.flights.table import shown
 
@@ -13,7 +14,7 @@ _MOST = 0.02
 _FEW = 10
 
 
-def without_comments(body: Body) -> tuple[Body, str] | None:
+def without_comments(body: Body) -> tuple[Body, Finding] | None:
     """The rows with blank lines in place of comments, and a note; None where there are none.
 
     Args:
@@ -35,5 +36,5 @@ def without_comments(body: Body) -> tuple[Body, str] | None:
     what = f"line {line}" if count == 1 else f"{count} lines, the first line {line},"
     verb = "is a comment" if count == 1 else "are comments"
     rows = memoryview(_COMMENT.sub(b"", data))
-    note = f"{what} {verb} and {'is' if count == 1 else 'are'} passed over: {words}"
-    return dataclasses.replace(body, rows=rows), note
+    words = f"{what} {verb} and {'is' if count == 1 else 'are'} passed over: {words}"
+    return dataclasses.replace(body, rows=rows), note("text.comments", words, value=count)

@@ -8,8 +8,8 @@ _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
 
 
-def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """The bytes of a file in UTF-8, and a note where they were in another encoding.
+def as_utf8(path: str, data: bytes) -> bytes:
+    """The bytes of a file in UTF-8.
 
     Spreadsheets save "Unicode text" as UTF-16 with a mark, and older programs write one byte a
     letter, of which the degree sign in a header is the commonest.
@@ -19,21 +19,20 @@ def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
-            return data.decode("utf-16").encode(), ("text in UTF-16 was read as such",)
+            return data.decode("utf-16").encode()
         except UnicodeDecodeError as e:
             problem = f"begins as text in UTF-16, and is none ({e.reason})"
             raise wrong(path, f"{problem}, expected whole text") from e
     if data.isascii() or b"\x00" in data or _is_utf8(data):
-        return data, ()
+        return data
     foreign = len(data) - len(data.decode("ascii", "ignore"))
     if foreign > _FOREIGN * len(data):
-        return data, ()
+        return data
     try:
-        text = data.decode("cp1252").encode()
+        return data.decode("cp1252").encode()
     # `check_text` says where.
     except UnicodeDecodeError:
-        return data, ()
-    return text, ("is no text in UTF-8, and was read as Latin-1 (Windows-1252)",)
+        return data
 
 
 def _is_utf8(data: bytes) -> bool:

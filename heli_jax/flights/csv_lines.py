@@ -22,7 +22,6 @@ class Head(NamedTuple):
         delimiter: between them; a tab of a file whose cells have blanks between them.
         above: lines of names above the header, the nearest first.
         first_line: the number of the first line of rows or units.
-        note: what stands above, in words; empty of a table that begins with its names.
         is_fitting: whether rows of as many cells were found right below.
         units: of the columns behind the first, where a line above names them.
     """
@@ -31,7 +30,6 @@ class Head(NamedTuple):
     delimiter: str
     above: tuple[str, ...]
     first_line: int
-    note: str = ""
     is_fitting: bool = True
     units: tuple[str, ...] = ()
 

@@ -66,8 +66,7 @@ def _head(
         is_comment, is_near = bare != above.text, above.number + 1 == row.number
         if is_comment and len(names) == width and are_names(names):
             header = Line(delimiter.join(names), above.number, begin)
-            note = _below(lines, at - 1, "the names of the columns")
-            return Head(header, _kept(delimiter), (), row.number, note)
+            return Head(header, _kept(delimiter), (), row.number)
         # Names that are one too few are a slip, which is told with both lines.
         alike = abs(len(names) - width) <= _SLIP and len(names) > 1 and are_names(names)
         # And where others have as many cells it is not known what they are.
@@ -75,19 +74,8 @@ def _head(
         if is_unsure or (alike and is_near and not is_comment):
             return None
     names = [f"column{i}" for i in range(1, width + 1)]
-    called = f"no names stand above the columns: they are called {names[0]} to {names[-1]}"
-    note = f"{called}{_below(lines, at, '; the numbers') if at else ''}"
     header = Line(delimiter.join(names), row.number, begin)
-    return Head(header, _kept(delimiter), (), row.number, note)
-
-
-def _below(lines: Sequence[Line], at: int, what: str) -> str:
-    """Where something begins below lines of text, in words."""
-    words = f"{what} were found in line {lines[at].number}"
-    if not at:
-        return words
-    first, last = lines[0].number, lines[at - 1].number
-    return f"{words}, below " + (f"line {first}" if first == last else f"lines {first} to {last}")
+    return Head(header, _kept(delimiter), (), row.number)
 
 
 def _is_sample(cells: Sequence[str], delimiter: str) -> bool:

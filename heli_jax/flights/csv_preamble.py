@@ -161,17 +161,12 @@ def _head_above(
     top = header
     while top and _is_group(lines, cells, top - 1, width) and delimiter != " ":
         top -= 1
-    head_line, note = lines[header], ""
-    if top:
-        first, last = lines[0].number, lines[top - 1].number
-        above = f"line {first}" if first == last else f"lines {first} to {last}"
-        note = f"the names of the columns were found in line {head_line.number}, below {above}"
+    head_line = lines[header]
     return Head(
         Line(head_line.text, head_line.number, lines[begin - 1].after),
         "\t" if delimiter == " " else delimiter,
         tuple(line.text for line in reversed(lines[top:header])),
         lines[begin - 1].number + 1,
-        note,
         units=_units_above(cells[:top], cells[header]),
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
 from heli_jax.flights.csv_cells import row_of_units
@@ -82,7 +83,7 @@ def open_csv(path: Path) -> "CsvTable":
     digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
     if is_gzipped(path):
         data = unpacked(where, data)
-    data, notes = as_utf8(where, data)
+    data = as_utf8(where, data)
     check_text(where, data)
     blanks = inner_ending(path) not in (".csv", ".tsv")
     head = find_head(where, data, blanks)
@@ -109,17 +110,16 @@ def open_csv(path: Path) -> "CsvTable":
     body = Body(where, rows, delimiter, head.first_line, quotes)
     groups = [header_names(where, text, delimiter, number) for text in head.above]
     names = as_wide(qualified(names, groups), body)
-    body, empty = body.filled()
-    body, cut = body.whole(len(names))
-    notes = (*notes, head.note) if head.note else notes
+    body, cut = body.filled().whole(len(names))
     rate = rate_above(bytes(data[:after]).decode("utf-8", "replace"))
-    notes, units = (*notes, *empty, *cut), _units_below(body, names)
+    notes, units = cut, _units_below(body, names)
     if units is None:
         stated = dict(zip(names[1:], head.units, strict=False))
         return CsvTable(size, digest, names, body, head, notes, stated, rate)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
-    notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
+    words = f"line {number_of_line} was taken for units and not for a sample: {listed}"
+    notes = (*notes, note("text.units-line", words, value=number_of_line))
     stated = dict(zip(names, units, strict=True))
     return CsvTable(size, digest, names, body, head, notes, stated, rate)
 
@@ -162,7 +162,7 @@ class CsvTable:
         names: tuple[str, ...],
         body: Body,
         head: Head,
-        notes: tuple[str, ...] = (),
+        notes: tuple[Finding, ...] = (),
         units: Mapping[str, str] | None = None,
         rate_above: tuple[float, str] | None = None,
     ) -> None:
@@ -282,10 +282,8 @@ class CsvTable:
             values = text_floats(points)
             if example and not isinstance(values, int):
                 other = "commas" if sign == "," else "points"
-                self._note(
-                    f"{shown(name)} has marks between thousands, as in {shown(example)}: "
-                    f"{other} are decimal"
-                )
+                words = f"{shown(name)} has marks between thousands, as in {shown(example)}"
+                self._note(note("text.thousands", f"{words}: {other} are decimal", name))
             return values
         cells = filled.to_pylist()
         dates = seconds_of_dates(cells, self._days(name))
@@ -293,7 +291,7 @@ class CsvTable:
             return dates
         self._dates.add(name)
         if dates.note:
-            self._note(f"{shown(name)}: {dates.note}")
+            self._note(note("clock.dates", f"{shown(name)}: {dates.note}", name))
         return dates.seconds
 
     def _days(self, name: str) -> list[str | None] | None:
@@ -312,14 +310,14 @@ class CsvTable:
         stripped = without_comments(self._body)
         if stripped is None:
             return False
-        self._body, note = stripped
+        self._body, passed_over = stripped
         self._signs = decimal_signs(self._body)
-        self._note(note)
+        self._note(passed_over)
         return True
 
-    def _note(self, words: str) -> None:
-        if words not in self.notes:
-            self.notes = (*self.notes, words)
+    def _note(self, finding: Finding) -> None:
+        if finding not in self.notes:
+            self.notes = (*self.notes, finding)
 
     def _require_no_names(self, row: int) -> None:
         """Refuse a header between the rows: a logger began anew there."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.csv_cells import row_of_units
 from heli_jax.flights.csv_fortran import is_fortran, parted
 from heli_jax.flights.table import wrong
@@ -69,7 +70,7 @@ class Body:
             rows = rows[size:]
         return replace(self, rows=rows, first_line=self.first_line + lines)
 
-    def whole(self, width: int) -> tuple["Body", tuple[str, ...]]:
+    def whole(self, width: int) -> tuple["Body", tuple[Finding, ...]]:
         """The body without a last line that ends before its last cells, as where a logger lost its
         power, and a note of it.
 
@@ -83,27 +84,23 @@ class Body:
         if at in (0, len(tail)) or cells >= width or self.has_quotes:
             return self, ()
         # In memory from here on: a file on the disk is read to its end.
-        return replace(self, rows=self.data[: at - len(tail)]), (
-            f"the last line is cut off ({cells} of {width} cells): it is left out",
-        )
+        words = f"the last line is cut off ({cells} of {width} cells): it is left out"
+        cut = note("text.line-cut-off", words, value=cells)
+        return replace(self, rows=self.data[: at - len(tail)]), (cut,)
 
-    def filled(self) -> tuple["Body", tuple[str, ...]]:
+    def filled(self) -> "Body":
         """The body without the rows of empty cells behind the last that holds something, as
-        spreadsheets write them, and a note of it."""
+        spreadsheets write them."""
         size, of_nothing = _LAST, b" \t\r\n" + self.delimiter.encode()
         while not (end := self._end(size)).rstrip(of_nothing) and size < self.size:
             size *= 16
         kept = end.rstrip(of_nothing)
         # To the end of its line, which may be of empty cells.
         _, at = _line_end(end, len(kept))
-        count = sum(self.delimiter in line for line in lines_of(end[at:].decode()))
-        if not kept or not count:
-            return self, ()
-        words = "row is" if count == 1 else f"{count} rows are"
+        if not kept or self.delimiter not in end[at:].decode():
+            return self
         # In memory from here on, as in `whole`.
-        return replace(self, rows=self.data[: at - len(end)]), (
-            f"the last {words} empty, and left out",
-        )
+        return replace(self, rows=self.data[: at - len(end)])
 
     def _end(self, size: int) -> bytes:
         """The last `size` bytes, or fewer."""

@@ -2,10 +2,13 @@
 
 import dataclasses
 
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 
 
-def part(flight: Flight, first: int, last: int, name: str = "", note: str = "") -> Flight:
+def part(
+    flight: Flight, first: int, last: int, name: str = "", note: Finding | None = None
+) -> Flight:
     """The samples from `first` up to but not including `last`.
 
     Args:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import note
 from heli_jax.flights import progress
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
@@ -238,9 +239,10 @@ def make_log(
         topics += of_message
         damaged += lost
     require_samples(path, topics)
-    anew = [t.name for t in tables if t.descriptions > 1 or "#" in t.name]
-    words = f"described anew within the log, and read by each description: {', '.join(anew)}"
-    notes = (f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped",) if damaged else ()
+    notes = []
+    if damaged:
+        words = f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped"
+        notes.append(note("damage.skipped", words, value=damaged))
     return ChannelLog(
         path=path,
         format="dataflash",
@@ -249,7 +251,7 @@ def make_log(
         topics=tuple(topics),
         firmware=_firmware(alone["MSG"].rows),
         parameters=_parameters(alone["PARM"].rows),
-        notes=(*notes, words) if anew else notes,
+        notes=tuple(notes),
     )
 
 

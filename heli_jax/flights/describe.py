@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.array_clocks import clock_notes
 from heli_jax.flights.clock_guess import arrival_notes, counter_notes
 from heli_jax.flights.flight import Signal
@@ -31,6 +32,7 @@ from heli_jax.flights.runs import clock_scale, numbering, numbering_notes, resta
 from heli_jax.flights.table import (
     Survey,
     Table,
+    listed,
     sample_count,
     shown,
     wrong,
@@ -140,7 +142,7 @@ class LogInfo:
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     filters: Mapping[str, str | int | float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     vibration: RotorLines | None = None
 
 
@@ -285,16 +287,20 @@ def describe_table(
     )
 
 
-def _other_lengths(surveys: list[Survey]) -> tuple[str, ...]:
-    """A sentence for each number of samples that is not the log's: arrays may have their own."""
+def _other_lengths(surveys: list[Survey]) -> tuple[Finding, ...]:
+    """A note for each number of samples that is not the log's: arrays may have their own."""
     by_size: dict[int, list[str]] = {}
     for each in surveys:
         if each.values is not None:
-            by_size.setdefault(each.values.size, []).append(shown(each.name))
+            by_size.setdefault(each.values.size, []).append(each.name)
     rows = _n_rows(surveys)
     return tuple(
-        f"{sample_count(size)}, not {rows}: {', '.join(names[:6])}"
-        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        note(
+            "channels.other-length",
+            f"{sample_count(size)}, not {rows}: {listed(map(shown, names))}",
+            *names,
+            value=size,
+        )
         for size, names in by_size.items()
         if size != rows
     )
@@ -363,7 +369,7 @@ def _describe_stamps(
     if scale is None:
         scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
-        stamps, _ = without_overflow(stamps)
+        stamps = without_overflow(stamps)
         seconds = stamps * scale
         steps = np.diff(seconds)
     # A column that was named as the clock may be anything, so what follows has to hold: finite

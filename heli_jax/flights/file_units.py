@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.request import Request
@@ -63,11 +64,15 @@ def _compared(log: ChannelLog | Table, signal: Signal) -> Signal:
     return signal if same else dataclasses.replace(signal, contradicted=stated)
 
 
-def other_units(request: Request) -> list[str]:
+def other_units(request: Request) -> list[Finding]:
     """Notes on units that the file states otherwise than the configuration."""
     return [
-        f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
-        f" the file says {shown(signal.contradicted)}"
+        note(
+            "units.contradicted",
+            f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
+            f" the file says {shown(signal.contradicted)}",
+            name,
+        )
         for (name, _), signal in request.signals.items()
         if signal.contradicted
     ]
@@ -79,8 +84,9 @@ def unit_in_file(log: ChannelLog | Table, name: str) -> str:
     return held.get(name, "").strip()
 
 
-def taken_note(name: str, signal: Signal) -> str:
-    """That a signal is read in the file's unit, in words; empty where it is not."""
+def taken_note(name: str, signal: Signal) -> Finding | None:
+    """That a signal is read in the file's unit; None where it is not."""
     if not signal.assumed or signal.unit == signal.si:
-        return ""
-    return f"{name}: no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"
+        return None
+    words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"
+    return note("units.assumed", f"{name}: {words}", name)

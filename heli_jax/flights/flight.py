@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding
 from heli_jax.flights.signal_facts import SignalFacts
 
 HOLDS = ("zero-order", "linear", "mixed")
@@ -85,11 +86,11 @@ class Source:
     Attributes:
         path: of the file.
         sha256: of the file.
-        notes: what the reader assumed or did, in sentences.
+        notes: what the reader assumed or did.
         firmware: of the autopilot that wrote the log.
         parameters: of that autopilot, by name.
         rates: the usual rates of outputs in an autopilot's log [Hz].
-        cautions: sentences on what biases a fit to the log as it is used, which every fit repeats.
+        cautions: what biases a fit to the log as it is used, which every fit repeats.
         inputs: by the model's name, what each is in the log.
         outputs: likewise.
         first_time: from which windows of the log count [s], in the log's own count.
@@ -98,11 +99,11 @@ class Source:
 
     path: str
     sha256: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     rates: Mapping[str, float] = field(default_factory=dict)
-    cautions: tuple[str, ...] = ()
+    cautions: tuple[Finding, ...] = ()
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
     first_time: float = 0.0

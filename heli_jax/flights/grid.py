@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heli_jax.finding import Finding
+
 JITTER_ALLOWED = 0.1  # of a step, where rounding does not explain more
 LATEST = 1e12  # s, beyond any calendar; keeps sums and differences of stamps finite
 SHORTEST_STEP = 1e-9  # s
@@ -24,14 +26,15 @@ class Grid:
     jitter: float
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Finding, ...]:
         """What a reader of the results should know of it."""
         if self.jitter <= _JITTER_NOTED:
             return ()
-        return (
+        words = (
             f"the time stamps jitter by up to {100 * self.jitter:.2g} % of a step; the samples are"
-            f" taken as uniform, {self.dt:.6g} s apart",
+            f" taken as uniform, {self.dt:.6g} s apart"
         )
+        return (Finding("clock.jitter", "note", words, self.jitter, "steps"),)
 
 
 @dataclass(frozen=True)
@@ -77,21 +80,19 @@ _COUNTER = 2.0**32
 """ticks after which a counter of 32 bits begins anew: 71.6 minutes of microseconds"""
 
 
-def without_overflow(stamps: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Stamps (N,) of a counter of 32 bits that began anew, as going on, and a note of it."""
+def without_overflow(stamps: np.ndarray) -> np.ndarray:
+    """Stamps (N,) of a counter of 32 bits that began anew, as going on."""
     steps = np.diff(stamps)
     back = np.flatnonzero(steps < 0)
     # Whole numbers below its end, that fall by nearly all of it and then go on as before.
     if not back.size or not (stamps.min() >= 0 and stamps.max() < _COUNTER):
-        return stamps, ()
+        return stamps
     on = steps[back] + _COUNTER
     usual = float(np.median(steps))
     if not np.all((on > 0) & (on <= _ON * usual)) or np.any(stamps != np.rint(stamps)):
-        return stamps, ()
+        return stamps
     turns = np.cumsum(np.r_[0, steps < 0])
-    times = "once" if back.size == 1 else f"{back.size} times"
-    note = f"the time began anew at 2^32 ticks {times}, as a counter of 32 bits does: it goes on"
-    return stamps + _COUNTER * turns, (note,)
+    return stamps + _COUNTER * turns
 
 
 def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:

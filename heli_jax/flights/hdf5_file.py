@@ -45,7 +45,11 @@ def main() -> None:
         sets = guarded(path, "HDF5 file", lambda: _read(path, kind, budget))
         arrays, units, notes = sets.vectors()
         shapes = [(name, x.dtype.str, x.size) for name, x in arrays.items()]
-        head = {"arrays": shapes, "units": units, "notes": notes}
+        head = {
+            "arrays": shapes,
+            "units": units,
+            "notes": [(n.code, n.sentence, n.subjects, n.value) for n in notes],
+        }
     except InputError as e:
         head = {"error": str(e)}
     sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")

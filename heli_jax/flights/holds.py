@@ -22,7 +22,8 @@ class Decision(NamedTuple):
     reason: str
 
 
-_LOW_PASSED = "was low-passed as"
+LOW_PASSED = "resampling.input-low-passed"
+"""code of an input that was commanded in steps and was low-passed with outputs"""
 _SHARE = 0.05, 0.9
 """share of the motion in jumps, from which on an input is held at them, and at all samples: white
 noise has 0.01, a random walk 0.02, steps under noise of half a percent 0.96"""
@@ -86,12 +87,13 @@ def without_jumps(flight: Flight) -> Flight:
 
 def low_passed(outputs: Iterable[str]) -> Decision:
     """Of an input that was commanded in steps and went through the filter of these outputs."""
-    return Decision("linear", f"{_LOW_PASSED} {', '.join(outputs)}")
+    return Decision("linear", f"was low-passed as {', '.join(outputs)}")
 
 
-def is_low_passed(reason: str) -> bool:
-    """Whether the reason of a hold is that of `low_passed`: no other hold is right then."""
-    return reason.startswith(_LOW_PASSED)
+def is_low_passed(flight: Flight, name: str) -> bool:
+    """Whether an input went through the filter of outputs: no other hold is right then."""
+    notes = flight.source.notes if flight.source else ()
+    return any(n.code == LOW_PASSED and name in n.subjects for n in notes)
 
 
 def _of_few_values(moves: np.ndarray, moved: np.ndarray, share: float) -> Decision:

@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.repeats import carried_on, first_of_each
 from heli_jax.flights.request import Request
 from heli_jax.flights.runs import clock_scale
 from heli_jax.flights.slower import SLOWER, usual_step
-from heli_jax.flights.table import Table, shown
+from heli_jax.flights.table import Table, listed, shown
 
 _SHARED = 0.1
 """of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
@@ -170,18 +171,18 @@ def topics_of(
     return tuple(topics)
 
 
-def joined_note(topics: Sequence[Topic]) -> str:
-    """What was made of the rows, in a sentence."""
-    known = [t for t in topics if t.times.size > 1]
-    rates = ", ".join(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known[:6])
-    more = f" and {len(known) - 6} more" if len(known) > 6 else ""
-    return (
+def joined_note(topics: Sequence[Topic]) -> Finding:
+    """What was made of the rows."""
+    known = (t for t in topics if t.times.size > 1)
+    rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
+    words = (
         f"its rows hold one topic each and leave other cells empty: each column is taken at the "
-        f"rows that hold it ({rates}{more})"
+        f"rows that hold it ({rates})"
     )
+    return note("channels.joined", words, value=len(topics))
 
 
-def _carried_note(topics: Sequence[Topic], carried: Collection[str]) -> str:
+def _carried_note(topics: Sequence[Topic], carried: Collection[str]) -> Finding:
     """What was made of values that are carried on."""
     rates = ", ".join(
         f"{shown(name)} at about {1 / usual_step(t.times):.4g} Hz"
@@ -189,11 +190,12 @@ def _carried_note(topics: Sequence[Topic], carried: Collection[str]) -> str:
         for name in t.columns
         if name in carried
     )
-    return (
+    words = (
         "its rows are those of several topics, and between its own each column repeats the last "
         f"value (a join that was filled forward): each is taken where it has a new one ({rates}); "
         "`repeats: keep` beside an output takes the repeats for measurements"
     )
+    return note("repeats.carried-on", words, *carried)
 
 
 def _called(names: Sequence[str]) -> str:

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights.array_table import ArrayTable, DataSets
 from heli_jax.flights.csv_dates import is_date, seconds_of_dates
-from heli_jax.flights.table import Budget, shown, wrong
+from heli_jax.flights.table import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
@@ -43,8 +44,8 @@ def open_json(path: Path) -> ArrayTable:
     for name, values in _columns(where, content, sets.budget).items():
         _add(sets, name, values, texts)
     if texts:
-        more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
-        sets.note(f"left out, since they hold text: {', '.join(map(shown, texts[:6]))}{more}")
+        words = f"left out, since they hold text: {listed(map(shown, texts))}"
+        sets.note(note(LEFT_OUT, words, *texts))
     return sets.table(where, "json", data)
 
 

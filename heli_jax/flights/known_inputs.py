@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.onto_grid import FEWEST
 from heli_jax.flights.request import Request
 from heli_jax.flights.table import shown
@@ -11,7 +12,7 @@ from heli_jax.flights.table import shown
 
 def rows_of_known_inputs(
     request: Request, numbers: Mapping[str, np.ndarray], seconds: np.ndarray, rows: slice
-) -> tuple[slice, tuple[str, ...]]:
+) -> tuple[slice, tuple[Finding, ...]]:
     """The rows without those before an input's first value or behind its last, and a note of it.
 
     An input is somewhere all the time, and where it was before its first value nobody knows: a
@@ -32,11 +33,13 @@ def rows_of_known_inputs(
             continue
         first = max(first, rows.start + int(known[0]))
         stop = min(stop, rows.start + int(known[-1]) + 1)
-        cut.append(shown(name))
+        cut.append(name)
     if not cut or stop - first < FEWEST:
         return rows, ()
     where = f"from {seconds[first]:.6g} s to {seconds[stop - 1]:.6g} s"
     count = (rows.stop - rows.start) - (stop - first)
     many = "1 row is" if count == 1 else f"{count} rows are"
-    words = f"{', '.join(cut)} {'has' if len(cut) == 1 else 'have'} no value before or behind"
-    return slice(first, stop), (f"the flight is {where}: {words}, and {many} left out",)
+    have = "has" if len(cut) == 1 else "have"
+    words = f"{', '.join(map(shown, cut))} {have} no value before or behind, and {many} left out"
+    left_out = note("windows.inputs-known", f"the flight is {where}: {words}", *cut, value=count)
+    return slice(first, stop), (left_out,)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.errors import nearest
+from heli_jax.finding import Finding
 from heli_jax.flights.table import shown, wrong
 
 _APART = 1.0
@@ -55,7 +56,7 @@ class ChannelLog:
         topics: those that hold samples.
         firmware: which wrote it, in its own words.
         parameters: the firmware's settings, by name.
-        notes: what was lost or assumed when it was read, in sentences.
+        notes: what was lost or assumed when it was read.
         flight: which flight of the file it is, from 1, and of how many.
         cautions: what speaks against its times, which every fit repeats.
         start: when the logger began [s], in the log's own count, where the log says so.
@@ -68,10 +69,10 @@ class ChannelLog:
     topics: tuple[Topic, ...]
     firmware: str = ""
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     flight: tuple[int, int] = (1, 1)
     start: float | None = None
-    cautions: tuple[str, ...] = ()
+    cautions: tuple[Finding, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.table import shown
 
 _FEWEST = 8
@@ -143,10 +144,13 @@ def suspected(numbers: np.ndarray) -> np.ndarray:
     return at
 
 
-def suspect_notes(numbers: np.ndarray) -> list[str]:
-    """What is said of numbers (N,) that may be marks, behind the name of their channel."""
+def suspect_notes(name: str, numbers: np.ndarray) -> list[Finding]:
+    """What is said of numbers (N,) that may be marks; `name` is their channel's, as it is shown."""
     at = suspected(numbers)
-    return [f"has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"] if at.any() else []
+    if not at.any():
+        return []
+    words = f"{name} has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"
+    return [note("samples.stray-kept", words, value=int(np.count_nonzero(at)))]
 
 
 def at_sure_or_suspected(numbers: np.ndarray) -> np.ndarray:
@@ -162,7 +166,7 @@ def without_marks(numbers: np.ndarray) -> np.ndarray:
     return np.where(at, np.nan, numbers) if at.any() else numbers
 
 
-def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
+def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[Finding]:
     """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
     notes = []
     for name, numbers in channels:
@@ -175,9 +179,12 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
             # What counts first: a terminal shows the beginning.
             stand = "stands" if np.count_nonzero(at) == 1 else "stand"
             words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
-            notes.append(f"{words}: a fit takes them as missing")
+            words += ": a fit takes them as missing"
+            notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
     more = len(notes) - _MOST_NOTES
-    return [*notes[:_MOST_NOTES], f"{more} more channels have such samples"] if more > 0 else notes
+    if more <= 0:
+        return notes
+    return [*notes[:_MOST_NOTES], note("samples.marks", f"{more} more channels have such samples")]
 
 
 def counted(values: np.ndarray) -> Counts:

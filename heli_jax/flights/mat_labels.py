@@ -10,19 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.table import shown
-
 _LABELS, _UNITS = ("label", "name", "signalname"), ("unit", "units")
 _INDEXED = re.compile(r"(.*)\[\d+\]")
-_MOST_NAMED = 6
 
 
 class Labelled(NamedTuple):
-    """Arrays by their names, the units that stand beside them, and notes."""
+    """Arrays by their names, and the units that stand beside them."""
 
     arrays: dict[str, np.ndarray]
     units: dict[str, str]
-    notes: tuple[str, ...] = ()
 
 
 def labelled(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> Labelled:
@@ -55,11 +51,7 @@ def labelled(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> Labe
             names[path] = f"{match[1]}.{label}"
     taken = [*names.values(), *(path for path in arrays if path not in names)]
     names = {path: name for path, name in names.items() if taken.count(name) == 1}
-    listed = ", ".join(f"{shown(n)} for {shown(p)}" for p, n in list(names.items())[:_MOST_NAMED])
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    notes = (f"arrays are called by the labels beside them: {listed}{more}",) if names else ()
     return Labelled(
         {names.get(path, path): values for path, values in arrays.items()},
         {names.get(path, path): unit for path, unit in units.items()},
-        notes,
     )

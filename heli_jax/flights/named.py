@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import DerivedLog, DerivedTable
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.preset import choose, meanings, preset, presets
@@ -13,8 +14,8 @@ class Named(NamedTuple):
     """Columns by name, each with the channel that it is in SI."""
 
     signals: Mapping[str, Signal]
-    notes: tuple[str, ...] = ()
-    """what is not among them, in sentences"""
+    notes: tuple[Finding, ...] = ()
+    """what is not among them"""
     required: bool = True
     """whether a channel without a usable clock is an error; it is left out otherwise"""
 
@@ -53,8 +54,9 @@ def by_preset(name: str) -> NamedBy:
             instead = f"preset {' or '.join(fitting)}, or " if fitting else ""
             problem = f"holds no channel of preset {table.name}, expected {instead}--signals"
             raise wrong(log.path, problem)
-        lacking = ", ".join(signal for signal in chosen if signal not in signals)
-        notes = (f"preset {table.title}: the log has no {lacking}",) if lacking else ()
+        lacking = [signal for signal in chosen if signal not in signals]
+        words = f"preset {table.title}: the log has no {', '.join(lacking)}"
+        notes = (note("channels.lacking", words, *lacking),) if lacking else ()
         return Named(signals, notes, required=False)
 
     return named

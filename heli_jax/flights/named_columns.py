@@ -11,7 +11,6 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.channel_names import words_in
-from heli_jax.flights.table import shown
 from heli_jax.flights.time_units import time_unit
 
 _NAMES = {
@@ -23,7 +22,6 @@ _NAMES = {
 _UNITS = {"unit", "units"}
 _FEWEST_SHARED = 3
 """letters by which a matrix and a list of names belong together: OutputData, OutputName"""
-_MOST_NAMED = 6
 
 
 class NamedColumns:
@@ -60,22 +58,6 @@ class NamedColumns:
         """The unit of a column, empty where none stands beside the matrix."""
         units = self._units.get(path)
         return units[column] if units else ""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Which matrices have columns with names."""
-        if not self._names:
-            return ()
-        listed = ", ".join(
-            f"{shown(path)} ({', '.join(names[:_MOST_NAMED])}{', ...' if rest else ''})"
-            for path, names in list(self._names.items())[:_MOST_NAMED]
-            for rest in (names[_MOST_NAMED:],)
-        )
-        more = len(self._names) - _MOST_NAMED
-        return (
-            f"columns are called by the names beside them: {listed}"
-            + (f" and {more} more" if more > 0 else ""),
-        )
 
 
 def _columns(array: np.ndarray) -> int:

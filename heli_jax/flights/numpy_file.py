@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, note
 from heli_jax.flights import array_table
 from heli_jax.flights.array_table import ArrayTable, DataSets
-from heli_jax.flights.table import Budget, shown, wrong
+from heli_jax.flights.table import Budget, listed, shown, wrong
 from heli_jax.regular_file import read_regular
 
 MAGIC = b"\x93NUMPY"
@@ -44,12 +45,11 @@ def open_numpy(path: Path) -> ArrayTable:
 
     array_table.guarded(path, "file of NumPy", read)
     if objects:
-        listed = ", ".join(map(shown, objects[:6]))
-        words = f"objects of Python, which are not read: {listed}"
+        words = f"objects of Python, which are not read: {listed(map(shown, objects))}"
         if not sets.names:
             problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
             raise wrong(where, problem)
-        sets.note(words)
+        sets.note(note(LEFT_OUT, words, *objects))
     return sets.table(where, "numpy", data)
 
 

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight, Source
-from heli_jax.flights.holds import Decision, decide, low_passed
+from heli_jax.flights.holds import LOW_PASSED, Decision, decide, low_passed
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import (
@@ -29,9 +30,9 @@ from heli_jax.flights.slower import (
     at_own_rate,
     is_slower,
     own_clock,
+    slower_words,
     usual_step,
 )
-from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
 Key = tuple[str, str]
@@ -61,7 +62,7 @@ def long_gap(seconds: np.ndarray) -> LongGap | None:
 
 def window_note(
     window: tuple[float, float] | None, end: float, step: float = 0.0
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """A note where a window reaches beyond the log, else none.
 
     Args:
@@ -72,7 +73,7 @@ def window_note(
     if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
         return ()
     words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
-    return (f"{words}, which ends at {end:.6g} s",)
+    return (note("windows.cut", f"{words}, which ends at {end:.6g} s", value=end),)
 
 
 def even_expected(seconds: np.ndarray, usual: float) -> str:
@@ -96,13 +97,13 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
     return holds
 
 
-def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
-    """What is to be said of the signals as they were logged, in sentences."""
+def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
+    """What is to be said of the signals as they were logged."""
     values = {key: signal.values for key, signal in signals.items()}
     return [*_missing_notes(request, signals), *_turn_notes(request, values)]
 
 
-def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
+def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
     """A note for every output with missing samples: how many, and where in the log."""
     notes = []
     for key, signal in signals.items():
@@ -112,11 +113,12 @@ def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
             name = shown(request.signals[key].name)
             are = "is" if count == 1 else "are"
             words = f"{count} of {missing.size} samples of {name} {are} missing"
-            notes.append(f"{words}, {_where(signal.seconds[missing], missing)}")
+            words += f", {_where(signal.seconds[missing], missing)}"
+            notes.append(note("samples.missing", words, key[0], value=count))
     return notes
 
 
-def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
+def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[Finding]:
     """A note for every angle (N,) that jumps by a turn, as a heading from -pi to pi does."""
     notes = []
     for key, samples in values.items():
@@ -129,11 +131,12 @@ def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]
         if count:
             turn = float(np.ptp(signal.from_si(np.array([0.0, 2 * np.pi]))))
             often = "once" if count == 1 else f"{count} times"
-            notes.append(
+            words = (
                 f"{shown(signal.name)} jumps by a turn {often}, which no model does, and between "
                 "samples it is drawn through the jump: name the channel "
                 f"unwrap({shown(signal.name)[1:-1]}, {turn:.6g}) instead"
             )
+            notes.append(note("angles.jump", words, key[0], value=count))
     return notes
 
 
@@ -150,7 +153,7 @@ def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
 
 def measured_once(
     request: Request, signals: Mapping[Key, Timed]
-) -> tuple[dict[Key, np.ndarray], list[str]]:
+) -> tuple[dict[Key, np.ndarray], list[Finding]]:
     """The signals (N,), repeated values of slow outputs taken as missing, and notes."""
     outputs = request.of_kind("output", signals)
     stated = {name: request.signals[name, "output"].repeats for name in outputs}
@@ -164,7 +167,7 @@ class OnGrid(NamedTuple):
 
     samples: dict[Key, np.ndarray]
     holds: dict[str, Decision]
-    notes: list[str]
+    notes: list[Finding]
 
 
 def at_times(
@@ -198,20 +201,22 @@ def at_times(
                 samples[key, kind] = low[key]
                 outputs = ", ".join(alike[key])
                 follow = "follow" if len(alike[key]) > 1 else "follows"
-                notes.append(
+                words = (
                     f"{key} is low-passed as well and linear between samples, since {outputs} "
                     f"{follow} it within a sample: filtered alike, both keep what is between them"
                 )
+                notes.append(note(LOW_PASSED, words, key))
             else:
                 # A low-pass filter would turn a stick that jumps into one that rings.
                 samples[key, kind] = held_mean(*signal, times)
                 if not np.isin(samples[key, kind], signal.values).all():
-                    words = f"{key} is held: each step of the grid has its mean over that step"
-                    notes += [words, *_between(request, signals, key, times)]
+                    notes += _between(request, signals, key, times)
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples
-            notes.append(slower_note(shown(request.signals[key, kind].name), placed, signal, rate))
+            words = slower_words(shown(request.signals[key, kind].name), placed, signal, rate)
+            count = int(np.count_nonzero(np.isfinite(placed.samples)))
+            notes.append(note("resampling.slower", words, key, value=count))
         else:
             own = own_clock(signal)
             # Missing rows are no longer there to say where too much is missing.
@@ -237,7 +242,7 @@ def at_times(
 
 def _between(
     request: Request, signals: Mapping[Key, Timed], name: str, times: np.ndarray
-) -> list[str]:
+) -> list[Finding]:
     """What to say of a held input that moves between the samples of outputs that jump with it."""
     signal = signals[name, "input"]
     jump = [o for (i, o), at_once in request.options.follows.items() if i == name and at_once]
@@ -249,11 +254,12 @@ def _between(
     if not jump or not goes_down(signal.seconds, times):
         return []
     hz = 1.0 / usual_step(signal.seconds)
-    return [
+    words = (
         f"{', '.join(jump)} and {name} jump together, and {name} was logged at about {hz:.4g} Hz: "
         "its mean over a step is not what they show at the step's beginning, and estimates suffer; "
         f"a rate as high as that of {name} keeps both as they are"
-    ]
+    )
+    return [note("resampling.jumps-averaged", words, name, *jump, value=hz)]
 
 
 def _alike(

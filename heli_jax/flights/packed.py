@@ -4,12 +4,13 @@ Sources: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute conv
 NetCDF User's Guide. Libraries apply some of them or none; here all files are unpacked alike.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.table import shown
+from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.flights.table import listed, shown
 
 ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned"),
@@ -17,7 +18,6 @@ ATTRIBUTES = (
 )
 """what is asked of a data set"""
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
-_MOST_NAMED = 6
 
 
 class Packing(ValueError):
@@ -25,10 +25,9 @@ class Packing(ValueError):
 
 
 class Unpacked(NamedTuple):
-    """Numbers of a data set, of its shape: whether they were scaled, and how many are missing."""
+    """Numbers of a data set, of its shape, and how many are missing."""
 
     values: np.ndarray
-    is_scaled: bool = False
     n_missing: int = 0
 
 
@@ -58,28 +57,24 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> Unpacked:
     count = int(np.count_nonzero(missing))
     if count:
         values = np.where(missing, np.nan, values.astype(np.float64))
-    return Unpacked(values, is_scaled, count)
+    return Unpacked(values, count)
 
 
-def notes_of(
-    scaled: Mapping[str, None], missing: Mapping[str, int], left_out: Mapping[str, str]
-) -> tuple[str, ...]:
-    """What was made of a file's data sets, in sentences.
+def notes_of(missing: Mapping[str, int], left_out: Mapping[str, str]) -> tuple[Finding, ...]:
+    """What was made of a file's data sets.
 
     Args:
-        scaled: names of those whose numbers were scaled.
         missing: by name the number of fills.
         left_out: by name why.
     """
     notes = []
-    if scaled:
-        words = "packed numbers are unpacked by the file's scale_factor and add_offset"
-        notes.append(f"{words}: {_listed(map(shown, scaled))}")
     if missing:
-        listed = _listed(f"{shown(name)} ({count})" for name, count in missing.items())
-        notes.append(f"the file's marks for no value are taken as missing samples: {listed}")
+        each = listed(f"{shown(name)} ({count})" for name, count in missing.items())
+        words = f"the file's marks for no value are taken as missing samples: {each}"
+        notes.append(note("samples.marks", words, *missing, value=sum(missing.values())))
     if left_out:
-        notes.append(f"left out: {_listed(f'{shown(n)}, {w}' for n, w in left_out.items())}")
+        words = f"left out: {listed(f'{shown(n)}, {w}' for n, w in left_out.items())}"
+        notes.append(note(LEFT_OUT, words, *left_out))
     return tuple(notes)
 
 
@@ -90,12 +85,6 @@ def text_of(attribute: object) -> str:
     if isinstance(attribute, bytes):
         attribute = attribute.decode("utf-8", "replace")
     return attribute.strip("\0 ") if isinstance(attribute, str) else ""
-
-
-def _listed(words: Iterable[str]) -> str:
-    each = list(words)
-    more = f" and {len(each) - _MOST_NAMED} more" if len(each) > _MOST_NAMED else ""
-    return f"{', '.join(each[:_MOST_NAMED])}{more}"
 
 
 def _signed(stored: np.ndarray, unsigned: object) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.table import (
     Budget,
@@ -80,7 +81,7 @@ class ColumnTable:
     """A `Table` on columns of Arrow, which come in pieces."""
 
     format = "arrow"
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     _unpacked = 0
     """bytes of all columns once they are unpacked, where the file states them"""
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Flight, Signal
@@ -130,8 +131,7 @@ def read_parts(
                 raise InputError("no input moves")
             flight = _enough_measured(finish(flight_from(logs, part)))
         except InputError as e:
-            words = str(e).removeprefix(f"{request.path}, ").removeprefix(f"{request.path}: ")
-            left_out.append(f"{start:.6g} s to {end:.6g} s ({words})")
+            left_out.append(f"{start:.6g} s to {end:.6g} s ({e.within})")
             why = e
             continue
         reasons = {
@@ -199,15 +199,17 @@ def _of_part(
     return part
 
 
-def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[str, ...]:
-    """What was split and what was left out, in words; `intervals` [s]."""
+def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[Finding, ...]:
+    """What was split and what was left out; `intervals` [s]."""
     gaps = [after - before for (_, before), (after, _) in itertools.pairwise(intervals)]
     count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-    note = f"{count} of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
+    words = f"{count} of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
+    split = note("clock.gaps-split", words, value=max(gaps))
     if not left_out:
-        return (note,)
+        return (split,)
     more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    return (note, f"left out: {'; '.join(left_out[:3])}{more}")
+    words = f"left out: {'; '.join(left_out[:3])}{more}"
+    return (split, note("windows.left-out", words, value=len(left_out)))
 
 
 def _enough_measured(flight: Flight) -> Flight:
@@ -223,10 +225,10 @@ def _enough_measured(flight: Flight) -> Flight:
     words = (
         f"{flight.name}: without {', '.join(few)}, of which fewer than {FEWEST} samples are seen"
     )
-    return _with_notes(flight, (words,))
+    return _with_notes(flight, (note(LEFT_OUT, words, *few),))
 
 
-def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
+def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
     assert flight.source is not None  # it was read from a log
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
     return dataclasses.replace(flight, source=source)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.file_units import other_units
@@ -96,7 +97,7 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
     return flight_of_signals(signals_of(log, request), request, source, log.first_time)
 
 
-def channel_window_note(log: ChannelLog, request: Request) -> tuple[str, ...]:
+def channel_window_note(log: ChannelLog, request: Request) -> tuple[Finding, ...]:
     """A note where the window reaches beyond the topics that are asked for."""
     times = [log.topic_of(signal.name).times for signal in request.signals.values()]
     # The one that ends first is where the flight does.
@@ -231,7 +232,7 @@ def _on_grid(
         made = OnGrid(samples, dict(holds), list(notes))
         return float(clocks[0].seconds[0]), dt, made
     clocks = on_all_the_time(signals, rate)
-    notes = [f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes]
+    notes = [n.of(c.topic) for c in clocks for n in new_clock(c.seconds, rate).notes]
     _require_no_gaps(path, clocks)
     times = common_times(path, clocks, rate, _sampled_alike(signals, rate))
     timed = {key: signal.timed for key, signal in signals.items()}
@@ -254,7 +255,7 @@ def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[T
     return clocks_of(needed or signals.values())
 
 
-def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
+def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[Finding, ...]]:
     """The step [s] of a single topic's clock, which is a uniform grid, and notes."""
     seconds = clock.seconds
     grid = uniform_grid(seconds - seconds[0], rounding_of(seconds))

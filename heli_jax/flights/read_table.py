@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, sentences
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.clock_faults import require_increasing, unit_notes
@@ -120,7 +121,7 @@ def _with_runs(
     return whole, whole.numbers(request.columns)
 
 
-def table_window_note(loaded: LoadedTable, request: Request) -> tuple[str, ...]:
+def table_window_note(loaded: LoadedTable, request: Request) -> tuple[Finding, ...]:
     """A note where the window reaches beyond the table."""
     elapsed = loaded.clock.elapsed
     step = float(np.median(np.diff(elapsed))) if elapsed.size > 1 else 0.0
@@ -212,10 +213,9 @@ class _Clock:
 
     stamps: np.ndarray
     scale: float
-    notes: tuple[str, ...] = ()
-    unit_notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     """where the file or a name says another unit"""
-    cautions: tuple[str, ...] = ()
+    cautions: tuple[Finding, ...] = ()
     """what speaks against the times"""
 
     @contextlib.contextmanager
@@ -224,9 +224,9 @@ class _Clock:
         try:
             yield
         except InputError as e:
-            if not self.unit_notes:
+            if not self.notes:
                 raise
-            raise InputError("; ".join([str(e), *self.unit_notes])) from e
+            raise InputError("; ".join([str(e), *sentences(self.notes)])) from e
 
     @property
     def elapsed(self) -> np.ndarray:
@@ -263,20 +263,21 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         row = int(bad[0])
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
         raise wrong(table.path, problem, table.place(row), place)
-    stamps, notes = without_overflow(stamps)
+    stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
     step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
     cautions = contradicted_rate(table, time.name, 1.0 / step)
     if not stated and time.scale == 1.0:
         cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return _Clock(stamps, scale, (*notes, *said), said, cautions)
+    return _Clock(stamps, scale, said, cautions)
 
 
 def _rows(
     path: str, elapsed: np.ndarray, window: tuple[float, float] | None
-) -> tuple[slice, tuple[str, ...]]:
+) -> tuple[slice, tuple[Finding, ...]]:
     """The rows inside the window, and a note where the window reaches beyond the log."""
-    first, last, notes = 0, elapsed.size, ()
+    first, last = 0, elapsed.size
+    notes: tuple[Finding, ...] = ()
     where = "the log"
     if window is not None and elapsed.size > 1:
         step = float(np.median(np.diff(elapsed)))  # the mean would count the gaps
@@ -352,7 +353,7 @@ def _on_grid(
 ) -> tuple[float, OnGrid]:
     """The time step, and the signals on the uniform grid with notes on how they came there."""
     seconds, rate = stamps.seconds, request.options.rate
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     if isinstance(grid, Grid):
         if rate is None:
             return grid.dt, OnGrid(signals, dict(holds), list(grid.notes))

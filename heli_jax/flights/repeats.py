@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.slower import Timed, usual_step
 
 REPEATS = ("auto", "keep", "missing")
@@ -125,7 +126,7 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
 
 def repeats_removed(
     outputs: Mapping[str, Timed], stated: Mapping[str, str]
-) -> tuple[dict[str, np.ndarray], list[str]]:
+) -> tuple[dict[str, np.ndarray], list[Finding]]:
     """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes.
 
     Args:
@@ -150,33 +151,35 @@ def repeats_removed(
             # Stated by somebody who knows: then no further sign is asked for.
             usual = usual or round(float(np.median(lengths))) if lengths.size else None
             if usual is None or usual < 2:
-                notes.append(f"{name}: no value is repeated, though `repeats: missing` is stated")
                 continue
         elif usual is None:
             continue
         elif not (moving or sure):
             # Nothing else shows that the machine moved while this signal stood still.
-            notes.append(
+            words = (
                 f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
                 "`repeats: missing`"
             )
+            notes.append(note("repeats.kept", words, name, value=usual))
             continue
         made[name] = without_repeats(y, usual)
-        notes.append(
+        words = (
             f"{name} keeps each value for {usual} samples: taken as measured at the first of them "
             "and missing at the others (`repeats: keep` leaves them)"
         )
+        notes.append(note("repeats.missing", words, name, value=usual))
     return made, notes
 
 
-def _carried_note(name: str, seconds: np.ndarray, made: np.ndarray) -> str:
+def _carried_note(name: str, seconds: np.ndarray, made: np.ndarray) -> Finding:
     seen = ~np.isnan(made)
     hz = 1.0 / usual_step(seconds[seen])
-    return (
+    words = (
         f"{name} is carried on from row to row, with a new value at about {hz:.4g} Hz: taken as "
         f"measured at the {np.count_nonzero(seen)} rows with a new one and missing at the others "
         "(`repeats: keep` leaves them)"
     )
+    return note("repeats.carried-on", words, name, value=hz)
 
 
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.band_limited import PASSED, decimate, low_pass
 from heli_jax.flights.clock_steps import step_notes
 from heli_jax.numerics.jumps import split
@@ -25,7 +26,7 @@ class Clock:
 
     times: np.ndarray
     dt: float
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def longest_gap(seconds: np.ndarray) -> float:
@@ -41,11 +42,13 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     # The last sample is not lost to the rounding of its stamp.
     count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
     # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
-    notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
+    words = f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"
+    notes = [note("resampling.rate", words, value=1 / usual)]
     notes += step_notes(seconds, rate, longest_gap(seconds))
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
-        notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs")
+        words = f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs"
+        notes.append(note("resampling.low-passed", words, value=passed))
     return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
 
 

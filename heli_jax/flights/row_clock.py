@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.table import Survey, Table, shown
@@ -109,7 +110,7 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
 
 
-def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[str, ...]:
+def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, ...]:
     """A caution where a file states another rate than that of its times.
 
     Args:
@@ -128,7 +129,7 @@ def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[str, ...]:
     return rate_cautions(stated, clock, rate)
 
 
-def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple[str, ...]:
+def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple[Finding, ...]:
     """A caution for each rate that is neither that of times nor a whole multiple, of which every
     second or tenth sample may have been logged.
 
@@ -140,9 +141,15 @@ def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple
     if not (math.isfinite(rate) and rate > 0):
         return ()
     return tuple(
-        f"the file states {other:.6g} Hz ({words}), and its times {shown(clock)} are at "
-        f"{rate:.6g} Hz: one of the two clocks is wrong, and rates that follow from it are off "
-        f"by {abs(other / rate - 1):.0%}."
+        Finding(
+            "clock.rate-contradicted",
+            "doubt",
+            f"the file states {other:.6g} Hz ({words}), and its times {shown(clock)} are at "
+            f"{rate:.6g} Hz: one of the two clocks is wrong, and rates that follow from it are off "
+            f"by {abs(other / rate - 1):.0%}.",
+            other / rate,
+            f"stated rate over that of the times, whole numbers to {_OTHER_RATE:g}",
+        )
         for other, words in stated.items()
         if abs(other / rate / max(round(other / rate), 1) - 1.0) > _OTHER_RATE
     )

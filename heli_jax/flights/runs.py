@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from heli_jax import units
+from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
@@ -28,7 +29,7 @@ _NAMES = {
 class RunsTable:
     """A `Table` whose runs follow one another."""
 
-    def __init__(self, table: Table, clock: str, stamps: np.ndarray, note: str) -> None:
+    def __init__(self, table: Table, clock: str, stamps: np.ndarray, note: Finding) -> None:
         """
         Args:
             table: of all runs.
@@ -78,7 +79,7 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
     none = np.zeros(0, int)
     if stamps.size < 2 * _SHORTEST or not np.isfinite(stamps).all():
         return none
-    stamps, _ = without_overflow(stamps)
+    stamps = without_overflow(stamps)
     steps = np.diff(stamps)
     # A stick that steps stands still in between.
     if np.any(steps == 0):
@@ -118,7 +119,7 @@ def set_apart(stamps: np.ndarray, starts: np.ndarray, scale: float) -> np.ndarra
     return apart
 
 
-def run_words(table: Table, starts: np.ndarray, column: str = "") -> str:
+def run_note(table: Table, starts: np.ndarray, column: str = "") -> Finding:
     """That a table holds several runs, and where they begin.
 
     Args:
@@ -129,10 +130,11 @@ def run_words(table: Table, starts: np.ndarray, column: str = "") -> str:
     places = ", ".join(table.place(int(start)) for start in starts[:4])
     more = f" and {starts.size - 4} more" if starts.size > 4 else ""
     why = f"{shown(column)} is another" if column else "the time begins anew"
-    return (
+    words = (
         f"{why} in {places}{more}: {starts.size + 1} runs, put one after another with "
         f"{_BETWEEN:g} s between"
     )
+    return note("clock.runs", words, value=starts.size + 1)
 
 
 def clock_scale(table: Table, time: Signal) -> float:
@@ -165,10 +167,10 @@ def with_runs(
     if not starts.size:
         return table
     apart = set_apart(stamps, starts, scale)
-    return RunsTable(table, clock, apart, run_words(table, starts, column))
+    return RunsTable(table, clock, apart, run_note(table, starts, column))
 
 
-def numbering_notes(column: str) -> tuple[str, ...]:
+def numbering_notes(column: str) -> tuple[Finding, ...]:
     """That a column numbers runs, where one does.
 
     Args:
@@ -177,7 +179,8 @@ def numbering_notes(column: str) -> tuple[str, ...]:
     if not column:
         return ()
     remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
-    return (f"{shown(column)} seems to number runs, which the time does not part: {remedy}",)
+    words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
+    return (note("clock.runs-numbered", words, column),)
 
 
 def numbering(surveys: Sequence[Survey]) -> str:

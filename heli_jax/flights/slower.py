@@ -130,7 +130,7 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(moved) & (np.abs(away) <= _NEAR * step), moved, lines)
 
 
-def note(name: str, placed: Placed, signal: Timed, rate: float) -> str:
+def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
     """What was done to a slow output, in a sentence.
 
     Args:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import Finding, note
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
@@ -46,7 +47,7 @@ class Beside(NamedTuple):
     found."""
 
     signals: Mapping[Key, ClockedSignal]
-    note: str
+    note: Finding
 
 
 class Opened(NamedTuple):
@@ -120,7 +121,7 @@ def flight_from(logs: Opened, request: Request) -> Flight:
     return flight_of_signals(clocked(logs, request), request, source, first)
 
 
-def beyond(logs: Opened, request: Request) -> tuple[str, ...]:
+def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
     """A note where the window reaches beyond the first log."""
     log, asked = logs.log, _only(request, logs.keys)
     if isinstance(log, ChannelLog):
@@ -204,8 +205,7 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
     signals = _clocked(_open(asked, file), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
-    words = _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)
-    return Beside(shifted, words), asked
+    return Beside(shifted, _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)), asked
 
 
 def _of_one_clock(
@@ -242,7 +242,8 @@ def _of_one_clock(
         f"{name} (sha256 {file.sha256[:12]}): its times are taken as those of {first}, with which "
         f"it shares {shared:.4g} s; if each counts from a beginning of its own, state align"
     )
-    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, words), asked
+    taken = note("clock.taken-as-one", words, value=shared)
+    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, taken), asked
 
 
 def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
@@ -254,19 +255,21 @@ def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[floa
     )
 
 
-def _note(name: str, also: Also, lag: Lag) -> str:
-    """What was found of the clock of a further log, in words."""
+def _note(name: str, also: Also, lag: Lag) -> Finding:
+    """What was found of the clock of a further log."""
     words = (
         f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
         f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
         f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
-    if lag.drift is None:
-        return words
-    rate, sd = lag.drift
-    return (
-        f"{words}; the lag drifts by {-1e6 * rate:.3g} us a second (sd {1e6 * sd:.2g}), which is "
-        "not corrected"
+    if lag.drift is not None:
+        rate, sd = lag.drift
+        words += (
+            f"; the lag drifts by {-1e6 * rate:.3g} us a second (sd {1e6 * sd:.2g}), which is "
+            "not corrected"
+        )
+    return Finding(
+        "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
     )
 
 

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
-from heli_jax.flights.table import shown
+from heli_jax.flights.table import listed, shown
 from heli_jax.flights.time_units import split_unit
 
 NUMBER = "segment"
@@ -19,14 +20,13 @@ DEEPEST = 3
 """dimensions of an array that may be a stack"""
 _FEWEST = 10
 """samples of a segment, below which matrices of a few numbers are no stack"""
-_MOST_NAMED = 6
 
 
 class Unstacked(NamedTuple):
-    """Arrays of at most two dimensions, and what was made of the others, in sentences."""
+    """Arrays of at most two dimensions, and what was made of the others."""
 
     arrays: dict[str, np.ndarray]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 def unstacked(arrays: Mapping[str, np.ndarray]) -> Unstacked:
@@ -54,13 +54,14 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> Unstacked:
         words = f"{shape[0]} segments of {shape[1]} samples, put one after another"
         padding = shape[0] * shape[1] - rows
         words += f" without {padding} that pad them" if padding else ""
-        notes.append(f"stacked arrays, {_listed(made, arrays)}: {words}; {NUMBER!r} numbers them")
+        words = f"stacked arrays, {_listed(made, arrays)}: {words}; {NUMBER!r} numbers them"
+        notes.append(note("channels.stacked", words, *made, value=shape[0]))
         if NUMBER in arrays:
             made.pop(NUMBER, None)
     left = [n for n in deep if n not in made]
     if left:
         why = "which of their dimensions is the time is not known"
-        notes.append(f"left out, since {why}: {_listed(left, arrays)}")
+        notes.append(note(LEFT_OUT, f"left out, since {why}: {_listed(left, arrays)}", *left))
     kept = {n: made.get(n, x) for n, x in arrays.items() if n not in left}
     return Unstacked({**kept, **{n: x for n, x in made.items() if n not in kept}}, tuple(notes))
 
@@ -152,6 +153,4 @@ def _without_padding(
 
 
 def _listed(names: Mapping[str, np.ndarray] | list[str], arrays: Mapping[str, np.ndarray]) -> str:
-    listed = [f"{shown(n)} {arrays[n].shape}" for n in names if n in arrays]
-    more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
-    return f"{', '.join(listed[:_MOST_NAMED])}{more}"
+    return listed(f"{shown(n)} {arrays[n].shape}" for n in names if n in arrays)

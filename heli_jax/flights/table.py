@@ -1,13 +1,14 @@
 """A log as named columns of numbers, whatever the file's format."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
+from heli_jax.finding import Finding
 from heli_jax.regular_file import size_words
 
 
@@ -32,8 +33,8 @@ class Table(Protocol):
     format: str
     size: int
     names: tuple[str, ...]
-    notes: tuple[str, ...]
-    """what was assumed or left out when it was opened, in sentences"""
+    notes: tuple[Finding, ...]
+    """what was assumed or left out when it was opened"""
     units: Mapping[str, str]
     """by column, where the file states one"""
 
@@ -66,14 +67,24 @@ class Table(Protocol):
 def wrong(path: str, problem: str, *place: str) -> InputError:
     """The error for a file: `file, place, place: problem`, in one line whatever the names hold."""
     # A name from a file may hold line breaks or escape sequences, which a terminal would obey.
-    text = f"{', '.join((path, *place))}: {problem}"
-    return InputError(re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", text))
+    within = ": ".join((*([", ".join(place)] if place else []), problem))
+    text = f"{path}{', ' if place else ': '}{within}"
+    return InputError(
+        *(re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", t) for t in (text, within))
+    )
 
 
 def shown(text: str) -> str:
     """Text from a file, quoted, cut to 40 characters."""
     # Cut, since a damaged file may have a name as long as itself.
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
+
+
+def listed(words: Iterable[str]) -> str:
+    """The first six, and how many more there are."""
+    each = list(words)
+    more = f" and {len(each) - 6} more" if len(each) > 6 else ""
+    return f"{', '.join(each[:6])}{more}"
 
 
 def column(name: str) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from heli_jax.errors import InputError
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
@@ -13,7 +14,7 @@ from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.runs import clock_scale, with_runs
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import Table, listed, shown, wrong
 from heli_jax.flights.table_view import numbers_once
 
 _MOST_NAMED = 6
@@ -27,7 +28,7 @@ def as_channels(
     table: Table,
     time: str | None,
     unit: str | None,
-    notes: list[str],
+    notes: list[Finding],
     rate: float | None = None,
 ) -> tuple[ChannelLog, Clockless]:
     """A table as a log of one topic, its clock named or guessed; arrays of other lengths that have
@@ -54,7 +55,7 @@ def as_channels(
     return ChannelLog(table.path, table.format, table.size, table.sha256, tuple(topics)), clockless
 
 
-def without_joins(log: ChannelLog, notes: list[str]) -> ChannelLog:
+def without_joins(log: ChannelLog, notes: list[Finding]) -> ChannelLog:
     """The log with topics of their own where the rows of a table hold one topic each."""
     topics: list[Topic] = []
     for topic in log.topics:
@@ -69,7 +70,7 @@ def without_joins(log: ChannelLog, notes: list[str]) -> ChannelLog:
 
 
 def require_clocks(
-    log: ChannelLog, clockless: Clockless, patterns: Sequence[str], notes: list[str]
+    log: ChannelLog, clockless: Clockless, patterns: Sequence[str], notes: list[Finding]
 ) -> None:
     """Refuse, or where they were not asked for by name note, arrays without a clock."""
     rows = log.topics[0].times.size
@@ -82,10 +83,11 @@ def require_clocks(
             raise wrong(log.path, problem, f"array {shown(name)}")
     asked = [n for p in patterns or ["*"] for n in matching(clockless, p)]
     for size in dict.fromkeys(clockless[name] for name in asked):
-        names = [shown(n) for n in dict.fromkeys(asked) if clockless[n] == size]
-        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-        words = f"left out: {', '.join(names[:6])}{more}"
-        notes.append(f"{words}, of {size} samples, for which there is no clock")
+        names = [n for n in dict.fromkeys(asked) if clockless[n] == size]
+        words = (
+            f"left out: {listed(map(shown, names))}, of {size} samples, for which there is no clock"
+        )
+        notes.append(note(LEFT_OUT, f"left out: {words}", *names, value=size))
 
 
 def in_runs(table: Table, clock: TimeInfo) -> Table:
@@ -99,10 +101,11 @@ def in_runs(table: Table, clock: TimeInfo) -> Table:
     return with_runs(table, clock.column, table.numbers([clock.column]), scale)
 
 
-def clock_words(clock: TimeInfo) -> str:
-    """What is taken for a clock of so many samples a second, in words."""
+def rate_note(clock: TimeInfo) -> Finding:
+    """What is taken for a clock of so many samples a second, since the file says so."""
     what = "rows" if clock.column == ROWS else shown(clock.column)
-    return f"{what} are taken as samples at {clock.counted:g} Hz"
+    words = f"{what} are taken as samples at {clock.counted:g} Hz, as the file says: {clock.said}"
+    return note("clock.rate-of-file", words, value=clock.counted)
 
 
 def matching(names: Iterable[str], pattern: str) -> list[str]:
@@ -115,7 +118,7 @@ def _table_topic(
     table: Table,
     time: str | None,
     unit: str | None,
-    notes: list[str],
+    notes: list[Finding],
     rate: float | None = None,
 ) -> tuple[Topic, float]:
     """The columns of a table's clock, which is named or guessed, and its first time [s]."""
@@ -129,12 +132,13 @@ def _table_topic(
         if clock:
             remedy += ", or a file without the rows that go back"
         if not clock and (texts := [c.name for c in info.columns if c.kind == "text"]):
-            why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
+            why += f" ({_why_unread(table, texts[0])})"
         raise wrong(table.path, f"{why}, {remedy}")
     if clock.said:
-        notes.append(f"{clock_words(clock)}, as the file says: {clock.said}")
+        notes.append(rate_note(clock))
     elif clock.guessed:
-        notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
+        words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
+        notes.append(note("clock.guessed", words, clock.column))
     is_rows = clock.column == ROWS
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
@@ -154,22 +158,27 @@ def _table_topic(
         numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
     else:
         numbers, copies = numbers_once(table, clock.column, names)
-    stamps, more = without_overflow(numbers.pop(clock.column))
-    notes += (*copies, *more)
+    stamps = without_overflow(numbers.pop(clock.column))
+    notes += copies
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
     return topic, float(stamps[0]) * scale
 
 
-def _left_out(table: Table, names: Sequence[str]) -> list[str]:
+def _left_out(table: Table, names: Sequence[str]) -> list[Finding]:
     """Notes on columns that hold text, with where and what it is."""
-    notes = []
-    for name in names[:_MOST_NAMED]:
-        try:
-            table.numbers([name])
-        except InputError as e:
-            notes.append(f"left out: {str(e).removeprefix(table.path).lstrip(',: ')}")
-    if len(names) > _MOST_NAMED:
-        notes.append(f"left out: {len(names) - _MOST_NAMED} more columns of text")
+    why = {name: _why_unread(table, name) for name in names[:_MOST_NAMED]}
+    notes = [note(LEFT_OUT, f"left out: {words}", name) for name, words in why.items() if words]
+    if more := names[_MOST_NAMED:]:
+        notes.append(note(LEFT_OUT, f"left out: {len(more)} more columns of text", *more))
     return notes
+
+
+def _why_unread(table: Table, name: str) -> str:
+    """Where a column holds text and what it is; empty where it holds numbers."""
+    try:
+        table.numbers([name])
+    except InputError as e:
+        return e.within
+    return ""

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note
 from heli_jax.flights.clock_parts import ClockParts, CompactClock, clock_parts
-from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.table import Survey, Table
 
 
 class TableView:
@@ -18,7 +19,7 @@ class TableView:
         table: Table,
         rows: np.ndarray | None = None,
         clock: ClockParts | CompactClock | None = None,
-        note: str = "",
+        note: Finding | None = None,
     ) -> None:
         """
         Args:
@@ -33,7 +34,7 @@ class TableView:
         self.units = table.units
         self.notes = self._all_notes()
 
-    def _all_notes(self) -> tuple[str, ...]:
+    def _all_notes(self) -> tuple[Finding, ...]:
         return (*self.table.notes, *([self._note] if self._note else []))
 
     @property
@@ -122,8 +123,9 @@ def seen_once(table: Table, rows: np.ndarray) -> TableView:
     left_out = np.setdiff1d(np.arange(int(rows[-1]) + 1), rows)
     # Behind the last row that is seen there may be more.
     first = int(left_out[0]) if left_out.size else int(rows[-1]) + 1
-    note = f"rows are written twice, the first in {table.place(first)}: each is read once"
-    return TableView(table, rows, note=note)
+    words = f"rows are written twice, the first in {table.place(first)}: each is read once"
+    twice = note("clock.rows-twice", words)
+    return TableView(table, rows, note=twice)
 
 
 def without_copies(table: Table, clock: str, surveys: Sequence[Survey]) -> Table:
@@ -145,7 +147,7 @@ def without_copies(table: Table, clock: str, surveys: Sequence[Survey]) -> Table
 
 def numbers_once(
     table: Table, clock: str, names: Sequence[str]
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
     """Columns (N,) of one length, and a note where rows that are there twice were left out.
 
     Args:
@@ -177,8 +179,4 @@ def with_joined_clock(table: Table) -> Table:
         return table
     if not clock.fits(columns):
         return table
-    *first, last = map(shown, clock.columns)
-    note = f"{', '.join(first)} and {last} are taken as one clock"
-    if not first:
-        note = f"{last} is taken for hours, minutes and seconds in one number, HHMMSS"
-    return TableView(table, clock=clock, note=note)
+    return TableView(table, clock=clock)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 
+from heli_jax.finding import Finding
 from heli_jax.flights.table import column, shown, wrong
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
@@ -64,7 +65,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 def require_likely(
     path: str, name: str, unit: str, stamps: np.ndarray, assumed: bool = False
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
     that one or nobody stated seconds; a caution where somebody did.
 
@@ -84,7 +85,8 @@ def require_likely(
     step, length = float(np.median(np.diff(stamps))), float(stamps[-1] - stamps[0])
     problem = f"in s its stamps are {step:.4g} s apart over {length:.4g} s: they look like {likely}"
     if named != likely and not assumed:
-        return (f"time: {shown(name)}: {problem}.",)
+        words = f"time: {shown(name)}: {problem}."
+        return (Finding("units.unlikely", "doubt", words, step, "seconds between stamps", (name,)),)
     why = f", as its name says {named}" if named == likely else ""
     remedy = f"expected its unit: {{signal: {name}, unit: {likely}}}"
     if named != likely:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from heli_jax.finding import note
 from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples
 from heli_jax.flights.px4_commands import is_command
@@ -106,11 +107,13 @@ def open_ulog(path: Path) -> ChannelLog:
         count = content.damaged
         share = 100 * content.lost / len(data)
         lost = f" ({share:.2g} % of the file)" if share >= _TOLD else ""
-        notes.append(f"{count} damaged message{'' if count == 1 else 's'} skipped{lost}")
+        words = f"{count} damaged message{'' if count == 1 else 's'} skipped{lost}"
+        notes.append(note("damage.skipped", words, value=count))
     if content.dropouts:
         times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
-        lost = f"{content.dropped * 1e-3:.3g} s in all"
-        notes.append(f"the logger dropped data {times}, {lost}")
+        lost = content.dropped * 1e-3
+        words = f"the logger dropped data {times}, {lost:.3g} s in all"
+        notes.append(note("damage.dropouts", words, value=lost))
     information = content.information
     parts = (information.get("sys_name", ""), information.get("ver_hw", ""), _version(information))
     return ChannelLog(

@@ -396,14 +396,15 @@ def _search(
 
 def cautions(problem: Problem) -> tuple[Finding, ...]:
     """What the logs say of their signals that biases a fit to them; once where flights agree."""
-    flights, said = tuple(problem.flights), {}
+    flights = tuple(problem.flights)
+    said: dict[str, Finding] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
         for caution in flight.source.cautions if flight.source else ():
-            said.setdefault(caution, label)
+            said.setdefault(caution.sentence, caution.of(label))
     own = own_instruments(problem.training, naming.names(problem.model.Inputs))
     own = own if problem.instrument is None else ()
     return (
-        *(note("quality.caution", f"{label}: {c}", label) for c, label in said.items()),
+        *said.values(),
         *((note("loop.instrument-unused", f"{own_said(own)}; it is not used."),) if own else ()),
         *_whole_band(problem),
     )

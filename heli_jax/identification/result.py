@@ -96,6 +96,8 @@ class Check:
     at_zero: dict[str, tuple[float, str]] = field(default_factory=dict)
     """by parameter that starts at zero, of which nothing is a part: the size [SI] that its expected
     sd is relative to, and the unit"""
+    log_notes: tuple[Finding, ...] = ()
+    """what the readers of the logs assumed or did"""
 
     @property
     def further_notes(self) -> tuple[Finding, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.identification.validation.follows_response import feedback
@@ -37,7 +38,7 @@ class Written(NamedTuple):
     """The files, the configuration first, and what the user has to know."""
 
     paths: tuple[Path, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
 
 def write_config(
@@ -102,34 +103,46 @@ def write_config(
         with whole_file(path, str(path)) as temporary:
             temporary.write_text(words, encoding="utf-8")
     todo = sum(words.count(EDIT) for words in (content, *paths.values()))
-    notes = [f"wrote {', '.join(map(str, (out, *paths)))}", *read.notes]
+    written = f"wrote {', '.join(map(str, (out, *paths)))}"
+    notes = [note("configuration.written", written), *read.notes]
     if todo:
         words = "1 number is" if todo == 1 else f"{todo} numbers are"
-        notes.append(f"{words} yours to give, where {EDIT} stands")
+        notes.append(
+            note(
+                "configuration.numbers-to-give",
+                f"{words} yours to give, where {EDIT} stands",
+                value=todo,
+            )
+        )
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
         outputs = ", ".join(naming.names(chosen.model.Outputs))
-        notes.append(f"found none of {outputs} by its name: say which were logged, and as what")
+        words = f"found none of {outputs} by its name: say which were logged, and as what"
+        notes.append(note("channels.lacking", words, *naming.names(chosen.model.Outputs)))
     if lacking:
         words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
-        notes.append(
-            f"{words}: name the stick's, which no rate or angle is, or write {{constant: 0}} in "
+        words += (
+            ": name the stick's, which no rate or angle is, or write {constant: 0} in "
             "place of {signal: EDIT} where it stayed where it was and was not logged"
         )
+        notes.append(note("channels.lacking", words, *lacking))
     if signals is not None:
         absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
         absent = [n for n in absent if n not in signals.wandering]
         called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
         notes += unread_notes((*lacking, *absent), called, read.unread)
     if vehicle_of_log := other_vehicle(read.autopilot):
-        notes.append(f"the log's vehicle is {vehicle_of_log}: see that the model is one of it")
+        words = f"the log's vehicle is {vehicle_of_log}: see that the model is one of it"
+        notes.append(note("model.other-vehicle", words))
     if others:
         assert isinstance(chosen.name, dict)
-        notes.append(
+        words = (
             f"the model {chosen.name['linear']} is a guess by the stick that moves; a stand or a "
             f"flybar no log tells: --model {' or '.join(name for name, _ in others)}"
         )
-    notes.append(f"look over what is marked GUESS; next: heli-jax check {out}")
+        notes.append(note("model.guessed", words))
+    words = f"look over what is marked GUESS; next: heli-jax check {out}"
+    notes.append(note("configuration.guessed", words))
     return Written((out, *paths), tuple(notes))
 
 

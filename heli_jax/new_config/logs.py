@@ -9,17 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.clock_faults import require_increasing
-from heli_jax.flights.clock_guess import arrival_notes, is_called_time
+from heli_jax.flights.clock_guess import COUNTS_ROWS, arrival_notes, is_called_time
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.row_clock import ROWS, CountedTable
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.flights.table_topics import clock_words, in_runs
+from heli_jax.flights.table_topics import in_runs, rate_note
 from heli_jax.flights.table_view import numbers_once
 from heli_jax.new_config.guess import Series
 
@@ -39,7 +40,7 @@ class Log(NamedTuple):
     """`TimeInfo` of a table; None where topics have clocks of their own"""
     flight: int | None
     several: bool
-    notes: Sequence[str] = ()
+    notes: Sequence[Finding] = ()
     """what of the log is not looked at"""
     unread: Mapping[str, str] = MappingProxyType({})
     """columns of a table that cannot be asked for, and why, in words"""
@@ -82,7 +83,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
         if np.asarray(values).dtype.kind in "biuf" and _is_known(as_floats(values))
     }
     flight = first.flight[0] if others or first.flight[1] > 1 else None
-    notes = tuple(n for n in first.notes if n.startswith("left out, since"))
+    notes = tuple(n for n in first.notes if n.code == LEFT_OUT)
     return Log(
         str(path),
         first.format,
@@ -97,7 +98,7 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
 
 def _read_table(table: Table, rate: float | None) -> Log:
     info: LogInfo = describe_table(table, None, None, rate)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     time = info.time
     if time is None:
         _require_whole_clock(table, info)
@@ -105,7 +106,8 @@ def _read_table(table: Table, rate: float | None) -> Log:
         time = describe_table(table, None, None, _ASSUMED).time
         assert time is not None
         time = dataclasses.replace(time, counted=math.nan)
-        notes = (f"{_without_time(info)}: how many samples a second has is yours to say",)
+        words = f"{_without_time(info)}: how many samples a second has is yours to say"
+        notes = (note("clock.not-found", words),)
     if time.problem:
         if time.column in table.names:
             # With its line, and what to do.
@@ -113,7 +115,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
         problem = "expected a column of increasing times, got none"
         raise wrong(table.path, f"{problem}: {time.problem}")
     if time.said:
-        notes = (f"{clock_words(time)}, as the file says: {time.said}",)
+        notes = (rate_note(time),)
     clock = time.column
     table = CountedTable(table) if clock == ROWS else in_runs(table, time)
     names = [c.name for c in info.columns if c.kind == "number"]
@@ -136,7 +138,8 @@ def _read_table(table: Table, rate: float | None) -> Log:
     if others:
         listed = ", ".join(map(shown, others[:6]))
         words = shown(clock) if clock != ROWS else "the others"
-        notes += (f"left out, since they are not as long as {words}: {listed}",)
+        words = f"left out, since they are not as long as {words}: {listed}"
+        notes += (note(LEFT_OUT, words, *others),)
     return Log(table.path, table.format, series, time, None, False, notes, _unread(table, info))
 
 
@@ -175,7 +178,7 @@ def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
 def _without_time(info: LogInfo) -> str:
     """Why none of a table's columns is a time, in words."""
     strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
-    notes = [strays, *(note for note in info.notes if "taken for no time" in note)]
+    notes = [strays, *(n.sentence for n in info.notes if n.code == COUNTS_ROWS)]
     return "; ".join(filter(None, ("no column is a time", *notes)))
 
 

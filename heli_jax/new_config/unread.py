@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.table import shown
 from heli_jax.new_config import guess
 
@@ -11,7 +12,7 @@ _MOST = 4
 
 def unread_notes(
     lacking: Collection[str], called: Mapping[str, Sequence[str]], unread: Mapping[str, str]
-) -> list[str]:
+) -> list[Finding]:
     """Notes on signals that were not found, where a column that cannot be read is called so.
 
     Args:
@@ -24,6 +25,6 @@ def unread_notes(
         for name in guess.by_name(called[signal], list(unread))[:1]:
             columns.setdefault(name, signal)
     return [
-        f"{signal} may be the column {shown(name)}, which {unread[name]}"
+        note(LEFT_OUT, f"{signal} may be the column {shown(name)}, which {unread[name]}", name)
         for name, signal in list(columns.items())[:_MOST]
     ]

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax import units
+from heli_jax.finding import sentences
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
 from heli_jax.report.compared_bode import BODE_WORDS, bode_overlay
@@ -49,7 +50,7 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
             ("Verdicts", compared.verdicts),
             ("Agreement", compared.agreement),
         ],
-        notes=compared.notes,
+        notes=sentences(compared.notes),
         pictures=pictures,
         numbers=numbers.content(),
         # Relative, so that page and runs can be moved together.

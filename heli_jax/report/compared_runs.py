@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
@@ -142,24 +143,31 @@ class ComparedRuns(NamedTuple):
         return Table(head, tuple(rows))
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What a reader should know of the differences."""
-        notes, first = [_JOINT], self.runs[0]
+    def notes(self) -> tuple[Finding, ...]:
+        """What a reader should know of the differences; subjects are labels of runs."""
+        notes, first = [note("compared.joint-sd", _JOINT)], self.runs[0]
         for label, run in zip(self.labels[1:], self.runs[1:], strict=True):
             if _share_a_log(first, run):
-                notes.append(_SAME.format(first=self.labels[0], second=label))
+                words = _SAME.format(first=self.labels[0], second=label)
+                notes.append(note("compared.one-log", words, self.labels[0], label))
         for label, run in zip(self.labels, self.runs, strict=True):
             if run.status == "not-converged":
-                notes.append(f"{label} did not converge: its numbers are no result.")
+                words = f"{label} did not converge: its numbers are no result."
                 if run is first:
-                    notes.append("Differences are from the first run: name one first that did.")
+                    words += " Differences are from the first run: name one first that did."
+                notes.append(Finding("compared.not-converged", "doubt", words, subjects=(label,)))
                 continue
+            doubts = {}
             if run.distrust:
-                notes.append(f"{label}: {run.distrust}")
+                doubts["not-trusted"] = f": {run.distrust}"
             if run.adequate is False:
-                notes.append(f"{label} is not adequate: its intervals may be too narrow.")
+                doubts["not-adequate"] = " is not adequate: its intervals may be too narrow."
             elif run.overconfident:
-                notes.append(f"{label}: its sd are too small, since its residuals are not white.")
+                doubts["overconfident"] = ": its sd are too small: its residuals are not white."
+            notes += [
+                Finding(f"compared.{what}", "doubt", f"{label}{words}", subjects=(label,))
+                for what, words in doubts.items()
+            ]
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
@@ -209,7 +217,7 @@ class ComparedRuns(NamedTuple):
     def _summary(self) -> Summary:
         head, rows = self.estimates
         title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
-        return Summary(title, head, rows, self.notes)
+        return Summary(title, head, rows, tuple(sentences(self.notes)))
 
     def __repr__(self) -> str:
         return as_text(self._summary())

@@ -2,13 +2,12 @@
 
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, as_data
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit, Signals
@@ -31,7 +30,7 @@ class SensorAgreement(NamedTuple):
 
     compatible: bool
     verdict: str
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     """on the errors that were found, beside the fit's own notes"""
     head: tuple[str, ...]
     errors: tuple[tuple[str, ...], ...]
@@ -95,7 +94,7 @@ def fit_json(
             "models": content.choice(supplementary.choice),
             "methods": methods_content(supplementary.methods),
             "intervals": content.intervals(supplementary.intervals),
-            "record": [content.finding(f) for f in supplementary.findings],
+            "record": [as_data(f) for f in supplementary.findings],
             "compatibility": _sensors(supplementary.sensors),
             **content.likelihood(fit),
             # The words of the format, with which programs compare: not to be polished.
@@ -111,7 +110,7 @@ def fit_json(
             "frequency_error_start": frequency_start_content(problem),
             "starts": content.starts(fit),
             "steps": fit.steps,
-            "findings": [content.finding(f) for f in fit.findings],
+            "findings": [as_data(f) for f in fit.findings],
             **_provenance(fit, problem),
         }
     )
@@ -123,7 +122,7 @@ def _sensors(agreement: SensorAgreement | None) -> dict[str, Any] | None:
     return {
         "compatible": agreement.compatible,
         "verdict": agreement.verdict,
-        "doubts": list(agreement.doubts),
+        "doubts": [as_data(f) for f in agreement.doubts],
         "shows": {row[0]: row[agreement.head.index("shows")] for row in agreement.errors},
     }
 
@@ -138,12 +137,11 @@ def _provenance(fit: Fit, problem: Problem) -> dict[str, Any]:
     }
 
 
-def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:
+def check_json(check: Check) -> dict[str, Any]:
     """What `heli-jax check` found as plain data; what is not a finite number is null.
 
     Args:
         check: what is known before a fit.
-        log_notes: what the reader of each log assumed, a sentence each.
     """
     verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
     # Of a parameter that is not determined the number would be no expectation.
@@ -159,9 +157,9 @@ def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:
             "verdict": content.verdict(verdict),
             "noise_sd": check.noise,
             "noise_guessed": list(check.guessed),
-            "record": [content.finding(f) for f in check.findings],
-            "notes": [content.finding(f) for f in check.further_notes],
-            "log_notes": list(log_notes),
+            "record": [as_data(f) for f in check.findings],
+            "notes": [as_data(f) for f in check.further_notes],
+            "log_notes": [as_data(f) for f in check.log_notes],
         }
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
-from heli_jax.finding import Finding
+from heli_jax.finding import as_data
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.identification.equation_error.baseline import Baseline
@@ -165,11 +165,6 @@ def adequacy(fit: Fit) -> dict[str, Any]:
     }
 
 
-def finding(f: Finding) -> dict[str, Any]:
-    """A finding as plain data."""
-    return {**f._asdict(), "shifts": dict(f.shifts)}
-
-
 def choice(choice: Choice | None) -> dict[str, Any] | None:
     """The models compared."""
     if choice is None:
@@ -326,7 +321,7 @@ def source(flight: Flight) -> dict[str, Any]:
         "dt": flight.dt,
         "window": list(flight.window),
         "log_first_time": flight.source.first_time,
-        "notes": list(flight.source.notes),
+        "notes": [as_data(n) for n in flight.source.notes],
         "signals": {
             "inputs": {n: as_content(s) for n, s in flight.source.inputs.items()},
             "outputs": {n: as_content(s) for n, s in flight.source.outputs.items()},

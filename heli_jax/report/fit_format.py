@@ -182,7 +182,7 @@ class Compatibility(TypedDict):
 
     compatible: bool
     verdict: str
-    doubts: list[str]
+    doubts: list[Finding]
     shows: dict[str, str]
     """by error of a sensor whether it shows"""
 
@@ -312,7 +312,8 @@ class FlightSource(TypedDict, total=False):
     """[s] from the log's beginning"""
     log_first_time: float
     """[s] in the log's own count"""
-    notes: list[str]
+    notes: list[Finding]
+    """what the reader of the log assumed or did"""
     signals: SignalSources
 
 

@@ -30,6 +30,7 @@ from heli_jax.analysis.response_curves import (
     octave_mean,
     without_hold,
 )
+from heli_jax.finding import Finding, note
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate
@@ -61,8 +62,8 @@ class FittedPair(NamedTuple):
     """half of a 95 % interval of what was measured, in sd"""
 
 
-NO_RESPONSES = "no responses of the flights, nor handling qualities"
-"""what a note begins with where none could be taken"""
+NO_RESPONSES = "responses.none-of-fit"
+"""code of flights of which none could be taken"""
 
 
 class FittedResponses(NamedTuple):
@@ -75,7 +76,7 @@ class FittedResponses(NamedTuple):
     handling: tuple[Handling, ...]
     about: str
     """where the model was linearised, in words; empty for a linear one"""
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
     incoherent: tuple[str, ...] = ()
     """those without a coherence worth showing, as `lat to p`; they have no figure"""
     held_out: tuple[FittedPair, ...] = ()
@@ -96,8 +97,8 @@ def fitted_responses(
     try:
         responses = flight_responses(problem.training, settings)
     except ValueError as e:
-        words = f"{NO_RESPONSES}: {e}"
-        return FittedResponses((), 0, (), "", (words,))
+        words = f"no responses of the flights, nor handling qualities: {e}"
+        return FittedResponses((), 0, (), "", (note(NO_RESPONSES, words),))
     known = problem.training[0].known
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
     flight = FittedFlight(problem.model, params, fit, fit.signals[0])
@@ -106,7 +107,8 @@ def fitted_responses(
     of = linear_responses(problem.model, params, free, at.state, at.inputs)
     if not all(np.isfinite(M).all() for M in of.matrices):
         words = f"the model cannot be linearised about {at.words or 'zero'}"
-        return FittedResponses((), 0, (), at.words, (*responses.notes, words))
+        lacking = note("responses.not-linearised", words)
+        return FittedResponses((), 0, (), at.words, (*responses.notes, lacking))
     curves = _Curves(fit, of, tuple(free), (responses.omega[0], _BEYOND * responses.omega[-1]))
     coherent = _coherent(responses)
     pairs = _pairs(responses, curves, coherent)
@@ -212,7 +214,7 @@ def _pairs(
 
 def _of_held_out(
     problem: Problem, settings: Settings, curves: _Curves
-) -> tuple[tuple[FittedPair, ...], tuple[str, ...]]:
+) -> tuple[tuple[FittedPair, ...], tuple[Finding, ...]]:
     """The responses of the flights held out, as many as are shown, and why there is none."""
     held = tuple(f for f in problem.flights if f.hold_out)
     if not held:
@@ -220,7 +222,7 @@ def _of_held_out(
     try:
         responses = flight_responses(held, settings)
     except ValueError as e:
-        return (), (f"no responses of the flights held out: {e}",)
+        return (), (note("responses.none-held-out", f"no responses of the flights held out: {e}"),)
     pairs = tuple(_pairs(responses, curves, _coherent(responses))[:MOST_PAIRS])
     if pairs:
         return pairs, ()
@@ -228,7 +230,7 @@ def _of_held_out(
         f"no figure of the flights held out: none of their responses, taken together, has a "
         f"coherence of {COHERENT:g} in the mean over an octave"
     )
-    return (), (words,)
+    return (), (note("responses.none-held-out", words),)
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:

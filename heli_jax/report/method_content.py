@@ -2,10 +2,11 @@
 
 from typing import Any
 
+from heli_jax.finding import as_data
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.problem import Problem
-from heli_jax.report.fit_content import finding, parameter
+from heli_jax.report.fit_content import parameter
 
 
 def frequency_start_content(problem: Problem) -> dict[str, Any] | None:
@@ -37,6 +38,6 @@ def methods_content(comparison: MethodComparison | None) -> dict[str, Any] | Non
             "seconds": r.seconds,
             "parameters": {n: parameter(e) for n, e in estimates.items()},
             "difference_joint_sd": {n: comparison.difference(r, n) for n in estimates},
-            "findings": [] if r.fit is None else [finding(f) for f in r.fit.findings],
+            "findings": [] if r.fit is None else [as_data(f) for f in r.fit.findings],
         }
     return {"results": results, "sentences": list(comparison.sentences)}

@@ -1,11 +1,13 @@
 """Responses as NetCDF, with their units."""
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from heli_jax.analysis.flight_responses import FlightResponses
+from heli_jax.finding import as_data
 
 type _Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 """its dimensions, its values and what is said of it"""
@@ -37,6 +39,7 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
             "instruments": " ".join(responses.instruments),
             "units_of_outputs": " ".join(units[n] for n in responses.outputs),
             "units_of_inputs": " ".join(units[n] for n in inputs),
+            "notes": json.dumps([as_data(f) for f in responses.notes]),
         },
     )
     data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")

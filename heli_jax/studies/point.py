@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from heli_jax.errors import InputError
+from heli_jax.finding import sentences
 
 _MAPPED = 30_000
 """Regions of memory above which compiled programs are let go: Linux grants a process 65530, every
@@ -39,7 +40,7 @@ class Outcome(NamedTuple):
     sentence: str | None = None
     """why there is no fit; None where there is one"""
     notes: tuple[str, ...] = ()
-    """what the readers of its logs assumed or did"""
+    """what the readers of its logs assumed or did, in sentences"""
 
 
 def fit_point(task: Task) -> Outcome:
@@ -93,7 +94,7 @@ def _fitted(task: Task) -> Outcome:
             for file in sorted(place.rglob("*"))
             if file.is_file()
         }
-    return Outcome(files, notes=tuple(workflow.log_notes(run.problem)))
+    return Outcome(files, notes=tuple(sentences(workflow.log_notes(run.problem))))
 
 
 def _in_words(point: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import xarray as xr
 from heli_jax import run_directory
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
+from heli_jax.finding import Finding, as_data, note
 from heli_jax.flights.flight import Flight
 from heli_jax.stages import Note
 from heli_jax.sweeps import store as stores
@@ -113,7 +114,7 @@ def run_sweep(
     *,
     files: Mapping[str, str] | None = None,
     attributes: Mapping[str, Any] | None = None,
-    notes: Sequence[str] = (),
+    notes: Sequence[Finding] = (),
 ) -> xr.Dataset:
     """Run a checked sweep.
 
@@ -130,9 +131,10 @@ def run_sweep(
     """
     # The notes are kept too: who opens the store a year later has not seen what was printed.
     notes = [*notes, *_notes(job)]
-    for note in notes:
-        options.say(Note(note))
-    kept = {"seed": 0, **(attributes or {}), "versions": versions(), "notes": notes}
+    for found in notes:
+        options.say(Note(found.sentence))
+    kept = {"seed": 0, **(attributes or {}), "versions": versions()}
+    kept["notes"] = [as_data(f) for f in notes]
     if out is None:
         # The same store as on disk, so that a sweep in memory goes through the same code.
         store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
@@ -152,13 +154,20 @@ def run_sweep(
     return _resume(job, out, options)
 
 
-def _notes(job: Job) -> list[str]:
+def _notes(job: Job) -> list[Finding]:
     """What of a sweep has no effect, or another than one might think."""
+    name = job.model.name
     without_effect = [
-        f"axes.{n}: {job.model.name} does not read {n}: no run depends on it" for n in unread(job)
+        note(
+            "sweep.axis-without-effect",
+            f"axes.{n}: {name} does not read {n}: no run depends on it",
+            n,
+        )
+        for n in unread(job)
     ]
+    words = "the margins are those of the loop without the delay"
     delayed = [
-        f"reduce.{n}: the margins are those of the loop without the delay"
+        note("sweep.margins-without-delay", f"reduce.{n}: {words}", n)
         for n, r in job.reduce.items()
         if r.how == "margins" and ("delay" in job.design.names or job.model.delays)
     ]

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from heli_jax import run_directory
+from heli_jax.finding import as_data, note
 from heli_jax.sweeps.chunks import chunks_of
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
@@ -75,7 +76,11 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "timing": timing,
         "versions": dataset.attrs["versions"],
         "seed": dataset.attrs["seed"],
-        "notes": dataset.attrs.get("notes", []),
+        # A store of an earlier version has sentences alone.
+        "notes": [
+            n if isinstance(n, dict) else as_data(note("sweep.note", n))
+            for n in dataset.attrs.get("notes", [])
+        ],
     }
     if "float32_error" in dataset.attrs:
         content["float32_error"] = dataset.attrs["float32_error"]

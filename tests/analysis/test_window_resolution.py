@@ -40,4 +40,5 @@ def test_inputs_that_move_as_one_are_named():
     flight = Flight(dt=DT, inputs={"lat": u, "lat2": 0.5 * u}, outputs={"phi": y})
     found = flight_responses([flight], Settings((0.2, 6.0), 15.0))
     assert not np.isfinite(found.outputs["phi"].pairs["lat"].H).any()
-    assert any(note.startswith("lat and lat2 move as one: ") for note in found.notes)
+    as_one = [n.subjects for n in found.notes if n.code == "excitation.inputs-as-one"]
+    assert as_one == [("lat", "lat2")]

@@ -41,7 +41,8 @@ def test_the_signals_of_a_preset(log):
     np.testing.assert_allclose(converted.columns["roll_rate"], P, atol=1e-6)
     np.testing.assert_allclose(converted.columns["roll"], PHI, atol=1e-6)
     assert converted.units["roll_rate"] == "rad/s"
-    assert any("the log has no" in note and "north" in note for note in converted.notes)
+    [lacking] = [n for n in converted.notes if n.code == "channels.lacking"]
+    assert "north" in lacking.subjects
 
 
 def test_the_signals_of_a_configuration(log, tmp_path):

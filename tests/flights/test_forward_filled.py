@@ -65,9 +65,9 @@ def test_a_forward_filled_join_is_read_as_the_join_it_was(joined, tmp_path):
         both = min(a.size, b.size)
         np.testing.assert_array_equal(a[:both], b[:both])
     assert filled.source is not None
-    [note] = [n for n in filled.source.notes if "filled forward" in n]
-    assert "'gyro_x' at about 100 Hz, 'roll' at about 50 Hz" in note
-    assert not any("leave other cells empty" in n for n in filled.source.notes)
+    [note] = [n for n in filled.source.notes if n.code == "repeats.carried-on"]
+    assert note.subjects == ("gyro_x", "roll")
+    assert "channels.joined" not in {n.code for n in filled.source.notes}
 
 
 def test_samples_of_the_grid_s_own_rate_stay_as_they_were_measured(joined, tmp_path):
@@ -124,4 +124,4 @@ def test_a_lone_output_that_keeps_each_value_for_one_length_needs_no_other_sign(
         seen = np.flatnonzero(np.isfinite(read.outputs["w"]))
         assert np.array_equal(seen, np.arange(0, 6000, 20))
         assert read.source is not None
-        assert any("w keeps each value for 20 samples: taken" in n for n in read.source.notes)
+        assert [n.value for n in read.source.notes if n.code == "repeats.missing"] == [20]

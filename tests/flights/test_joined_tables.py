@@ -60,9 +60,7 @@ def test_convert_takes_each_column_at_its_own_rows(path):
         assert np.isfinite(converted.columns[name]).all()
         np.testing.assert_allclose(converted.columns[name], true(t + first), atol=most)
     assert np.mean(converted.columns["lat"] == stick(t + first)) > 0.98
-    [note] = [n for n in converted.notes if "hold one topic each" in n]
-    assert "rows of 'p', 'q' at about 400 Hz" in note
-    assert "rows of 'lat' at about 50 Hz, rows of 'v' at about 5 Hz" in note
+    assert [n.value for n in converted.notes if n.code == "channels.joined"] == [3]
 
 
 def test_without_a_rate_the_rows_stay_as_they_are(path):
@@ -84,7 +82,7 @@ def test_a_flight_takes_each_signal_at_its_own_rows(path):
     assert 95 <= seen.sum() <= 100
     np.testing.assert_allclose(read.outputs["v"][seen], speed(t[seen]), atol=1e-3)
     assert read.source is not None
-    assert any("hold one topic each" in note for note in read.source.notes)
+    assert "channels.joined" in {n.code for n in read.source.notes}
     part = flight(path, rate=50.0, window=(5.0, 15.0))
     assert part.duration == pytest.approx(10.0, abs=0.05)
 
@@ -121,11 +119,11 @@ def test_a_flight_is_where_its_inputs_are_known(tmp_path, begin, end):
     np.testing.assert_array_equal(read.outputs["p"], np.arange(begin, end))
     assert read.t0 == pytest.approx(0.01 * begin)
     count = 200 - end + begin
-    said = f"'lat' has no value before or behind, and {count} rows are left out"
-    assert sum(said in note for note in read.source.notes) == 1
+    said = [(n.subjects, n.value) for n in read.source.notes if n.code == "windows.inputs-known"]
+    assert said == [(("lat",), count)]
     # A window within needs no word.
     within = flight(tmp_path / "log.csv", outputs=("p",), window=(0.1, 1.5))
-    assert not any("left out" in note for note in within.source.notes)
+    assert "windows.inputs-known" not in {n.code for n in within.source.notes}
 
 
 def test_an_input_that_is_empty_within_or_everywhere_is_refused(tmp_path):

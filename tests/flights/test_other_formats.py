@@ -119,7 +119,7 @@ def test_no_object_of_python_is_made(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", allow_pickle=True, x=objects, t=T, p=P)
     table = open_table(tmp_path / "b.npz")
     assert table.names == ("t", "p")
-    assert "'x'" in table.notes[0]
+    assert table.notes[0].subjects == ("x",)
     assert not (tmp_path / "ran").exists()
 
 

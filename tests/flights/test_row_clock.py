@@ -68,7 +68,7 @@ def test_a_single_number_in_the_file_is_its_rate(tmp_path: Path, name, number, t
     assert info.time is not None
     assert (info.time.counted, info.time.said) == (RATE, f"'{name}' = {number:g}")
     converted = convert_log(path, Selection())
-    assert any(f"at 40 Hz, as the file says: '{name}'" in note for note in converted.notes)
+    assert [n.value for n in converted.notes if n.code == "clock.rate-of-file"] == [40]
     assert read(path, by_rate(RATE), p="y[1]").outputs["p"][7] == pytest.approx(2 * P[7])
 
 

@@ -51,7 +51,7 @@ def test_a_text_of_dataflash_has_units_instances_and_a_torn_end(tmp_path: Path) 
         assert own.units[f"IMU[{k}].GyrX"] == "rad/s"
         np.testing.assert_allclose(own.columns[f"IMU[{k}].GyrX"], k + 0.1 * np.arange(40))
         np.testing.assert_allclose(own.times, 1e-3 + 0.02 * np.arange(40))
-    assert log.notes == ("1 damaged place skipped",)
+    assert [(n.code, n.value) for n in log.notes] == [("damage.skipped", 1)]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from heli_jax import Free, Problem, fit, models
+from heli_jax.finding import note
 from heli_jax.flights.flight import Source
 from heli_jax.identification.equation_error.baseline import baseline
 from tests.identification.bench import BENCH, record, vehicle
@@ -14,7 +15,7 @@ SCRIPT = "<script>alert(1)</script>"
 
 
 def _fitted(free, **options):
-    source = Source("/logs/<b>bench</b>.csv", "ab" * 32, ("stick: <i>mm</i> to m",))
+    source = Source("/logs/<b>bench</b>.csv", "ab" * 32, (note("a.note", "stick: <i>mm</i> to m"),))
     flight = record(BENCH, seed=1, n=1000, dt=0.05, source=source, **options)
     problem = Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
     result = fit(problem)

@@ -87,9 +87,9 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     b = write_run(tmp_path / "a2", {"Ixx": (0.03, 0.001)}, status="not-converged")
     compared = compare_runs([a, b])
     assert compared.estimates.rows[0][3] == "–"
-    words = " ".join(compared.notes)
-    assert "a2 did not converge" in words
-    assert "share a log" in words
+    said = [(n.code, n.subjects) for n in compared.notes]
+    assert ("compared.not-converged", ("a2",)) in said
+    assert ("compared.one-log", ("a1", "a2")) in said
 
 
 def test_on_a_narrow_terminal_each_piece_says_which_metric(tmp_path, monkeypatch, capsys) -> None:
@@ -110,7 +110,7 @@ def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window
         return write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}, data=data)
 
     compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
-    assert ("share a log" in " ".join(compared.notes)) == shared
+    assert ("compared.one-log" in {n.code for n in compared.notes}) == shared
 
 
 def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
     b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)})
     compared = compare_runs([a, b])
     assert [row[-1] for row in compared.verdicts.rows] == [summary, "yes"]
-    assert any("a: its sd are too small" in note for note in compared.notes)
+    assert ("compared.overconfident", ("a",)) in [(n.code, n.subjects) for n in compared.notes]
 
 
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
@@ -132,8 +132,8 @@ def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path,
     b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)}, **against)
     compared = compare_runs([a, b])
     assert compared.verdicts.rows[1][4] == f"The data determine all. {sentence}"
-    assert f"b: {sentence}" in compared.notes
-    assert any("b is not adequate" in note for note in compared.notes)
+    said = [n.code for n in compared.notes if n.subjects == ("b",)]
+    assert said == ["compared.not-trusted", "compared.not-adequate"]
     assert cli.main(["runs", str(tmp_path), "--json"]) == 0
     assert [r["untrusted"] for r in json.loads(capsys.readouterr().out)] == ["", "Ixx"]
 
@@ -254,7 +254,7 @@ def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None
         "output-error by instrument (lat)",
         "output-error",
     ]
-    assert "± is one standard deviation" in compared.notes[0]
+    assert compared.notes[0].code == "compared.joint-sd"
     assert "one standard deviation" in compared.to_latex()
     assert np.isnan(compared.to_dataframe().set_index("run").loc["c", "sd"])
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from heli_jax import numbers
+from heli_jax.finding import note
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import files, tables
 from heli_jax.report.drawings import Analysis
@@ -99,7 +100,7 @@ def test_verdict_comes_first(sound_page):
     assert text.count("Estimates") >= 1
 
 
-def test_the_headline_is_not_said_twice(sound, sound_page, tmp_path):
+def test_what_the_headline_says_is_not_repeated_and_remedies_are_said(sound, sound_page, tmp_path):
     assert words(sound_page[0]).count("the data determine Ixx and If") == 1
     assert "The data determine Ixx and If" not in words(sound_page[0])
     fit = sound[0]
@@ -113,8 +114,7 @@ def test_the_headline_is_not_said_twice(sound, sound_page, tmp_path):
         ),
     )
     text = words(page(sound, tmp_path, status="not-identifiable", verdict=verdict)[0])
-    assert text.lower().count("the data do not determine if") == 1
-    assert "Fix If or give it a prior." in text
+    assert "fix If or give it a prior." in text
     assert "The data determine Ixx." in text
 
 
@@ -227,7 +227,7 @@ def test_what_sensors_say_of_each_other_comes_before_the_fit(sound, tmp_path):
     found = SensorAgreement(
         False,
         "Not compatible: no errors bring psi to 3.2e-07.",
-        ("lambda_p +23 %: much",),
+        (note("a.note", "lambda_p +23 %: much"),),
         ("error", "estimate, 95 %", "unit", "shows", "what it is"),
         (("lambda_p", "0.226 ± 0.061", "1", "yes", "scale"),),
     )

@@ -297,7 +297,7 @@ def test_a_disturbance_that_nothing_draws_is_said(write, tmp_path, capsys):
     shown = capsys.readouterr()
     assert "disturbance: nothing is drawn without an axis seed" in shown.err
     assert "! disturbance: nothing is drawn" in shown.out
-    assert "nothing is drawn" in opened(out).attrs["notes"][0]
+    assert [n["code"] for n in opened(out).attrs["notes"]] == ["sweep.nothing-drawn"]
 
 
 def test_nested_designs_draw_each_their_own(write, tmp_path):

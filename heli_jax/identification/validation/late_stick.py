@@ -177,7 +177,7 @@ def _by_shift(
         for n in naming.names(layout.model.Inputs)
         # Whoever simulates an input knows when it acted.
         if any(np.ptp(f.inputs[n]) > 0 and (f.source or n in f.hold_reason) for f in flights)
-        and not any(is_low_passed(f.hold_reason.get(n, "")) for f in flights)
+        and not any(is_low_passed(f, n) for f in flights)
         and (names is None or n in names)
     )
     # The mean of two samples is another value where an input acts on an output at once.

@@ -163,7 +163,7 @@ def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]
         for n in naming.names(problem.model.Inputs)
         # What stays constant is the same under either hold.
         if np.ptp(flight.inputs[n]) > 0
-        and not is_low_passed(flight.hold_reason.get(n, ""))
+        and not is_low_passed(flight, n)
         and (not in_doubt or (flight.hold[n] != "zero-order" and n in flight.hold_reason))
     }
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, note
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -342,11 +342,12 @@ def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight
     for choice in sorted(ranking.taken, key=lambda c: (c.window.flight, c.window.first)):
         w = choice.window
         whole = problem.training[w.flight]
-        note = (
+        words = (
             f"window: auto took {w.start:.4g} s to {w.end:.4g} s of it ({choice.reason}; "
             f"{len(ranking.taken)} windows of {ranking.length:.3g} s say "
             f"{100 * ranking.taken[-1].efficiency:.0f} % of what all say)"
         )
         name = f"{whole.name or w.label} {w.start:.4g}-{w.end:.4g} s"
-        flights.setdefault(w.flight, []).append(part(whole, w.first, w.last, name, note))
+        taken = note("windows.chosen", words, value=ranking.taken[-1].efficiency)
+        flights.setdefault(w.flight, []).append(part(whole, w.first, w.last, name, taken))
     return {i: tuple(f) for i, f in flights.items()}

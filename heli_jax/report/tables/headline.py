@@ -37,18 +37,10 @@ def further_sentences(fit: Fit) -> list[str]:
     # What the data determine is a property of an optimum.
     if fit.status == "not-converged":
         return []
-    said, lines = _determined(fit)[1], []
-    for sentence in fit.verdict.sentences:
-        # Both begin with "the data": one of them as a sentence, the other after a colon.
-        words = f"t{sentence[1:]}" if sentence.startswith("The ") else sentence
-        claim, colon, remedy = words.removesuffix(".").partition(": ")
-        # Up to its end or a comma: "the data determine a" is not said by "... determine a and b".
-        repeated = said == claim or said.startswith(f"{claim}, but ")
-        if not repeated:
-            lines.append(sentence)
-        elif colon:
-            lines.append(f"{remedy[0].upper()}{remedy[1:]}.")
-    return lines
+    v = fit.verdict
+    # One alone, of parameters that the data determine well, is what the headline says.
+    alone = len(v.sentences) == 1 and not (v.resting or fit.not_identifiable or _doubts(fit))
+    return [] if alone else list(v.sentences)
 
 
 def _determined(fit: Fit) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from heli_jax import naming
+from heli_jax.finding import sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.origins import in_words
 from heli_jax.identification.problem import Problem
@@ -52,7 +53,8 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
         rows.append(("file", source.path if source else "given in memory, no file"))
         if source:
             rows.append(("sha256", source.sha256))
-        listed.append(Origin(signals.flight, Table(("", ""), rows), source.notes if source else ()))
+        notes = tuple(sentences(source.notes)) if source else ()
+        listed.append(Origin(signals.flight, Table(("", ""), rows), notes))
     return listed
 
 
