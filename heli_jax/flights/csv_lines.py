@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from heli_jax.flights.csv_cells import MISSING, is_number, row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day
-from heli_jax.flights.csv_fortran import parted
 from heli_jax.flights.csv_text import Line
 
 _NUMBER = re.compile(r"[+\u2212-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
@@ -35,9 +34,9 @@ class Head(NamedTuple):
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of a line; between numbers glued at their signs stands a blank too."""
+    """The cells of a line."""
     if delimiter == " ":
-        return parted(line).split()
+        return line.split()
     if '"' in line:
         try:
             return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))

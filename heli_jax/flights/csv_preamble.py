@@ -22,7 +22,6 @@ from heli_jax.flights.csv_lines import (
     is_row,
     names_fit,
 )
-from heli_jax.flights.csv_nameless import FEWEST, nameless_head
 from heli_jax.flights.csv_text import (
     DELIMITERS,
     LONGEST_HEADER,
@@ -35,6 +34,8 @@ from heli_jax.flights.csv_text import (
 )
 from heli_jax.flights.table import shown, wrong
 
+_FEWEST = 3
+"""rows that make a table"""
 _LOOKED_AT = 1 << 20
 _MOST_LINES = 20_000
 """bytes and lines in which a table is sought"""
@@ -75,14 +76,12 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
         return Head(below, separator[1], (), below.number + 1)
     near = [line for line in lines_in(data, plain, _LOOKED_AT, _NEAR) if line.text.strip()]
     _require_one_comma(path, near)
-    if nameless := nameless_head(data, near, blanks):
-        return nameless
     delimiter = find_delimiter(plain.text, near[1].text if len(near) > 1 else "")
     if _is_header(near, delimiter, blanks):
         return Head(plain, delimiter, (), plain.number + 1)
     lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
     unsure = Head(plain, delimiter, (), plain.number + 1, is_fitting=False)
-    return _sought(path, lines, blanks) or nameless_head(data, lines, blanks, FEWEST) or unsure
+    return _sought(path, lines, blanks) or unsure
 
 
 def _require_one_comma(path: str, lines: Sequence[Line]) -> None:
@@ -90,7 +89,7 @@ def _require_one_comma(path: str, lines: Sequence[Line]) -> None:
     names at most, whole numbers all of them."""
     names, *rows = [cells_of(line.text, ",") for line in lines]
     width = len(names)
-    is_cut = len(rows) >= FEWEST and all(
+    is_cut = len(rows) >= _FEWEST and all(
         width + 1 < len(row) <= 2 * width and all(map(_WHOLE.fullmatch, row)) for row in rows
     )
     if is_cut and are_names(names) and '"' not in lines[1].text:
@@ -137,7 +136,7 @@ def _heads(lines: Sequence[Line], cells: Sequence[list[str]], delimiter: str) ->
         end = at
         while end < len(lines) and is_row(cells[end]) and len(cells[end]) == len(cells[at]):
             end += 1
-        if end - at >= FEWEST and (head := _head_above(lines, cells, at, delimiter)):
+        if end - at >= _FEWEST and (head := _head_above(lines, cells, at, delimiter)):
             heads.append(head)
         at = max(end, at + 1)
     return heads

@@ -20,7 +20,6 @@ from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_lines import Head
 from heli_jax.flights.csv_on_disk import plain_beginning
 from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
-from heli_jax.flights.csv_rate import rate_above
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
@@ -111,17 +110,16 @@ def open_csv(path: Path) -> "CsvTable":
     groups = [header_names(where, text, delimiter, number) for text in head.above]
     names = as_wide(qualified(names, groups), body)
     body, cut = body.filled().whole(len(names))
-    rate = rate_above(bytes(data[:after]).decode("utf-8", "replace"))
     notes, units = cut, _units_below(body, names)
     if units is None:
         stated = dict(zip(names[1:], head.units, strict=False))
-        return CsvTable(size, digest, names, body, head, notes, stated, rate)
+        return CsvTable(size, digest, names, body, head, notes, stated)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     words = f"line {number_of_line} was taken for units and not for a sample: {listed}"
     notes = (*notes, note("text.units-line", words, value=number_of_line))
     stated = dict(zip(names, units, strict=True))
-    return CsvTable(size, digest, names, body, head, notes, stated, rate)
+    return CsvTable(size, digest, names, body, head, notes, stated)
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -164,9 +162,7 @@ class CsvTable:
         head: Head,
         notes: tuple[Finding, ...] = (),
         units: Mapping[str, str] | None = None,
-        rate_above: tuple[float, str] | None = None,
     ) -> None:
-        self.rate_above = rate_above
         self.path, self.size, self.names = body.path, size, names
         self.notes = notes
         self.units: Mapping[str, str] = dict(units or {})

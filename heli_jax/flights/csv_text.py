@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from heli_jax.finding import Finding, note
 from heli_jax.flights.csv_cells import row_of_units
-from heli_jax.flights.csv_fortran import is_fortran, parted
 from heli_jax.flights.table import wrong
 
 
@@ -355,14 +354,12 @@ def is_of_blanks(header: str, first: str) -> bool:
     """Whether blanks alone stand between the cells of header and first row."""
     # Names may hold blanks: only where nothing else is between them, and as many cells below.
     alone = not any(delimiter in header.strip() + first.strip() for delimiter in DELIMITERS)
-    return alone and len(header.split()) == len(parted(first).split()) > 1
+    return alone and len(header.split()) == len(first.split()) > 1
 
 
 def tabs_for_blanks(text: str) -> str:
-    """Lines whose cells have any number of blanks around them, with one tab between cells; between
-    numbers that are glued at their signs too."""
-    lines = map(parted, lines_of(text)) if is_fortran(text) else lines_of(text)
-    return "\n".join("\t".join(line.split()) for line in lines)
+    """Lines whose cells have any number of blanks around them, with one tab between cells."""
+    return "\n".join("\t".join(line.split()) for line in lines_of(text))
 
 
 def header_names(path: str, header: str, delimiter: str, line: int) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -85,12 +84,11 @@ def counted(table: Table, time: Signal | None) -> Table:
     return table if time is None or time.name != ROWS else CountedTable(table)
 
 
-def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | None:
+def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
-    or in words above them, and what says so; None where there is none, or are several.
+    and what says so; None where there is none, or are several.
 
     Args:
-        table: of rows.
         surveys: of all columns or arrays.
     """
     rates: dict[float, str] = {}
@@ -99,9 +97,6 @@ def stated_rate(table: Table, surveys: Sequence[Survey]) -> tuple[float, str] | 
         if rate is not None and each.values is not None:
             number = float(each.values[np.isfinite(each.values)][0])
             rates.setdefault(rate, f"{shown(each.name)} = {number:g}")
-    if not rates:
-        # Of a text alone there may be anything above the rows.
-        return getattr(table, "rate_above", None)
     if len(rates) != 1:
         return None
     rate, words = next(iter(rates.items()))
@@ -118,10 +113,7 @@ def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, .
         clock: the column of times.
         rate: of its usual step [Hz].
     """
-    file: Any = table
-    while hasattr(file, "table"):  # below what was derived of it
-        file = file.table
-    stated = dict([above] if (above := getattr(file, "rate_above", None)) else [])
+    stated: dict[float, str] = {}
     for name in table.names:
         # Of another clock than this one its path tells.
         if _is_step(name) is not None and _group(name) == _group(clock):

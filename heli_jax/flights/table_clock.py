@@ -42,7 +42,7 @@ def table_clock(
         signal, guessed, unit = by_rate(rate, name), False, None
     elif time is None:
         # A rate in the file goes before what merely increases, as a distance may.
-        stated = stated_rate(table, surveys)
+        stated = stated_rate(surveys)
         signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
         if signal is None and stated is not None:
             (clock, said), unit = stated, None

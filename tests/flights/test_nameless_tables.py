@@ -1,4 +1,4 @@
-"""Tables of numbers alone, as books on flight test and Fortran leave them, and comments in them."""
+"""Tables of numbers alone, and comments between their rows."""
 
 import numpy as np
 import pytest
@@ -28,37 +28,10 @@ def columns(path):
     return np.stack(list(table.numbers(table.names).values()), axis=1), table
 
 
-GLUED = ["".join(f"{x:11.4E}" if x < 0 else f" {x:10.4E}" for x in row) for row in TABLE]
-NO_LETTER = [line.replace("E-", "-0").replace("E+", "+0") for line in rows("{:14.7E}")]
-
-
-@pytest.mark.parametrize(
-    ("lines", "name"),
-    [
-        (rows(), "a.asc"),
-        (rows(between=","), "a.csv"),
-        (rows(between=";"), "a.csv"),
-        ([r.replace(".", ",") for r in rows(between=";")], "a.csv"),
-        (rows("{:.7f}", "\t"), "a.tsv"),
-        ([r.replace("E", "D") for r in rows()], "a.dat"),
-        (GLUED, "a.dat"),
-        (NO_LETTER, "a.dat"),
-        ([f"{N} 3", *rows()], "a.dat"),
-        (["  ".join(rows()[:1]), "", *rows()[1:]], "a.txt"),
-    ],
-)
-def test_columns_without_names_are_called_by_their_numbers(tmp_path, lines, name):
-    values, table = columns(of_lines(tmp_path, lines, name))
-    assert table.names == ("column1", "column2", "column3")
-    np.testing.assert_allclose(values, TABLE, atol=2e-6)
-
-
-@pytest.mark.parametrize("sign", ["%", "#", "//", "!", "*", "C ", "'"])
-def test_names_in_a_comment_of_any_program_are_names(tmp_path, sign):
-    above = [f"{sign} Roll, dt = 0.02 s", f"{sign} time aileron p"]
-    values, table = columns(of_lines(tmp_path, [*above, *rows()]))
-    assert table.names == ("time", "aileron", "p")
-    np.testing.assert_allclose(values, TABLE, atol=1e-7)
+@pytest.mark.parametrize(("between", "name"), [(" ", "a.asc"), (",", "a.csv"), (";", "a.csv")])
+def test_a_table_without_names_is_refused_with_what_to_write(tmp_path, between, name):
+    with pytest.raises(InputError, match="write a line of names above"):
+        open_csv(of_lines(tmp_path, rows(between=between), name))
 
 
 def test_comments_between_rows_are_passed_over_and_told(tmp_path):

@@ -4,9 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from heli_jax.flights.csv_rate import rate_above
 from heli_jax.flights.describe import describe_log
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.open_log import open_log
@@ -52,41 +50,6 @@ def test_a_text_of_dataflash_has_units_instances_and_a_torn_end(tmp_path: Path) 
         np.testing.assert_allclose(own.columns[f"IMU[{k}].GyrX"], k + 0.1 * np.arange(40))
         np.testing.assert_allclose(own.times, 1e-3 + 0.02 * np.arange(40))
     assert [(n.code, n.value) for n in log.notes] == [("damage.skipped", 1)]
-
-
-@pytest.mark.parametrize(
-    ("above", "rate"),
-    [
-        ("// Sample rate: 50.0Hz", 50.0),
-        ("# Sampling period: 20 ms", 50.0),
-        ("% Ts = 0.08;", 12.5),
-        ("Sample Rate,1 kHz", 1000.0),
-        ("Sampling frequency (Hz): 100", 100.0),
-        ("Capture Frame Rate,120.000000,Export Frame Rate,120.000000", 120.0),
-        ("sampling time 0.05 s, sample rate 20 Hz", 20.0),
-        ("Sample rate 50 Hz, update rate 10 Hz", None),
-        ("Capture time: 1:30:00 PM", None),
-        ("# recorded 2020, 1000 samples", None),
-    ],
-)
-def test_the_rate_in_words_above_a_table(above: str, rate: float | None) -> None:
-    found = rate_above(above + "\nCounter,p\n")
-    assert (found[0] if found else None) == rate
-
-
-def test_a_rate_above_the_rows_is_taken_with_what_counts_them(tmp_path: Path) -> None:
-    rows = "".join(f"{2552 + i}\t{np.sin(i / 9):.6f}\t\n" for i in range(100) if i != 50)
-    path = tmp_path / "imu.txt"
-    path.write_text(f"// Sample rate: 50.0Hz\n// Firmware: 2.5.1\nCounter\tGyr_X\t\n{rows}")
-    time = describe_log(path).time
-    assert time is not None
-    assert (time.column, time.counted, time.said) == ("Counter", 50.0, "'Sample rate: 50.0Hz'")
-    assert time.duration == pytest.approx(99 / 50)
-    # A clock goes before words.
-    path.write_text(path.read_text().replace("Counter", "time_ms"))
-    time = describe_log(path).time
-    assert time is not None
-    assert (time.column, time.unit) == ("time_ms", "ms")
 
 
 def test_numbers_of_packets_are_no_times(tmp_path: Path) -> None:
