@@ -41,9 +41,7 @@ def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
 
 
 ABLATIONS: tuple[Ablation, ...] = (
-    Ablation("turned_sensors", f"{_VALIDATION}.turned_sensors:turned_sensors", lambda problem: []),
-    Ablation("odd_flights", f"{_VALIDATION}.odd_flights:odd_flights", lambda flights: []),
-    Ablation("noisy_inputs", f"{_VALIDATION}.noisy_inputs:noisy_inputs", lambda *_: ()),
+    Ablation("noisy_inputs", f"{_VALIDATION}.noisy_inputs:noisy_inputs", lambda *_, **__: []),
     Ablation(
         "noisy_scales", f"{_IDENTIFICATION}.estimation.noisy_scales:free_scales", lambda *_: ()
     ),
@@ -52,15 +50,7 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.estimation.restricted_likelihood:with_own_noise",
         lambda problem, noise: noise,
     ),
-    Ablation("moves_against", f"{_VALIDATION}.moves_against:moves_against", lambda *_: False),
-    Ablation(
-        "short_holds",
-        f"{_FLIGHTS}.short_holds:short_holds",
-        lambda y, begins, noisy, step: np.zeros(len(begins), bool),
-    ),
-    Ablation("noisy_rails", f"{_FLIGHTS}.noisy_rails:rail_below_noise", lambda x: None),
     Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
-    Ablation("stick_dropouts", f"{_FLIGHTS}.stick_dropouts:stick_dropouts", lambda x: None),
     Ablation(
         "likelier_hold",
         f"{_IDENTIFICATION}.likelier_hold:with_likelier_hold",

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from heli_jax.flights.marks import Counts, Marked
-from heli_jax.flights.noisy_rails import PILE, rail_below_noise
-from heli_jax.flights.short_holds import goes_on, short_holds
-from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.flights.strays import Strays
 
+PILE = 5.0
+"""times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
+steps has 3 times as many at its turning points as at the three values before"""
 FEW = 8
 """distinct values of a signal below which its extremes are no rails: steps between a few levels"""
 _RUN = 3
@@ -44,18 +44,21 @@ _DITHER = 0.01
 """of a usual move, by which a frozen sensor may go to and fro"""
 _DROPS, DROP_SHARE = 5, 0.01
 """visits of a value, and part of the samples at it, from which on they are dropouts"""
+_TRIFLE = 0.2
+"""of its usual deviation or move, by which another signal has to move while one is stuck"""
 _RUNS = 20
 """runs of equal samples, from which on their usual length is known"""
 
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """An end of a signal's range: its value, the times (K,) [s] of the samples there, none where it
-    is no rail, and the part of the range within which they are of that value."""
+    """An end of a signal's range: its value, and the times (K,) [s] of the samples there.
+
+    There are none where it is no rail.
+    """
 
     value: float
     times: np.ndarray
-    width: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -181,18 +184,13 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
     low, high = _at_rails(y, y, levels, counts)
     return SignalFacts(
         size=y.size,
-        low=_rail(s, y, low, float(y.min())),
-        high=_rail(s, y, high, float(y.max())),
+        low=Rail(float(y.min()), s[low]),
+        high=Rail(float(y.max()), s[high]),
         step=_lattice(levels),
         levels=levels.size,
         moves=float(np.mean(np.diff(y) != 0)) if y.size > 1 else 0.0,
         usual=float(np.median(np.diff(s))) if s.size > 1 else 0.0,
     )
-
-
-def _rail(seconds: np.ndarray, x: np.ndarray, at: np.ndarray, end: float) -> Rail:
-    width = float(np.max(np.abs(x[at] - end)) / np.ptp(x)) if at.any() and np.ptp(x) > 0 else 0.0
-    return Rail(end, seconds[at], width)
 
 
 def facts_of_all[K: Hashable](
@@ -213,13 +211,11 @@ def facts_of_all[K: Hashable](
             found = [
                 one
                 for one in _stretches(*signals[key], facts[key])
-                if any(goes_on(*other, one.begin, one.end, STUCK_SECONDS) for other in others)
+                if any(_goes_on(*other, one.begin, one.end) for other in others)
             ]
             counted = _that_count(found, facts[key].size * facts[key].usual)
             drops = _dropouts(*signals[key])
             facts[key] = replace(facts[key], stretches=counted, dropouts=drops)
-        for key in signals.keys() - outputs:
-            facts[key] = replace(facts[key], dropouts=_of_stick(*signals[key]))
     return facts
 
 
@@ -250,9 +246,8 @@ def _runs_out_of_proportion(
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
     noisy = _turns(moves) >= _TURNS
     least = _longest_by_itself(lengths, moves)
-    short = short_holds(y, begins, noisy, facts.step) & (lengths > 0)
     stuck = []
-    for i in np.flatnonzero(short | (lengths >= least)):
+    for i in np.flatnonzero(lengths >= least):
         first, last = begins[i], begins[i] + lengths[i] - 1
         begin, end = float(s[first]), float(s[last])
         # A simulated signal without noise comes to rest within the last digit.
@@ -260,9 +255,24 @@ def _runs_out_of_proportion(
         rests = before < max(_AT_REST * usual, 10.0 * within)
         drifts = np.ptp(y[first : last + 1]) > within
         # What has no noise may rest for a while without being stuck.
-        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy or short[i]):
+        if not rests and not drifts and (end - begin >= STUCK_SECONDS or noisy):
             stuck.append(Stuck(begin, end, float(y[first])))
     return stuck
+
+
+def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bool:
+    """Whether another signal moves from `begin` to `end` [s] about as it does all along."""
+    seen = np.isfinite(x)
+    inside = x[(seconds >= begin) & (seconds <= end) & seen]
+    if inside.size < 2:
+        return False
+    if float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen])):
+        return True
+    # Within so short a time a signal goes no way, and its moves from sample to sample count.
+    moves = np.abs(np.diff(x[seen]))
+    if end - begin >= STUCK_SECONDS or not moves.any():
+        return False
+    return float(np.median(np.abs(np.diff(inside)))) >= _TRIFLE * float(np.median(moves[moves > 0]))
 
 
 def _that_count(stuck: Sequence[Stuck], duration: float) -> tuple[Stuck, ...]:
@@ -325,11 +335,6 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
     return Dropouts(float(levels[k]), s[at])
 
 
-def _of_stick(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
-    dropouts = stick_dropouts(x)
-    return None if dropouts is None else Dropouts(dropouts[0], seconds[dropouts[1]])
-
-
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which samples (N,) are at the lower and at the upper rail; none where there is no rail."""
     finite = x[np.isfinite(x)]
@@ -359,9 +364,6 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
     piled = counts[0] > PILE * usual and counts[0] >= RAIL_SHARE * finite.size
     if piled and _comes_and_goes(finite == top):
         return x == top
-    edge = rail_below_noise(finite)
-    if edge is not None and _comes_and_goes(finite >= edge):
-        return np.isfinite(x) & (x >= edge)
     return np.zeros(x.shape, bool)
 
 

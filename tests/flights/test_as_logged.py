@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.signal import chirp, lfilter, sawtooth
+from scipy.signal import lfilter
 
 from heli_jax.errors import InputError
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
-from heli_jax.flights.signal_facts import signal_facts
 from heli_jax.flights.strays import strays as strays_of
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
@@ -51,71 +50,6 @@ def test_flat_tops_are_seen_at_any_rate(tmp_path, rate):
     low, high = half.source.facts["p", "output"].shares
     seen = RATE[: N // 2]
     assert low + high == pytest.approx(np.mean((seen <= -1.0) | (seen >= 1.2)), abs=0.01)
-
-
-def test_a_rail_with_noise_of_the_converter_is_one_and_a_plateau_is_none():
-    clipped = np.clip(RATE, -1.0, 1.0) + 0.0025 * RNG.standard_normal(N)
-    facts = signal_facts(T, clipped)
-    assert facts.shares[1] == pytest.approx(np.mean(RATE >= 1.0), abs=0.01)
-    assert facts.high.width > 0
-    # A first-order answer to steps comes to rest by itself, at the same value each time.
-    u = np.repeat(RNG.choice([-1.0, 0.0, 1.0], N // 50), 50)
-    y = np.zeros(N)
-    for k in range(N - 1):
-        y[k + 1] = y[k] + DT / 0.1 * (u[k] - y[k])
-    for sd in (0.0, 1e-3, 1e-2):
-        assert signal_facts(T, y + sd * RNG.standard_normal(N)).shares == (0.0, 0.0)
-    assert signal_facts(T, np.sin(1.7 * T)).shares == (0.0, 0.0)
-
-
-def mixed(rng, count=3000):
-    """Swings of six frequencies, within -1 and 1."""
-    omega, phase = 2 * np.pi * rng.uniform(0.1, 1.5, (6, 1)), rng.uniform(0, 2 * np.pi, (6, 1))
-    x = np.sin(omega * DT * np.arange(count) + phase).sum(axis=0)
-    return x / np.abs(x).max()
-
-
-@pytest.mark.parametrize("noise", [0.005, 0.01, 0.02])
-def test_a_rail_below_noise_is_seen(tmp_path, noise):
-    seen = 0
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        x = mixed(rng)
-        clipped = np.clip(x, -1.0, 0.4) + noise * rng.standard_normal(x.size)
-        facts = signal_facts(DT * np.arange(x.size), clipped)
-        assert facts.shares[0] == 0.0
-        if facts.shares[1]:
-            seen += 1
-            assert facts.shares[1] == pytest.approx(np.mean(x >= 0.4 - 2.5 * noise), abs=0.04)
-    assert seen >= (8 if noise < 0.02 else 4)
-    swings = np.clip(mixed(np.random.default_rng(8), N), -0.4, 0.4)
-    p = swings + 0.02 * np.random.default_rng(4).standard_normal(N)
-    (found,) = saturation([("one", read(tmp_path, p=p))])
-    assert found.severity == "doubt"
-    assert "p is level but for noise, within" in found.sentence
-
-
-def test_peaks_and_commanded_steps_with_noise_are_no_rails():
-    t = DT * np.arange(3000)
-    phase = t % 5.0
-    doublets = np.where(phase < 1, 1.0, np.where(phase < 2, -1.0, 0.0))
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        for y in (
-            mixed(rng),
-            np.sin(2 * np.pi * rng.uniform(0.05, 3.0) * t),
-            chirp(t, 0.2, 30.0, 3.0),
-            sawtooth(2 * np.pi * 0.3 * t, 0.5),
-            doublets,
-            lfilter([0.1], [1, -0.9], doublets),
-            np.tile(np.repeat([1.0, -1.0, 1.0, -1.0, 0.0], [90, 60, 30, 30, 90]), 10),
-            np.repeat(rng.choice([-1.0, -0.5, 0.0, 0.5, 1.0], 60), 50),
-            np.repeat(rng.uniform(-1, 1, 60), 50),
-            0.02 * np.cumsum(rng.standard_normal(t.size)),
-        ):
-            for noise in (0.005, 0.01, 0.02, 0.04, 0.08):
-                noisy = y + noise * rng.standard_normal(t.size)
-                assert signal_facts(t, noisy).shares == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("rate", [None, 40.0])

@@ -12,7 +12,6 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax import models
 from heli_jax.config.logs import read_flights
-from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.identification.validation.late_angles import lateness
 from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
 from heli_jax.identification.validation.signal_quality import cut_off, facts_of
@@ -124,17 +123,6 @@ def test_dropouts_are_no_measurements_and_can_be_stated(load):
     assert dropouts(problem, facts(problem)) == []
 
 
-def test_a_stick_that_drops_out():
-    u = np.round(U, 4)
-    gone = np.random.default_rng(1).choice(np.arange(5, N - 5, 7), 12, replace=False)
-    u[gone] = -1.0
-    value, at = stick_dropouts(u) or (None, None)
-    assert value == -1.0
-    np.testing.assert_array_equal(np.flatnonzero(at), np.sort(gone))
-    # A stick between three positions rests where it is.
-    assert stick_dropouts(np.repeat([0.0, 0.1, 0.0, -0.1] * 25, 10)) is None
-
-
 def test_flat_tops_are_no_measurements(load):
     rng = np.random.default_rng(2)
     noisy = P + 0.01 * rng.standard_normal(N)
@@ -176,7 +164,6 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
 @pytest.mark.parametrize("name", ["Pitchtest.csv", "Hovertest.csv"])
 def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
     log = np.genfromtxt(TREX / name, delimiter=",", names=True)
-    assert all(stick_dropouts(log[n]) is None for n in ("lat", "lon", "ped", "col"))
     for angle, rate in (("phi", "p"), ("theta", "q"), ("psi", "r")):
         assert lateness(log[angle], log[rate], 0.01) is None
         ratio = angle_over_rate(log[angle], log[rate], 0.01)

@@ -31,7 +31,6 @@ from heli_jax.identification.validation.advice import (
     is_unstable,
 )
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
-from heli_jax.identification.validation.moves_against import moves_against
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from heli_jax.numbers import explained_text, percent, vaf_text
 from heli_jax.numerics.white_noise import white_part
@@ -298,7 +297,6 @@ def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> Out
     # Of an unstable model the filter expects any error of a simulation: then its innovations are
     # all there is to judge by.
     expected = ratio <= EXPECTED and (white or (abs(lag1) < FAR_FROM_WHITE and not unstable))
-    expected = expected and not moves_against(name, evidence.records)
     adequate = bool(enough or expected)
     return OutputAdequacy(name, adequate, m.vaf, explained, white, lag1, ratio)
 

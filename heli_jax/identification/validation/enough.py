@@ -37,7 +37,6 @@ from heli_jax.identification.validation.signal_signs import (
     sticks_of,
 )
 from heli_jax.identification.validation.smoothed import smoothed
-from heli_jax.identification.validation.turned_sensors import turned_sensors
 from heli_jax.numbers import p_value
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -83,7 +82,6 @@ def is_it_enough(
         *smoothed(flights, process_noise=estimator_of(problem.method).process_noise),
         *misread(problem),
         *rate_against_angle(problem),
-        *turned_sensors(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated, sticks_of(problem.model)),
         *doubtful_inputs(flights, e.simulated, sticks_of(problem.model)),

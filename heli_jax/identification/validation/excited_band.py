@@ -12,7 +12,6 @@ from heli_jax.analysis.spectra import partial_coherence, segment_transforms, wit
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.hardly_moving import hardly_moving
-from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
 
 COHERENT = 0.6
@@ -61,17 +60,10 @@ def bands(flights: Sequence[Flight]) -> list[Finding]:
     """Which band each input excites, and which inputs move together.
 
     Flights of one sample time are looked at together: what one of them tells apart is told apart.
-    A flight that answers otherwise than the rest is named, and left out of that.
 
     Args:
         flights: those that are fitted.
     """
-    odd = {one.index: one.finding for one in odd_flights(flights)}
-    rest = [f for i, f in enumerate(flights) if i not in odd]
-    return [*odd.values(), *_bands(rest)]
-
-
-def _bands(flights: Sequence[Flight]) -> list[Finding]:
     dt = flights[0].dt
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]

@@ -18,7 +18,6 @@ from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.flights.table import shown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.signal_quality import (
     Facts,
     cut_off,
@@ -26,7 +25,6 @@ from heli_jax.identification.validation.signal_quality import (
     facts_of,
 )
 from heli_jax.identification.validation.signal_signs import rate_against_angle
-from heli_jax.identification.validation.turned_sensors import turned_sensors
 from heli_jax.vehicle import of_helicopter
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
@@ -74,8 +72,6 @@ def record_doubts(problem: Problem) -> list[Finding]:
         *dropouts(problem, facts),
         *cut_off(list(zip(labels(problem.training), facts, strict=True))),
         *rate_against_angle(problem),
-        *turned_sensors(problem),
-        *(one.finding for one in odd_flights(problem.training)),
     ]
 
 
@@ -93,13 +89,12 @@ def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Finding]:
             "doubt",
             dropout_words(label, flight, (name, kind), one),
             subjects=(name,),
-            brief=f"dropouts of {name} are taken for "
-            + ("commands" if kind == "input" else "measurements"),
+            brief=f"dropouts of {name} are taken for measurements",
             denies=True,
         )
         for label, flight, of_signals in zip(labels(flights), flights, facts, strict=True)
         for (name, kind), one in of_signals.items()
-        if one.dropouts is not None and (kind == "input" or one.dropped >= DROP_SHARE)
+        if one.dropouts is not None and one.dropped >= DROP_SHARE
     ]
 
 

@@ -17,7 +17,6 @@ from heli_jax.flights.signal_facts import (
     DROP_SHARE,
     RAIL_SHARE,
     STUCK_SECONDS,
-    Rail,
     SignalFacts,
     Stuck,
     at_rails,
@@ -121,17 +120,9 @@ def cut_off(flights: Sequence[tuple[str, Facts]]) -> list[Finding]:
     return findings
 
 
-def _near(rail: Rail) -> str:
-    if not rail.width:
-        return "at"
-    if rail.width < 0.0101:
-        return "within a hundredth of its range of"
-    return f"level but for noise, within {100 * rail.width:.0f} % of its range of"
-
-
 def _saturated(total: float, label: str, kind: str, name: str, facts: SignalFacts) -> Finding:
     ends = [
-        f"{_near(rail)} its {word} value {rail.value:.4g} in {100 * share:.2g} % of the samples"
+        f"at its {word} value {rail.value:.4g} in {100 * share:.2g} % of the samples"
         for word, rail, share in zip(
             ("smallest", "largest"), (facts.low, facts.high), facts.shares, strict=True
         )
@@ -158,8 +149,7 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
             if facts.marks and kind == "output":
                 words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
                 doubts.append((0.0, f"{words}at what the log says of such values."))
-            least = DROP_SHARE if kind == "output" else 0.0
-            if facts.dropouts is not None and facts.dropped >= least:
+            if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
                 words = dropout_words(label, flight, (name, kind), facts)
                 doubts.append((facts.dropped * facts.size * facts.usual, words))
             doubts += [
@@ -199,15 +189,13 @@ def _stays(stretches: Sequence[Stuck]) -> list[tuple[float, str]]:
 def dropout_words(label: str, flight: Flight, key: tuple[str, str], facts: SignalFacts) -> str:
     """A sentence on a signal's dropouts, of which there are some."""
     assert facts.dropouts is not None
-    name, kind = key
-    signals = getattr(flight.source, f"{kind}s", {})
-    value = facts.dropouts.value
+    name, value = key[0], facts.dropouts.value
+    signals = flight.source.outputs if flight.source else {}
     logged = float(signals[name].from_si(np.array(value))) if name in signals else value
     words = f"{label}: {name} jumps to {value:.4g} and back, in {100 * facts.dropped:.2g} % of the"
-    what = "drive the model as commands" if kind == "input" else "are taken for measurements"
     return (
-        f"{words} samples: dropouts that {what}; state missing: {logged:.6g} beside its signal, or "
-        "leave these parts out."
+        f"{words} samples: dropouts that are taken for measurements; state missing: {logged:.6g} "
+        "beside its signal, or leave these parts out."
     )
 
 
