@@ -84,9 +84,7 @@ def require_clocks(
     asked = [n for p in patterns or ["*"] for n in matching(clockless, p)]
     for size in dict.fromkeys(clockless[name] for name in asked):
         names = [n for n in dict.fromkeys(asked) if clockless[n] == size]
-        words = (
-            f"left out: {listed(map(shown, names))}, of {size} samples, for which there is no clock"
-        )
+        words = f"{listed(map(shown, names))}, of {size} samples, for which there is no clock"
         notes.append(note(LEFT_OUT, f"left out: {words}", *names, value=size))
 
 
