@@ -207,12 +207,13 @@ def shipped_cases(shared: Path) -> Iterator[Case]:
 
 # Small inputs that failed once: ../shared/cases.
 
-_OUGHT: Mapping[str, tuple[bool, tuple[str, ...]]] = {
-    "fast-loop-slow-log/fe.yaml": (False, ("rate", "trusted")),
-    "fast-loop-slow-log/fe_from_truth.yaml": (False, ("rate", "trusted")),
+_OUGHT: Mapping[str, tuple[bool | None, tuple[str, ...]]] = {
+    "fast-loop-slow-log/fe.yaml": (False, ("loop-between",)),
+    "fast-loop-slow-log/fe_from_truth.yaml": (False, ("loop-between",)),
     "fast-loop-slow-log/iv.yaml": (False, ("instrument", "trusted")),
     "delay-wrong-optimum/fe.yaml": (True, ()),
-    "delay-wrong-optimum/fe_from_truth.yaml": (True, ()),
+    # D is 0.4 +- 0.8, which is no value where the start is 0.5.
+    "delay-wrong-optimum/fe_from_truth.yaml": (None, ()),
     "doublets-and-chirp/fit.yaml": (True, ()),
     "free-decay/decay.yaml": (True, ()),
     "free-decay/step.yaml": (True, ()),

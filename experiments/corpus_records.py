@@ -437,19 +437,21 @@ RIGS: dict[str, Rig] = {
         ought=("adequacy", "sign"),
     ),
     "p in degrees": Rig(lambda: times(p=57.3)(roll(1)), truth=TRUTH, ought=("unit",)),
-    "p clipped": Rig(lambda: clipped(roll(1)), truth=TRUTH, ought=("cut off",)),
-    "p repeated": Rig(lambda: held(roll(1)), truth=TRUTH, ought=("repeat", "held", "stays")),
-    "p astray": Rig(lambda: strayed(roll(1)), truth=TRUTH, ought=("motion", "far")),
-    "stick that drops out": Rig(lambda: dropped(roll(1)), truth=TRUTH, ought=("drop",)),
+    "p clipped": Rig(lambda: clipped(roll(1)), truth=TRUTH, ought=("amplitude",)),
+    "p repeated": Rig(lambda: held(roll(1)), truth=TRUTH, ought=("stuck",)),
+    "p astray": Rig(lambda: strayed(roll(1)), truth=TRUTH, ought=("stray",)),
+    "stick that drops out": Rig(
+        lambda: dropped(roll(1)), truth=TRUTH, ought=("amplitude", "adequacy")
+    ),
     "a dead stick in one of three": Rig(
-        lambda: [roll(1), roll(6), times(da=0.0)(roll(7))], truth=TRUTH, ought=("odd", "answer")
+        lambda: [roll(1), roll(6), times(da=0.0)(roll(7))], truth=TRUTH, ought=("adequacy",)
     ),
     "another machine in one of three": Rig(
         lambda: [roll(1), roll(6), roll(7) | {"p": roll(8)["p"], "phi": roll(8)["phi"]}],
         truth=TRUTH,
-        ought=("odd", "answer"),
+        ought=("flights-differ",),
     ),
-    "a turned gyro": Rig(lambda: two_axes(10.0), TWO_AXES, ought=("turned",)),
+    "a turned gyro": Rig(lambda: two_axes(10.0), TWO_AXES, ought=("residual-follows",)),
     "angle of a gyro in filter error": Rig(
         lambda: drifting(roll(2, gust=2.0)), truth=TRUTH, asks=FILTER, ought=("white",)
     ),
