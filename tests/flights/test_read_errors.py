@@ -80,7 +80,7 @@ BAD_TEXT = {
     "header and blanks": ("# a\nt,stick,phi\n  \n\n", ["line 2", "header alone"]),
     "no header": (
         csv_text(rows()[1:], header="0.000,0,0.0"),
-        ["no column 't'", "column1, column2"],
+        ["line 1", "write a line of names above"],
     ),
     "short row": (ragged(3, -1), ["line 8", "2 cells", "expected 3"]),
     "long row": (ragged(3, 2), ["line 8", "5 cells", "expected 3"]),
