@@ -7,7 +7,7 @@ follow by Gauss and Newton, and only what has stayed is determined.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -140,7 +140,8 @@ class Valley(NamedTuple):
         N = np.array(null) * np.array([u.per_log if u.logarithmic else 0.0 for u in unknowns])
         # Onto the null directions: how the logarithms of all go with that of one.
         onto = np.linalg.pinv(N) @ N
-        for i in scipy.linalg.qr(onto, mode="r", pivoting=True)[1].tolist():
+        pivoted: Any = scipy.linalg.qr(onto, mode="r", pivoting=True)
+        for i in pivoted[1].tolist():
             u = unknowns[i]
             if not onto[i, i] > 1e-2:
                 continue

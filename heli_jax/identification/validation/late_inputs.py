@@ -6,6 +6,7 @@ the output (C. A. Sims, Money, income, and causality, Am. Econ. Rev. 62, 1972).
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -129,7 +130,9 @@ def _basis(X: np.ndarray, size: float | None = None) -> np.ndarray:
     """Orthonormal columns (N, rank) that span those of X (N, m); of the columns' own size, or of
     `size`, what is rounding is left out."""
     norms = np.linalg.norm(X, axis=0) if size is None else np.full(X.shape[1], size)
-    Q, R, _ = scipy.linalg.qr(X / np.maximum(norms, 1e-300), mode="economic", pivoting=True)
+    scaled = X / np.maximum(norms, 1e-300)
+    parts: Any = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
+    Q, R = parts[:2]
     values = np.abs(np.diag(R))
     return Q[:, values > (1e-8 * values[0] if size is None else 1e-6)]
 
