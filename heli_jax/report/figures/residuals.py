@@ -18,7 +18,6 @@ from heli_jax.identification.validation.metrics import (
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels, sample_time
-from heli_jax.report.sketch import Sketch
 from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def residual_correlation(
     *,
     together: int = 1,
     test: Whiteness | None = None,
-    figure: "Figure | Sketch | None" = None,
+    figure: "Figure | None" = None,
 ) -> Panels:
     """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
     input, with 99 % bands.
