@@ -53,7 +53,7 @@ def bode_overlay(
         below.plot(response.omega / _TURN, phase(response.H), label=label, **look)
     above.set_xscale("log")
     style.plain_log_ticks(above)
-    above.set_title(f"{input} to {output}, {flight}", loc="left")
+    above.set_title(f"{input} to {output}, {style.short(flight)}", loc="left")
     above.set_ylabel("magnitude [dB]")
     below.set_ylabel("phase [deg]")
     below.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))

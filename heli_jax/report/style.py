@@ -226,12 +226,27 @@ def subtitle(ax: "Axes", text: str, *, raised: bool = False) -> None:
     )
 
 
+_BESIDE = 42
+"""letters of a title that leave room for a legend at its right"""
+_NAME = 26
+"""letters of a name in a title"""
+
+
+def short(name: str) -> str:
+    """A name from a log, which may have any length, as a title has it."""
+    half = _NAME // 2
+    return name if len(name) <= _NAME else f"{name[:half]}…{name[-half:]}"
+
+
 def legend_above(ax: "Axes", *, raised: bool = False) -> None:
     """A legend on top of the axes at the right, where no data are; `raised` beside the title
     where a subtitle lies between.
 
-    Beside a title is room for two or three entries; more belong below a raised subtitle.
+    Beside a short title is room for two or three entries; more belong below a raised subtitle.
     """
+    title = ax.get_title("left")
+    if not raised and len(title) > _BESIDE:
+        ax.set_title(title, loc="left", pad=19)
     from matplotlib.transforms import ScaledTranslation
 
     up = ScaledTranslation(0.0, ROW if raised else 0.0, ax.figure.dpi_scale_trans)

@@ -67,6 +67,17 @@ def test_bars_and_bands_keep_their_ends():
     assert (panel.marks, panel.shades) == ((2.5,), ((3.0, 4.0),))
 
 
+def test_a_long_name_of_a_flight_stays_in_its_figure_and_off_the_legend():
+    signals = record(200)._replace(flight=4 * "Hover of May 2024, ", hold_out=True)
+    with style.in_style():
+        ax = figures.response(signals, "roll", models.by_name("helicopter"))[0]
+        ax.figure.canvas.draw()
+        title, legend = (v.get_window_extent() for v in (ax._left_title, ax.get_legend()))
+    assert title.x1 < ax.figure.bbox.x1
+    assert title.y1 < ax.figure.bbox.y1
+    assert legend.y1 < title.y0 + 2.0
+
+
 NAMES = ["$a_1^$ <b> & \\frac{", "bell\x07 and\x1b[31m"]
 
 

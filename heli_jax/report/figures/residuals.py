@@ -76,7 +76,8 @@ def _head(ax: "Axes", signals: Signals, output: str, test: Whiteness) -> None:
     """Title and subtitle: what of which flight, and the test of whiteness."""
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"
-    ax.set_title(f"{what} of {output}, {signals.flight}: {result}", loc="left")
+    flight = style.short(signals.flight)
+    ax.set_title(f"{what} of {output}, {flight}: {result}", loc="left")
     lag1 = f"{test.lag1:+.2f}".replace("-", "−")
     subtitle(
         ax,

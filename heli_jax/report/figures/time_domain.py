@@ -68,7 +68,7 @@ def _agreement(signals: Signals, output: str) -> str:
     source = "held out, simulated" if signals.hold_out else "simulated"
     # NaN where the measured output never moves: it has no variance to account for.
     vaf = f", VAF {vaf_percent(agreement.vaf)}" if np.isfinite(agreement.vaf) else ""
-    return f"{output}, {signals.flight}: {source}{vaf}"
+    return f"{output}, {style.short(signals.flight)}: {source}{vaf}"
 
 
 def rls_history(
