@@ -117,16 +117,11 @@ def _print(head: _Row, rows: Sequence[_Row]) -> None:
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, name in enumerate(head):
-        table.add_column(_escaped(name), justify="left" if i == 0 else "right", no_wrap=True)
+        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(_escaped(cell) for cell in row))
+        table.add_row(*row)
     widest = sum(max(map(cell_len, column)) for column in zip(head, *rows, strict=True))
     width = widest + _BETWEEN * (len(head) + 1)
-    Console(file=sys.stdout, highlight=False, width=width).print(table)
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    # '[deg]' in a unit or a signal's name is markup to rich, and would vanish.
-    return escape(text)
+    # '[deg]' in a unit or a signal's name is markup to rich and would vanish, ':m:' an emoji.
+    console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False, width=width)
+    console.print(table)

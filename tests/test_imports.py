@@ -291,7 +291,9 @@ def test_what_other_commands_import_is_without_the_sweeps_libraries():
     program = (
         "import sys\n"
         "from heli_jax import config, generate, output\n"
-        "print(sorted({'zarr', 'xarray', 'pandas', 'distributed', 'scipy.stats'} & {*sys.modules}))"
+        "heavy = {'zarr', 'xarray', 'pandas', 'distributed', 'scipy.stats'} & {*sys.modules}\n"
+        "from heli_jax import workflow\n"
+        "print(sorted(heavy | {'matplotlib', 'PIL'} & {*sys.modules}))"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-# Imported where a figure of Matplotlib is read: the charts of most pages come from sketches.
+from heli_jax.report.style import BARS
+
+# Imported where a figure is read: `info` and `--help` need none of it.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.container import ErrorbarContainer
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -48,8 +49,6 @@ class Panel(NamedTuple):
     """vertical lines"""
     shades: tuple[tuple[float, float], ...] = ()
     """stretches of x that are shaded"""
-    x_limits: tuple[float, float] | None = None
-    """where they are not those of the chart"""
 
 
 class Chart(NamedTuple):
@@ -63,8 +62,6 @@ class Chart(NamedTuple):
     panels: tuple[Panel, ...]
     of: str = ""
     """what its x belongs to, as a flight: charts of the same share cursor and zoom"""
-    whole: bool = False
-    """whether x counts things: its numbers are whole"""
 
 
 def chart_of(figure: "Figure") -> Chart:
@@ -93,7 +90,6 @@ def chart_of(figure: "Figure") -> Chart:
 def _panel(ax: "Axes", height: float) -> Panel:
     low, high = ax.get_ylim()
     flat, upright, lines = _straight(ax)
-    first, last = ax.get_xlim()
     return Panel(
         label=ax.get_ylabel(),
         limits=(float(low), float(high)),
@@ -102,7 +98,6 @@ def _panel(ax: "Axes", height: float) -> Panel:
         levels=flat,
         marks=upright,
         shades=_shades(ax),
-        x_limits=(float(first), float(last)),
     )
 
 
@@ -122,37 +117,30 @@ def _straight(ax: "Axes") -> tuple[tuple[float, ...], tuple[float, ...], list["L
 
 
 def _lines(ax: "Axes", lines: list["Line2D"]) -> list[Series]:
-    from matplotlib.container import ErrorbarContainer
+    series: list[Series] = []
+    for line in lines:
+        if line.get_label() == BARS:
+            ends = np.asarray(line.get_ydata(), float)
+            series[-1] = series[-1]._replace(kind="bars", low=ends[::3], high=ends[1::3])
+        else:
+            series.append(_line(line, ax))
+    return [s for s in series if s.x.size]
 
-    bars = {c.lines[0]: c for c in ax.containers if isinstance(c, ErrorbarContainer)}
-    return [_line(line, bars.get(line), ax) for line in lines if np.size(line.get_xdata())]
 
-
-def _line(line: "Line2D", bars: "ErrorbarContainer | None", ax: "Axes") -> Series:
-    from matplotlib.collections import LineCollection
+def _line(line: "Line2D", ax: "Axes") -> Series:
     from matplotlib.colors import to_hex
 
-    x, y = np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)
     kind = "step" if line.get_drawstyle() == "steps-post" else "line"
-    # The container of error bars has their label, not the line in it.
-    label, low, high = str(line.get_label()), None, None
     if line.get_linestyle() in ("None", "none", "", " "):
         kind = "points"
-    if bars is not None:
-        label, kind = str(bars.get_label()), "bars"
-        [collection] = [c for c in bars.lines[2] if isinstance(c, LineCollection)]
-        ends = np.array([np.asarray(s)[:, 1] for s in collection.get_segments()])
-        low, high = ends.reshape(-1, 2).min(axis=1), ends.reshape(-1, 2).max(axis=1)
     return Series(
-        _name(label, ax),
+        _name(str(line.get_label()), ax),
         kind,
         to_hex(line.get_color()),
         float(line.get_linewidth()) if kind in ("line", "step") else float(line.get_markersize()),
         line.get_linestyle() not in ("-", "None"),
-        x,
-        y,
-        low,
-        high,
+        np.asarray(line.get_xdata(), float),
+        np.asarray(line.get_ydata(), float),
     )
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.identification.result import Signals
@@ -53,10 +52,10 @@ def bode_overlay(
         below.plot(response.omega / _TURN, phase(response.H), label=label, **look)
     above.set_xscale("log")
     style.plain_log_ticks(above)
-    above.set_title(f"{input} to {output}, {flight}", loc="left")
+    above.set_title(f"{input} to {output}, {style.short(flight)}", loc="left")
     above.set_ylabel("magnitude [dB]")
     below.set_ylabel("phase [deg]")
-    below.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
+    style.phase_ticks(below)
     below.set_xlabel("frequency [Hz]")
     style.legend_above(above)
     return above.figure  # pyright: ignore[reportReturnType]

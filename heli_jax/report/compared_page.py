@@ -155,7 +155,7 @@ def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit
         if far.any():
             label, simulated = f"{label} (diverges)", np.where(far, np.nan, simulated)
         style.line(ax, signals.log_times, simulated, color=color, ls=dashes, lw=0.9, label=label)
-    ax.set_title(f"{output}, {name}: simulated", loc="left")
+    ax.set_title(f"{output}, {style.short(name)}: simulated", loc="left")
     ax.set_xlabel(time_label(first.log_start))
     ax.figure.set_label(name)
     low, high = ax.get_ylim()

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,16 +14,16 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import figures
-from heli_jax.report.charts import Chart
 from heli_jax.report.embedded import Logged
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import FittedFlight
-from heli_jax.report.matrix_svg import correlation_svg
-from heli_jax.report.pictures import Draw, sketched
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+type Draw = Callable[[], Figure | None]
+"""draws a figure; None where there is nothing to draw"""
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
@@ -50,10 +49,10 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     for i in _drawn([s.hold_out for s in fit.signals]):
         s, part = fit.signals[i], parts[i]
         for output in s.measured:
-            drawings[f"response{part}_{output}"] = _panels(figures.response, s, output, model)
+            drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
             # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
-                drawings[f"residual{part}_{output}"] = _panels(
+                drawings[f"residual{part}_{output}"] = _drawing(
                     figures.residual_correlation,
                     s,
                     output,
@@ -70,14 +69,10 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
             for pair in pairs:
                 drawings[f"{group}_{pair.output}-{pair.input}"] = _match(pair, analysis, whose)
     if len(fit.verdict.names) > 1:
-        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)._replace(
-            svg=partial(correlation_svg, fit.verdict)
-        )
-    drawings["starts"] = _drawing(figures.waterfall, fit.starts)._replace(
-        chart=partial(figures.waterfall_chart, fit.starts)
-    )
+        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
+    drawings["starts"] = _drawing(figures.waterfall, fit.starts)
     if baseline is not None:
-        drawings["rls"] = _panels(
+        drawings["rls"] = _drawing(
             figures.rls_history, baseline, log_start=_log_start(fit, baseline.flight)
         )
     return drawings
@@ -178,16 +173,7 @@ def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any
         axes = function(*args, **options)
         return axes[0].figure if axes else None  # type: ignore[return-value]
 
-    return Draw(draw)
-
-
-def _panels(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
-    """What can be drawn on a sketch too."""
-
-    def chart() -> Chart | None:
-        return sketched(lambda sketch: function(*args, **options, figure=sketch))
-
-    return _drawing(function, *args, **options)._replace(chart=chart)
+    return draw
 
 
 def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
@@ -199,7 +185,7 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     known = problem.training[i].known if i < len(problem.training) else {}
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
     flight = FittedFlight(problem.model, params, fit, fit.signals[i])
-    return _panels(figures.bode, flight, baseline)
+    return _drawing(figures.bode, flight, baseline)
 
 
 def _match(pair: FittedPair, analysis: Analysis, whose: str) -> Draw:
@@ -208,4 +194,4 @@ def _match(pair: FittedPair, analysis: Analysis, whose: str) -> Draw:
     about = f"model linearised about {responses.about}" if responses.about else "continuous model"
     note = f"{about}; data without the hold of the input, {whose}"
     unit = figures.bode_unit(analysis.problem.model, pair.output, pair.input)
-    return _panels(figures.match, pair, unit, note)
+    return _drawing(figures.match, pair, unit, note)

@@ -1,21 +1,21 @@
 """How figures look: colours, one set of rcParams, thinning of long lines, saving."""
 
 import io
+import re
+import warnings
 import weakref
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from heli_jax.report.sketch import SketchAxes
 from heli_jax.report.thinning import MOST_POINTS, thinned
 from heli_jax.report.unit_symbols import pretty
 
-# Imported where it draws: the page of most fits needs none of it (`sketch`), and would wait half a
-# second for it.
+# Imported where it draws: `info` and `--help` need none of it, and would wait half a second for it.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -28,7 +28,9 @@ CYCLE = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK, "#7F7F7F")
 GREY, PALE = "#6B6B6B", "#A8A8A8"
 
 STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
+    "font.family": "sans-serif",
+    # Beside the first, which sets the widths, fonts of about its widths.
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "sans-serif"],
     "font.size": 9.0,
     "axes.titlesize": 10.0,
     "axes.titleweight": "bold",
@@ -57,8 +59,8 @@ STYLE: dict[Any, Any] = {
     "lines.solid_joinstyle": "round",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
-    # Letters as outlines: the page looks the same where DejaVu is not installed.
-    "svg.fonttype": "path",
+    # Letters as text, in a font of the reader's: as outlines they are most of a file.
+    "svg.fonttype": "none",
     # Without a salt the ids in an SVG are random, and two runs of one fit differ in every figure.
     "svg.hashsalt": "heli_jax",
     # A fifth of a pixel: nobody sees it, and noisy lines lose many of their points.
@@ -77,6 +79,12 @@ BOTTOM = 0.48
 _POINTS = 72.0
 """in an inch"""
 _DPI = 110
+_CORNERS = 4000
+"""of the long lines of a figure together"""
+# A hundredth of a point is enough, and half as long as a millionth.
+_PLACES, _FURTHER = re.compile(rb' (?:d|x|y)="[^"]+"'), re.compile(rb"(?<=\.\d\d)\d+| \n")
+_NOT_XML = bytes(set(range(32)) - {9, 10, 13})
+"""control characters"""
 
 
 def figure(height: float, width: float = WIDTH) -> "Figure":
@@ -106,7 +114,7 @@ def place(
     width, height = drawing.get_size_inches()
     left = 0.82
     # matplotlib takes margins as parts of the figure, and gaps as parts of a panel's height.
-    each = panel_height(height, panels, gap=gap, top=top)
+    each = (height - top - BOTTOM - gap * (panels - 1)) / panels
     drawing.subplots_adjust(
         left=left / width,
         right=1.0 - right / width,
@@ -116,18 +124,6 @@ def place(
     )
 
 
-def panel_height(height: float, panels: int, *, gap: float, top: float = TOP) -> float:
-    """Of each panel, on average [inch].
-
-    Args:
-        height: of the figure [inch].
-        panels: how many there are below each other.
-        gap: between two [inch].
-        top: margin above the first [inch].
-    """
-    return (height - top - BOTTOM - gap * (panels - 1)) / panels
-
-
 _LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()
 """lines that may be thinned: their x ascends"""
 
@@ -135,10 +131,12 @@ _LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()
 def thin(drawn: "Figure") -> None:
     """Thin the long lines of a figure to what can be seen of them."""
     # Not when they are drawn: the page's own drawing of a figure, which is zoomed, has all points.
-    for ax in drawn.axes:
-        for long in ax.get_lines():
-            if long in _LONG and np.size(long.get_xdata()) > MOST_POINTS:
-                long.set_data(*thinned(np.asarray(long.get_xdata()), np.asarray(long.get_ydata())))
+    lines = [v for ax in drawn.axes for v in ax.get_lines() if v in _LONG]
+    corners = [1 if v.get_drawstyle() == "default" else 2 for v in lines]
+    # Noise in many panels has no short outline: its lines share what a figure may have.
+    most = min(MOST_POINTS, _CORNERS // max(sum(corners), 1))
+    for v in lines:
+        v.set_data(*thinned(np.asarray(v.get_xdata()), np.asarray(v.get_ydata()), max(most, 4)))
 
 
 def line(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
@@ -150,9 +148,7 @@ def line(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
         y: (N,)
         **line_style: as of matplotlib's `plot`.
     """
-    drawn = ax.plot(np.asarray(x), np.asarray(y), **line_style)
-    if not isinstance(ax, SketchAxes):
-        _LONG.update(drawn)
+    _LONG.update(ax.plot(np.asarray(x), np.asarray(y), **line_style))
 
 
 def samples(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
@@ -174,6 +170,36 @@ def samples(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
     line(ax, x, y, **line_style)
 
 
+def bars(
+    ax: "Axes",
+    x: np.ndarray,
+    y: np.ndarray,
+    reach: ArrayLike,
+    *,
+    color: str,
+    label: str | None = None,
+) -> None:
+    """Draw dots with error bars.
+
+    Args:
+        ax: where.
+        x: (N,)
+        y: (N,)
+        reach: of the bars down and up, (2, N), or the same for both, (N,).
+        color: of both.
+        label: of the dots.
+    """
+    ax.plot(x, y, "o", ms=2.2, mew=0.0, color=color, label=label)
+    down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
+    # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.
+    ends = np.stack([y - down, y + up, np.full(y.size, np.nan)], axis=1).ravel()
+    ax.plot(np.repeat(x, 3), ends, lw=0.6, color=color, label=BARS)
+
+
+BARS = "_bars"
+"""label of the bars of the dots that were drawn before them"""
+
+
 def label(name: str, unit: str | None) -> str:
     """`roll [rad]`; the name alone where the unit is not known."""
     return f"{name} [{pretty(unit)}]" if unit is not None else name
@@ -187,9 +213,6 @@ def subtitle(ax: "Axes", text: str, *, raised: bool = False) -> None:
         text: of the line.
         raised: whether it lies over a legend (`legend_above`), the title over both.
     """
-    if isinstance(ax, SketchAxes):
-        ax.note = text
-        return
     row = _POINTS * ROW if raised else 0.0
     ax.set_title(ax.get_title("left"), loc="left", pad=19 + row)
     ax.annotate(
@@ -203,14 +226,27 @@ def subtitle(ax: "Axes", text: str, *, raised: bool = False) -> None:
     )
 
 
+_BESIDE = 42
+"""letters of a title that leave room for a legend at its right"""
+_NAME = 26
+"""letters of a name in a title"""
+
+
+def short(name: str) -> str:
+    """A name from a log, which may have any length, as a title has it."""
+    half = _NAME // 2
+    return name if len(name) <= _NAME else f"{name[:half]}…{name[-half:]}"
+
+
 def legend_above(ax: "Axes", *, raised: bool = False) -> None:
     """A legend on top of the axes at the right, where no data are; `raised` beside the title
     where a subtitle lies between.
 
-    Beside a title is room for two or three entries; more belong below a raised subtitle.
+    Beside a short title is room for two or three entries; more belong below a raised subtitle.
     """
-    if isinstance(ax, SketchAxes):
-        return  # a chart places its own
+    title = ax.get_title("left")
+    if not raised and len(title) > _BESIDE:
+        ax.set_title(title, loc="left", pad=19)
     from matplotlib.transforms import ScaledTranslation
 
     up = ScaledTranslation(0.0, ROW if raised else 0.0, ax.figure.dpi_scale_trans)
@@ -227,8 +263,6 @@ def legend_above(ax: "Axes", *, raised: bool = False) -> None:
 
 def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
     """0.1, 0.2, 0.5, 1 on a logarithmic axis, powers where they are far from one."""
-    if isinstance(ax, SketchAxes):
-        return
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis = ax.xaxis if which == "x" else ax.yaxis
@@ -251,8 +285,6 @@ def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int, *, integer: bool 
 
 def phase_ticks(ax: "Axes") -> None:
     """Steps of 15, 30, 45 and 90 degrees up the axis: a phase is read in parts of a right angle."""
-    if isinstance(ax, SketchAxes):
-        return
     from matplotlib.ticker import MaxNLocator
 
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
@@ -264,18 +296,15 @@ def styled(draw: Callable[[], "Figure | None"]) -> "Figure | None":
         return draw()
 
 
-def in_style() -> AbstractContextManager[None]:
+@contextmanager
+def in_style() -> Iterator[None]:
     """Matplotlib's settings for the style, as long as the context lasts."""
     import matplotlib
 
-    return matplotlib.rc_context(STYLE)
-
-
-def svg(draw: Callable[[], "Figure | None"]) -> tuple[str, bytes] | None:
-    """Draw a figure in the style: its first title and the SVG; None where there is none."""
-    with in_style():
-        drawn = draw()
-        return None if drawn is None else (drawn.axes[0].get_title("left"), as_svg(drawn))
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        # A name of a log in letters that this machine's font lacks; the reader's may have them.
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+        yield
 
 
 def as_svg(drawn: "Figure") -> bytes:
@@ -284,7 +313,9 @@ def as_svg(drawn: "Figure") -> bytes:
     buffer = io.BytesIO()
     # Without a date: the same fit gives the same file.
     drawn.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+    text = _PLACES.sub(lambda m: _FURTHER.sub(b"", m[0]), buffer.getvalue())
+    # What XML cannot hold, from a name of a log.
+    return text.translate(None, _NOT_XML)
 
 
 def as_png(drawn: "Figure") -> bytes:
@@ -293,14 +324,6 @@ def as_png(drawn: "Figure") -> bytes:
     buffer = io.BytesIO()
     drawn.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()
-
-
-def saved(drawn: "Figure", path: Path) -> bytes:
-    """Write a figure that was drawn in the style, within it, as `path`.svg and .png; the SVG."""
-    data = as_svg(drawn)
-    path.with_suffix(".png").write_bytes(as_png(drawn))
-    path.with_suffix(".svg").write_bytes(data)
-    return data
 
 
 def save(draw: Callable[[], "Figure | None"], path: Path) -> tuple[str, bytes] | None:
@@ -313,5 +336,7 @@ def save(draw: Callable[[], "Figure | None"], path: Path) -> tuple[str, bytes] |
         drawn = draw()
         if drawn is None:
             return None
-        data = saved(drawn, path)
+        data = as_svg(drawn)
+        path.with_suffix(".svg").write_bytes(data)
+        path.with_suffix(".png").write_bytes(as_png(drawn))
     return drawn.axes[0].get_title("left"), data

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 
-MOST_POINTS = 2000
-"""points of a drawn line at most: about three for each pixel of a page's width"""
+MOST_POINTS = 800
+"""points of a drawn line at most: the lowest and the highest of every 1.5 pixels of a page"""
 
 
 def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:

@@ -4,12 +4,7 @@ Each function draws on the `figure` it is given, or on one of its own (`axes[0].
 within `matplotlib.rc_context(style.STYLE)` to get the report's look.
 """
 
-from heli_jax.report.figures.estimates import (
-    correlation_matrix,
-    intervals,
-    waterfall,
-    waterfall_chart,
-)
+from heli_jax.report.figures.estimates import correlation_matrix, intervals, waterfall
 from heli_jax.report.figures.frequency_domain import bode, bode_unit
 from heli_jax.report.figures.match import match
 from heli_jax.report.figures.panels import Panels
@@ -31,5 +26,4 @@ __all__ = [
     "rls_history",
     "trace",
     "waterfall",
-    "waterfall_chart",
 ]

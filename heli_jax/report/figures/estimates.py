@@ -1,6 +1,6 @@
 """Figures of the estimates: their correlation, their intervals, and what each start reached."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,17 +9,12 @@ from heli_jax.identification.result import Fit, StartRow
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.report import style
-from heli_jax.report.charts import Chart, Panel, Series
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.style import legend_above, subtitle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-MATRIX_TITLE = "Correlation of the estimates"
-LEFT_OUT = "directions that are not identifiable are left out"
 
 
 def correlation_matrix(verdict: Verdict, *, figure: "Figure | None" = None) -> Panels:
@@ -38,9 +33,9 @@ def correlation_matrix(verdict: Verdict, *, figure: "Figure | None" = None) -> P
     ax.set_aspect("equal")
     _name_cells(ax, names)
     _write_correlations(ax, r)
-    ax.set_title(MATRIX_TITLE, loc="left")
+    ax.set_title("Correlation of the estimates", loc="left")
     if verdict.undetermined:
-        subtitle(ax, LEFT_OUT)
+        subtitle(ax, "directions that are not identifiable are left out")
     return (ax,)
 
 
@@ -59,11 +54,11 @@ def _write_correlations(ax: "Axes", r: np.ndarray) -> None:
     size = 8.5 if len(r) < 9 else 6.0
     for (i, j), value in np.ndenumerate(r):
         color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
-        text = cell_text(float(value), i == j)
+        text = _cell_text(float(value), i == j)
         ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
 
 
-def cell_text(r: float, diagonal: bool) -> str:
+def _cell_text(r: float, diagonal: bool) -> str:
     """A correlation in two digits, five where the last ones count; 1 on the diagonal."""
     if diagonal:
         return "1"
@@ -80,7 +75,15 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: "Figure | None" = None) -
     if len(starts) < 2:
         return ()
     [ax] = panels(figure, 2.8, [1.0])
-    rows, shown, finite, low, top, span, logarithmic = _ranked(starts)
+    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
+    cost = np.array([s.cost for s in rows])
+    finite = np.isfinite(cost)
+    low, top = _cost_range(cost[finite])
+    logarithmic = low > 0 and top > 30 * low
+    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
+    # differences where there are none.
+    span = max(top - low, 0.02 * abs(top), 1e-300)
+    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
     ok = np.array([s.converged for s in rows])
     x = np.arange(1, len(rows) + 1)
     ax.plot(x[finite], shown[finite], color=style.PALE, lw=0.8, zorder=1)
@@ -95,84 +98,9 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: "Figure | None" = None) -
     ax.set_ylabel("cost")
     ax.set_title(_starts_title(rows), loc="left")
     if not finite.all():
-        subtitle(ax, _ON_TOP)
+        subtitle(ax, "starts that ended without a finite cost are drawn on top")
     legend_above(ax, raised=not finite.all())
     return (ax,)
-
-
-_ON_TOP = "starts that ended without a finite cost are drawn on top"
-
-
-class _Ranked(NamedTuple):
-    """Starts by their cost, the best first, and the range of what they cost."""
-
-    rows: list[StartRow]
-    shown: np.ndarray
-    """heights at which they are drawn"""
-    finite: np.ndarray
-    """whether their cost is a number"""
-    low: float
-    top: float
-    span: float
-    """of an axis that is not logarithmic"""
-    logarithmic: bool
-
-
-def _ranked(starts: tuple[StartRow, ...]) -> _Ranked:
-    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost = np.array([s.cost for s in rows])
-    finite = np.isfinite(cost)
-    low, top = _cost_range(cost[finite])
-    logarithmic = low > 0 and top > 30 * low
-    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
-    # differences where there are none.
-    span = max(top - low, 0.02 * abs(top), 1e-300)
-    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
-    return _Ranked(rows, shown, finite, low, top, span, logarithmic)
-
-
-def waterfall_chart(starts: tuple[StartRow, ...]) -> Chart | None:
-    """`waterfall` as plain data: each optimum has a colour and a name; None where it draws none.
-
-    Args:
-        starts: where each of them led.
-    """
-    if len(starts) < 2:
-        return None
-    ranked = _ranked(starts)
-    x, y = np.arange(1.0, len(starts) + 1.0), ranked.shown
-    label, middle = "cost", 0.5 * (ranked.top + ranked.low)
-    limits = (middle - 0.9 * ranked.span, middle + 0.9 * ranked.span)
-    if ranked.logarithmic:
-        y, label = np.log10(y), "log10 of the cost"
-        room = 0.25 * float(np.ptp(y))
-        limits = (float(y.min()) - room, float(y.max()) + room)
-    finite = ranked.finite
-    series = [Series("", "line", style.PALE, 0.8, False, x[finite], y[finite])]
-    optimum = np.array([row.optimum for row in ranked.rows])
-    ok = np.array([row.converged for row in ranked.rows])
-    colours = [c for c in style.CYCLE if c != style.VERMILLION]
-    # 0 is no optimum: what failed there has a name of its own.
-    for k, number in enumerate(dict.fromkeys(optimum[ok & (optimum > 0)].tolist())):
-        at, colour = ok & (optimum == number), colours[k % len(colours)]
-        name = f"optimum {number}" if k < _NAMED else "further optima"
-        series.append(Series(name, "points", colour, 6.0, False, x[at], y[at]))
-    rest = ~ok | (optimum == 0)
-    if rest.any():
-        series.append(Series("failed", "points", style.VERMILLION, 6.0, False, x[rest], y[rest]))
-    return Chart(
-        _starts_title(ranked.rows),
-        "" if finite.all() else _ON_TOP,
-        "start, sorted by cost",
-        False,
-        (0.4, len(starts) + 0.6),
-        (Panel(label, limits, 160.0, tuple(series)),),
-        whole=True,
-    )
-
-
-_NAMED = 6
-"""optima that have a name of their own"""
 
 
 def _scale_cost(ax: "Axes", middle: float, span: float, *, logarithmic: bool) -> None:

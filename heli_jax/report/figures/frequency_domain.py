@@ -13,7 +13,6 @@ from heli_jax.identification.result import Signals
 from heli_jax.report import frequency, style
 from heli_jax.report.figures.panels import Panels, panels, sample_time
 from heli_jax.report.frequency import FittedFlight
-from heli_jax.report.sketch import Sketch, SketchAxes
 from heli_jax.report.style import legend_above, line, subtitle
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def bode(
     *,
     output: str | None = None,
     input: str | None = None,
-    figure: "Figure | Sketch | None" = None,
+    figure: "Figure | None" = None,
 ) -> Panels:
     """Magnitude and phase of the fit, of the RLS and of the record, and the record's coherence.
 
@@ -75,7 +74,7 @@ def bode(
     return axes
 
 
-def _bode_panels(figure: "Figure | Sketch | None", *, with_coherence: bool) -> Panels:
+def _bode_panels(figure: "Figure | None", *, with_coherence: bool) -> Panels:
     """With one row more above them than other figures have: title, subtitle and a legend of four
     entries are too long to stand beside each other."""
     height, ratios = (6.0, [1.4, 1.2, 0.6]) if with_coherence else (4.6, [1.2, 1.0])
@@ -192,15 +191,14 @@ def _finish_bode(
     style.plain_log_ticks(axes[0])
     axes[0].set_ylim(*_within(axes[0], 40.0))
     axes[1].set_ylim(*_within(axes[1], 180.0))
-    if not isinstance(axes[0], SketchAxes):
-        axes[0].annotate(
-            "Nyquist ",
-            (nyquist / _TURN, 0.03),
-            xycoords=("data", "axes fraction"),
-            ha="right",
-            fontsize=8,
-            color=style.GREY,
-        )
+    axes[0].annotate(
+        "Nyquist ",
+        (nyquist / _TURN, 0.03),
+        xycoords=("data", "axes fraction"),
+        ha="right",
+        fontsize=8,
+        color=style.GREY,
+    )
     axes[0].set_ylabel(f"magnitude [{unit}]")
     axes[1].set_ylabel("phase [deg]")
     style.phase_ticks(axes[1])

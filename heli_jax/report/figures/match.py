@@ -1,6 +1,6 @@
 """Bode figure of a fitted model over the flights' response, and of the error between both."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from heli_jax.report.figures.frequency_axis import BEYOND_CHANCE, last_of
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import phase
-from heli_jax.report.sketch import Sketch
 from heli_jax.report.style import legend_above, subtitle
 
 if TYPE_CHECKING:
@@ -28,9 +27,7 @@ _GAINS, _PHASES = 12.0, 90.0
 """[dB], [deg] that the panels of the error show at most to either side"""
 
 
-def match(
-    pair: FittedPair, unit: str, note: str, *, figure: "Figure | Sketch | None" = None
-) -> Panels:
+def match(pair: FittedPair, unit: str, note: str, *, figure: "Figure | None" = None) -> Panels:
     """Gain, phase and partial coherence of data and model, and their quotient, all with 95 %
     intervals; the quotient within the envelopes of what pilots do not notice.
 
@@ -97,7 +94,7 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
         angle = near + (angle - near + 180.0) % 360.0 - 180.0
     _bars(axes[0], hz, gain, relative, _DATA)
     reach = np.degrees(np.minimum(relative, np.pi))
-    axes[1].errorbar(hz, angle, yerr=reach, color=style.BLACK, label=_DATA, **_STYLE)
+    style.bars(axes[1], hz, angle, reach, color=style.BLACK, label=_DATA)
     # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
     # where there is room, and makes none. In gusts a response has a coherence of 0.3 to 0.6, and
     # intervals that are read: such bins have to be within the axes.
@@ -110,16 +107,15 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
 
 
 _DATA = "data, 95 % intervals"
-_STYLE: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
 
 
 def _bars(
-    ax: "Axes", hz: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str = ""
+    ax: "Axes", hz: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str | None = None
 ) -> None:
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
     up = 20.0 * np.log10(1.0 + relative)
-    ax.errorbar(hz, gain, yerr=[down, up], color=style.BLACK, label=label or None, **_STYLE)
+    style.bars(ax, hz, gain, [down, up], color=style.BLACK, label=label)
 
 
 def _draw_error(axes: Panels, pair: FittedPair, known: np.ndarray) -> None:
@@ -139,6 +135,4 @@ def _draw_error(axes: Panels, pair: FittedPair, known: np.ndarray) -> None:
         ax.set_ylim(-most, most)
     _bars(axes[0], hz[known], _DB * np.log(np.abs(error)), gain_reach)
     reach = np.degrees(np.minimum(phase_reach, np.pi))
-    axes[1].errorbar(
-        hz[known], np.degrees(np.angle(error)), yerr=reach, color=style.BLACK, **_STYLE
-    )
+    style.bars(axes[1], hz[known], np.degrees(np.angle(error)), reach, color=style.BLACK)

@@ -1,10 +1,9 @@
 """What every figure of a fit begins with: panels below each other, their labels in line."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
-from heli_jax.report.sketch import Sketch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +17,7 @@ _LABELS_LEFT = 0.57
 
 
 def panels(
-    figure: "Figure | Sketch | None",
+    figure: "Figure | None",
     height: float,
     ratios: list[float],
     *,
@@ -29,8 +28,8 @@ def panels(
     """Panels below each other in a given figure or a new one.
 
     Args:
-        figure: to draw on, with the margins it has, or a sketch; a new one where None.
-        height: of a new figure or a sketch [inch].
+        figure: to draw on, with the margins it has; a new one where None.
+        height: of a new figure [inch].
         ratios: heights of the panels, relative to each other.
         sharex: whether the panels have one x axis.
         right: margin of a new figure [inch].
@@ -39,10 +38,6 @@ def panels(
     n = len(ratios)
     # Panels with an x axis each need room for its tick labels.
     gap = 0.22 if sharex else 0.36
-    if isinstance(figure, Sketch):
-        each = style.panel_height(height, n, gap=gap, top=top)
-        sketched: Any = figure.panels([each * n * r / sum(ratios) for r in ratios])
-        return sketched
     from matplotlib.transforms import ScaledTranslation
 
     drawing = style.figure(height) if figure is None else figure

@@ -18,7 +18,6 @@ from heli_jax.identification.validation.metrics import (
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels, sample_time
-from heli_jax.report.sketch import Sketch
 from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def residual_correlation(
     *,
     together: int = 1,
     test: Whiteness | None = None,
-    figure: "Figure | Sketch | None" = None,
+    figure: "Figure | None" = None,
 ) -> Panels:
     """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
     input, with 99 % bands.
@@ -77,7 +76,8 @@ def _head(ax: "Axes", signals: Signals, output: str, test: Whiteness) -> None:
     """Title and subtitle: what of which flight, and the test of whiteness."""
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"
-    ax.set_title(f"{what} of {output}, {signals.flight}: {result}", loc="left")
+    flight = style.short(signals.flight)
+    ax.set_title(f"{what} of {output}, {flight}: {result}", loc="left")
     lag1 = f"{test.lag1:+.2f}".replace("-", "−")
     subtitle(
         ax,

@@ -131,16 +131,14 @@ def _draw_measured(
 ) -> None:
     f, H = hz[known], pair.H[known]
     relative = pair.half95 * pair.sd[known] / np.abs(H)
-    bars: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
     up = 20.0 * np.log10(1.0 + relative)
     gain = 20.0 * np.log10(np.abs(H))
-    axes[0].errorbar(
-        f, gain, yerr=[down, up], color=style.BLUE, label="one window, 95 % intervals", **bars
-    )
+    words = "one window, 95 % intervals"
+    style.bars(axes[0], f, gain, [down, up], color=style.BLUE, label=words)
     error = np.degrees(np.minimum(relative, np.pi))
-    axes[1].errorbar(f, branch[known], yerr=error, color=style.BLUE, **bars)
+    style.bars(axes[1], f, branch[known], error, color=style.BLUE)
 
 
 def _curve(

@@ -12,7 +12,6 @@ from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import vaf_percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels
-from heli_jax.report.sketch import Sketch, SketchAxes
 from heli_jax.report.style import label, legend_above, line, samples, subtitle
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def response(
-    signals: Signals, output: str, model: Model, *, figure: "Figure | Sketch | None" = None
+    signals: Signals, output: str, model: Model, *, figure: "Figure | None" = None
 ) -> Panels:
     """Measured and simulated output, the residual, and the inputs, over time.
 
@@ -69,11 +68,11 @@ def _agreement(signals: Signals, output: str) -> str:
     source = "held out, simulated" if signals.hold_out else "simulated"
     # NaN where the measured output never moves: it has no variance to account for.
     vaf = f", VAF {vaf_percent(agreement.vaf)}" if np.isfinite(agreement.vaf) else ""
-    return f"{output}, {signals.flight}: {source}{vaf}"
+    return f"{output}, {style.short(signals.flight)}: {source}{vaf}"
 
 
 def rls_history(
-    baseline: Baseline, *, log_start: float | None = None, figure: "Figure | Sketch | None" = None
+    baseline: Baseline, *, log_start: float | None = None, figure: "Figure | None" = None
 ) -> Panels:
     """Every coefficient of the recursive least squares over time, the a's above the b's.
 
@@ -116,8 +115,6 @@ def _draw_coefficients(ax: "Axes", t: np.ndarray, values: np.ndarray, names: lis
         # The first samples, with P(0) = 1e12 I, throw coefficients over many powers of ten.
         inside = np.clip(values[:, k], *_widened(ax.get_ylim()))
         line(ax, t, inside, color=color, ls=dashes, label=name)
-    if isinstance(ax, SketchAxes):
-        return  # a chart places its own legend
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0)
 
 
