@@ -285,15 +285,14 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 
 
 def reading_notes(problem: Problem) -> list[Finding]:
-    """What the reader of each log assumed or did; and where the starts come from, if they were
-    found."""
+    """Notes of the logs' readers, and on the origin of starts that were found."""
     guess = problem.first_guess
     begun = guess.sentences if guess else ()
     return once((*log_notes(problem), *(note("search.first-guess", words) for words in begun)))
 
 
 def log_notes(problem: Problem) -> list[Finding]:
-    """What the reader of each log assumed or did, in sentences that begin with the log."""
+    """Notes of the logs' readers; each sentence begins with its log."""
     notes = []
     for flight in problem.flights:
         where = flight.source.path if flight.source else flight.name

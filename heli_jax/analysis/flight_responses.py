@@ -261,7 +261,7 @@ def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names:
 def _moving_as_one(
     flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """Which inputs no response can be told apart of."""
+    """A doubt about inputs that move together, whose responses cannot be told apart."""
     pairs = (pair for output in outputs.values() for pair in output.pairs.values())
     if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
         return []

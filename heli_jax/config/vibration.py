@@ -97,7 +97,7 @@ def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ..
 def _lost(
     flight: Flight, outputs: Mapping[str, np.ndarray], settled: float, where: str
 ) -> tuple[Finding, ...]:
-    """What notches that begin anew behind missing samples cost, a note for each output."""
+    """A note for each output on the samples lost by notches that restart after a gap."""
     notes = []
     for name, y in flight.outputs.items():
         there, left = int(np.isfinite(y).sum()), int(np.isfinite(outputs[name]).sum())

@@ -85,7 +85,7 @@ def unit_in_file(log: ChannelLog | Table, name: str) -> str:
 
 
 def taken_note(name: str, signal: Signal) -> Finding | None:
-    """That a signal is read in the file's unit; None where it is not."""
+    """A note on a signal that is read in the file's unit; None for others."""
     if not signal.assumed or signal.unit == signal.si:
         return None
     words = f"no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"

@@ -91,7 +91,7 @@ def low_passed(outputs: Iterable[str]) -> Decision:
 
 
 def is_low_passed(flight: Flight, name: str) -> bool:
-    """Whether an input went through the filter of outputs: no other hold is right then."""
+    """True for an input that went through the filter of the outputs, after which it is linear."""
     notes = flight.source.notes if flight.source else ()
     return any(n.code == LOW_PASSED and name in n.subjects for n in notes)
 

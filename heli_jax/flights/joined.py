@@ -172,7 +172,7 @@ def topics_of(
 
 
 def joined_note(topics: Sequence[Topic]) -> Finding:
-    """What was made of the rows."""
+    """A note on the topics that the rows were divided into."""
     known = (t for t in topics if t.times.size > 1)
     rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
     words = (

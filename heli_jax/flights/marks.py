@@ -145,7 +145,7 @@ def suspected(numbers: np.ndarray) -> np.ndarray:
 
 
 def suspect_notes(name: str, numbers: np.ndarray) -> list[Finding]:
-    """What is said of numbers (N,) that may be marks; `name` is their channel's, as it is shown."""
+    """Notes on numbers (N,) that may be marks; `name` is the channel's, as it is shown."""
     at = suspected(numbers)
     if not at.any():
         return []

@@ -98,7 +98,7 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
 
 
 def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
-    """What is to be said of the signals as they were logged."""
+    """Notes on the signals as they were logged."""
     values = {key: signal.values for key, signal in signals.items()}
     return [*_missing_notes(request, signals), *_turn_notes(request, values)]
 

@@ -61,7 +61,7 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> Unpacked:
 
 
 def notes_of(missing: Mapping[str, int], left_out: Mapping[str, str]) -> tuple[Finding, ...]:
-    """What was made of a file's data sets.
+    """Notes on how a file's data sets were read.
 
     Args:
         missing: by name the number of fills.

@@ -200,7 +200,7 @@ def _of_part(
 
 
 def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[Finding, ...]:
-    """What was split and what was left out; `intervals` [s]."""
+    """A note on the gaps at which a log was split and the parts left out; `intervals` [s]."""
     gaps = [after - before for (_, before), (after, _) in itertools.pairwise(intervals)]
     count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
     words = f"{count} of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"

@@ -12,7 +12,7 @@ import numpy as np
 from heli_jax.flights.marks import Counts, Marked
 from heli_jax.flights.strays import Strays
 
-PILE = 5.0
+_PILE = 5.0
 """times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
 steps has 3 times as many at its turning points as at the three values before"""
 FEW = 8
@@ -261,7 +261,7 @@ def _runs_out_of_proportion(
 
 
 def _goes_on(seconds: np.ndarray, x: np.ndarray, begin: float, end: float) -> bool:
-    """Whether another signal moves from `begin` to `end` [s] about as it does all along."""
+    """True where another signal moves from `begin` to `end` [s] about as it does all along."""
     seen = np.isfinite(x)
     inside = x[(seconds >= begin) & (seconds <= end) & seen]
     if inside.size < 2:
@@ -351,7 +351,7 @@ def _at_rails(
 
 
 def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The samples at the largest value, or near it, where that is a rail.
+    """The samples at the largest value, where that is a rail.
 
     Args:
         x: samples (N,), NaN where one is missing.
@@ -361,7 +361,7 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
-    piled = counts[0] > PILE * usual and counts[0] >= RAIL_SHARE * finite.size
+    piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * finite.size
     if piled and _comes_and_goes(finite == top):
         return x == top
     return np.zeros(x.shape, bool)

@@ -256,7 +256,7 @@ def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[floa
 
 
 def _note(name: str, also: Also, lag: Lag) -> Finding:
-    """What was found of the clock of a further log."""
+    """A note on the offset between the clocks of two logs."""
     words = (
         f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
         f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "

@@ -100,7 +100,7 @@ def in_runs(table: Table, clock: TimeInfo) -> Table:
 
 
 def rate_note(clock: TimeInfo) -> Finding:
-    """What is taken for a clock of so many samples a second, since the file says so."""
+    """A note on a clock whose rate the file states."""
     what = "rows" if clock.column == ROWS else shown(clock.column)
     words = f"{what} are taken as samples at {clock.counted:g} Hz, as the file says: {clock.said}"
     return note("clock.rate-of-file", words, value=clock.counted)
@@ -174,7 +174,7 @@ def _left_out(table: Table, names: Sequence[str]) -> list[Finding]:
 
 
 def _why_unread(table: Table, name: str) -> str:
-    """Where a column holds text and what it is; empty where it holds numbers."""
+    """The place and text that keep a column from being read; empty for a column of numbers."""
     try:
         table.numbers([name])
     except InputError as e:

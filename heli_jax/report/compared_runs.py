@@ -144,7 +144,7 @@ class ComparedRuns(NamedTuple):
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """What a reader should know of the differences; subjects are labels of runs."""
+        """Notes on the differences and doubts about runs; subjects are labels of runs."""
         notes, first = [note("compared.joint-sd", _JOINT)], self.runs[0]
         for label, run in zip(self.labels[1:], self.runs[1:], strict=True):
             if _share_a_log(first, run):

@@ -135,8 +135,10 @@ class Valley(NamedTuple):
     def _far_points(
         self, null: list[np.ndarray], unknowns: tuple[Unknown, ...]
     ) -> Iterator[list[dict[str, float]]]:
-        """Where the valley leads to, by value of the unknowns: for each that is moved, first those
-        that together span the valley."""
+        """Points along the valley, by value of the unknowns, for each unknown that is moved.
+
+        Those that together span the valley come first.
+        """
         N = np.array(null) * np.array([u.per_log if u.logarithmic else 0.0 for u in unknowns])
         # Onto the null directions: how the logarithms of all go with that of one.
         onto = np.linalg.pinv(N) @ N
@@ -212,12 +214,12 @@ def _stays(
 def _told(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
 ) -> bool:
-    """Whether the points tell if a combination stays: it changed, or its parameters moved."""
+    """True where the points decide: the combination changed, or its parameters moved."""
     return any(one.moved or not one.same for one in (_change(c, unknowns, p) for p in points))
 
 
 class _Change(NamedTuple):
-    """What became of a combination at a point."""
+    """The change of a combination at a point."""
 
     same: bool
     moved: bool

@@ -21,7 +21,6 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
 from heli_jax.numerics.jumps import split
 
@@ -207,9 +206,7 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
     for name, u in flight.inputs.items():
         rate = input_rate(flight, name, u)
         felt = [mode for mode in modes if mode.input == name]
-        # Dropouts move a stick that rests between them, and are said where signals are judged.
-        dropped = facts_of(flight)[name, "input"].dropouts is not None
-        if rate is None or not felt or dropped:
+        if rate is None or not felt:
             continue
         fastest = max(felt, key=lambda mode: mode.hz)
         ratio = rate / fastest.hz

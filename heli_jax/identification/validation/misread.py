@@ -87,13 +87,13 @@ def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Finding]:
         Finding(
             "quality.dropouts",
             "doubt",
-            dropout_words(label, flight, (name, kind), one),
+            dropout_words(label, flight, name, one),
             subjects=(name,),
             brief=f"dropouts of {name} are taken for measurements",
             denies=True,
         )
         for label, flight, of_signals in zip(labels(flights), flights, facts, strict=True)
-        for (name, kind), one in of_signals.items()
+        for (name, _), one in of_signals.items()
         if one.dropouts is not None and one.dropped >= DROP_SHARE
     ]
 

@@ -247,7 +247,7 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
 
 
 class _Asked(NamedTuple):
-    """What is asked of a residual, by filter; columns stand before it."""
+    """Products, by filter, that do not depend on the residual; columns stand before the filter."""
 
     filters: Float[np.ndarray, "F K2"]
     """real and imaginary parts side by side"""
@@ -267,7 +267,7 @@ def _asked(
     beside: Complex[np.ndarray, "K b"],
     drives: list[Complex[np.ndarray, "K 2"]],
 ) -> _Asked:
-    """What does not depend on the residual.
+    """Precompute the products that do not depend on the residual.
 
     By products of columns, since the filters all act on the same ones: a basis for each filter and
     drive would take ten times as long.
@@ -308,7 +308,7 @@ def _products(
 
 
 def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray, "F d r"]:
-    """What the squares of each residual lose to each drive through each filter."""
+    """Gains: the part of each residual's squares that a drive through a filter explains."""
     right = asked.over @ _products(asked.filters, asked.beside, tried)
     out = []
     for d, cross, own in zip(asked.drives, asked.cross, asked.own, strict=True):
@@ -364,7 +364,7 @@ def _filters(
 def _responses(
     filters: Sequence[tuple[float, float]], back: np.ndarray
 ) -> Complex[np.ndarray, "F K"]:
-    """Of the filters at the lines, whose delays by a sample are `back`."""
+    """Frequency responses of the filters at the lines; `back` is a delay by one sample."""
     w, damping = (np.array([one[i] for one in filters]) for i in (1, 0))
     plain = ~np.isfinite(damping)
     damping = np.where(plain, 1.0, damping)

@@ -150,7 +150,7 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
                 words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
                 doubts.append((0.0, f"{words}at what the log says of such values."))
             if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
-                words = dropout_words(label, flight, (name, kind), facts)
+                words = dropout_words(label, flight, name, facts)
                 doubts.append((facts.dropped * facts.size * facts.usual, words))
             doubts += [
                 (length, f"{label}: {name} {words}") for length, words in _stays(facts.stretches)
@@ -186,10 +186,10 @@ def _stays(stretches: Sequence[Stuck]) -> list[tuple[float, str]]:
     ]
 
 
-def dropout_words(label: str, flight: Flight, key: tuple[str, str], facts: SignalFacts) -> str:
-    """A sentence on a signal's dropouts, of which there are some."""
+def dropout_words(label: str, flight: Flight, name: str, facts: SignalFacts) -> str:
+    """A sentence on an output's dropouts, of which there are some."""
     assert facts.dropouts is not None
-    name, value = key[0], facts.dropouts.value
+    value = facts.dropouts.value
     signals = flight.source.outputs if flight.source else {}
     logged = float(signals[name].from_si(np.array(value))) if name in signals else value
     words = f"{label}: {name} jumps to {value:.4g} and back, in {100 * facts.dropped:.2g} % of the"

@@ -22,7 +22,6 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.other_hold import pseudoinverse
-from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.residual_drives import (
     changing,
     drives,
@@ -171,22 +170,6 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
         if gained < _ENOUGH:
             break
     return asked
-
-
-def unasked(at: Solution) -> tuple[str, ...]:
-    """The outputs of which so many samples are missing that nothing could be asked.
-
-    Args:
-        at: where the fit ended.
-    """
-    layout, flights = at.layout, at.data.flights
-    asked: dict[str, bool] = {}
-    for i, outputs in enumerate(layout.outputs):
-        for n in outputs:
-            seen = np.isfinite(np.asarray(flights[i].outputs[n]))
-            # What never moves is judged elsewhere, and one flight that can be asked is enough.
-            asked[n] = asked.get(n, False) or own_samples(seen) is not None or not seen.any()
-    return tuple(n for n, could in asked.items() if not could)
 
 
 def _of_output(
