@@ -46,7 +46,6 @@ from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
-from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -171,9 +170,8 @@ def check(problem: Problem) -> Check:
     # At the start values, since nothing else is known yet: where these are far off, what is
     # determined there may differ from what is at the optimum, for which the fit asks again.
     at = Solution(*guess[:4])
-    twins = twins_of(problem, at, guess.e, optimum=False)
-    second = second_solutions(problem, at, guess.e, optimum=False, reported=twins)
-    around = Around(twins=twins, second=second, valley=Valley(problem, at, guess.e))
+    second = second_solutions(problem, at, guess.e, optimum=False)
+    around = Around(second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))

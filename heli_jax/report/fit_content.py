@@ -260,7 +260,6 @@ def verdict(verdict: Verdict) -> dict[str, Any]:
         "without_effect": list(verdict.without_effect),
         "resting_on_priors": list(verdict.resting),
         "exchangeable_nuisances": list(verdict.exchangeable),
-        "exchangeable_parameters": [list(pair) for pair in verdict.twins],
         "other_solutions": [other.values for other in verdict.second],
         "names": list(verdict.names),
         "correlation": verdict.correlation,
