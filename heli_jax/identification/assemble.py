@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding, weighed
 from heli_jax.identification.agreement import (
+    coloured_residuals,
     free_runs,
     pooled_metrics,
     signals_of,
@@ -174,7 +175,15 @@ def assemble(
     held = _held_out(end, judged.loop)
     # Of rounding, and of numbers that are none, notes of their own speak.
     astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
+    coloured = coloured_residuals(
+        end.white,
+        layout,
+        layout.free,
+        allowed_for=errors.coloured,
+        converged=status != "not-converged",
+    )
     findings = [
+        *coloured,
         *fit_notes(
             problem,
             search,
