@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import UNIT_IN_DOUBT, Finding, note, sentences
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, note
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
@@ -245,7 +245,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    notes = (*ranking.notes, *sentences(guessed_gusts(problem, at)))
+    notes = (*ranking.notes, *guessed_gusts(problem, at))
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 
