@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models
+from heli_jax import Flight, Free, Model, Nuisance, Problem, models
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
 from heli_jax.identification.validation.adequacy import Evidence, assess
 from heli_jax.identification.validation.advice import Record
@@ -16,7 +16,6 @@ from heli_jax.identification.validation.held_out import worse_than_mean
 from heli_jax.identification.validation.metrics import metrics, whiteness
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from tests.identification.bench import BENCH, vehicle
-from tests.identification.test_filter_error import FREE, made
 
 N, DT = 400, 0.05
 
@@ -175,19 +174,6 @@ def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
     assert [f.code for f in good.findings] == ["adequacy.judged-ahead"]
     assert good.ahead == 2.0
     assert judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0).denied
-
-
-@pytest.mark.slow
-def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
-    model, _, start, flight = made(bench30, 3)
-    right = fit(Problem(model, start, [flight], FREE, method="filter-error"))
-    assert right.adequate
-    assert 0.2 < right.adequacy.judged[0].against_disturbance < 5.0
-    turned = Flight(
-        dt=flight.dt, inputs={"x_roll": -flight.inputs["x_roll"]}, outputs=flight.outputs
-    )
-    wrong = fit(Problem(model, start, [turned], FREE, method="filter-error"))
-    assert wrong.exit_code == 4
 
 
 @pytest.mark.parametrize(

@@ -11,28 +11,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.model_selection import Candidate, _test, alternatives, choose
 from tests.identification.bench import steps
-from tests.identification.test_filter_error import FREE, made
-
-INERTIAS = {name: FREE[name] for name in ("Ixx", "If")}
-
-
-@pytest.mark.slow
-def test_two_poles_are_seen(bench30):
-    model, _, start, flight = made(bench30, 3, poles=2)
-    problem = Problem(model, start, [flight], INERTIAS, method="filter-error")
-    rivals = alternatives(problem, models.roll_on_stand, "roll")
-    assert list(rivals.problems) == ["no disturbance", "one pole", "two poles"]
-    found = choose(rivals.problems, rivals.nested)
-    assert [c.name for c in found.candidates] == ["two poles", "one pole", "no disturbance"]
-    assert found.candidates[0].white
-    one, two = (next(c for c in found.candidates if c.name == n) for n in ("one pole", "two poles"))
-    assert two.unknowns == one.unknowns
-    assert one.aic - two.aic > 10
-    assert found.sentences[0] == "AIC and BIC prefer: two poles."
-    for test in found.nested:
-        assert test.small == "no disturbance"
-        assert test.degrees == 2
-        assert test.p_value < 1e-6
+from tests.identification.test_filter_error import FREE
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ import scipy.linalg
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import initial_sd_of
-from heli_jax.identification.disturbed_sets import disturbed_sets, undisturbed_too
+from heli_jax.identification.disturbed_sets import undisturbed_too
 from heli_jax.identification.estimation.kalman import innovations
 from heli_jax.identification.identifiability.disturbances import _of_columns
-from heli_jax.identification.model_selection import begun_from, choose
 from heli_jax.naming import asdict
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.inputs import random_steps
@@ -130,25 +129,6 @@ def test_sizes_and_times_are_recovered_within_their_intervals(whole):
         estimate = {**found.nuisance, **found.estimates}[name]
         assert abs(estimate.value - true) < 3.5 * estimate.sd
         assert estimate.sd < 0.5 * abs(true)
-
-
-@pytest.mark.slow
-def test_the_table_names_the_one_left_out(whole):
-    flight, found = whole
-    sets = disturbed_sets(problem(flight), MODEL, ("p", "q"))
-    assert list(sets.problems) == [
-        "no disturbance", "without p: q", "without q: p", "all: p, q", "all: p, q; two poles",
-    ]  # fmt: skip
-    two = {n: sets.problems[n] for n in ("without q: p", "all: p, q")}
-    choice = choose(two, sets.nested)
-    assert choice.sentences[0] == "AIC and BIC prefer: all: p, q."
-    assert not next(c for c in choice.candidates if c.name == "without q: p").white
-    [test] = choice.nested
-    assert test.degrees == 2
-    assert test.p_value < 1e-6
-    # Named sigma_w where it is alone, and begun from what it is called among several.
-    again = begun_from(two["without q: p"], two["all: p, q"], found)
-    assert float(again.vehicle.sigma_w) == pytest.approx(found.nuisance["sigma_w_p"].value)
 
 
 def test_one_that_is_not_there_freezes_no_other():

@@ -13,7 +13,7 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.identification.fit import check
-from heli_jax.identification.validation import excited_band, next_flight, signal_quality
+from heli_jax.identification.validation import excited_band, signal_quality
 from heli_jax.identification.validation.expected_accuracy import too_good
 from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
 from heli_jax.identification.validation.missing_outputs import look_at_missing
@@ -274,28 +274,6 @@ def test_a_stick_that_stays_for_equal_times_is_a_slow_channel_unless_its_hold_is
 
 
 @pytest.mark.slow
-def test_a_log_too_slow_for_the_machine_is_refused_in_words():
-    # The machine swings at 0.95 Hz: three samples a second are doubtful, 1.6 hopeless.
-    f = flight(1, 3000)
-    verdicts = {}
-    for every in (5, 16, 31):
-        u = scipy.signal.lfilter([0.05], [1.0, -0.95], f.inputs["u"])
-        slow = Flight(
-            dt=DT * every,
-            inputs={"u": u[::every], "v": np.zeros(u[::every].size)},
-            outputs={"phi": response(u, np.zeros(u.size))[0][::every]},
-            sd={"phi": 1e-3},
-            hold={"u": "linear"},
-            hold_reason={"u": "moves"},
-        )
-        found = [x for x in check(problem(slow)).findings if x.code == "timing.logging-rate"]
-        verdicts[every] = found[0].severity
-        if every == 31:
-            assert found[0].value == pytest.approx(1 / (DT * 31) / (6.0 / 2 / np.pi), rel=0.05)
-    assert verdicts == {5: "ok", 16: "doubt", 31: "refuse"}
-
-
-@pytest.mark.slow
 def test_a_missing_output_costs_what_the_fit_with_it_would_gain():
     f = flight(0)
     without = problem(f)
@@ -360,18 +338,6 @@ def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
     asked = Problem(filtered, TRUTH, (moved,), FREE, Nuisance(bias=False))
     (finding,) = logging_rate(asked, [("flight", moved)], [sd])
     assert finding.severity == "ok", finding.sentence
-
-
-@pytest.mark.slow
-def test_candidates_one_by_one_are_those_side_by_side(monkeypatch):
-    asked = problem(flight(0, 1500))
-    both = []
-    for short in (next_flight._SHORT, 0):
-        monkeypatch.setattr(next_flight, "_SHORT", short)
-        both.append(plan_next_flight(asked, *at_start(asked)))
-    one_by_one, side_by_side = both
-    assert one_by_one.best.words == side_by_side.best.words
-    assert one_by_one.after == pytest.approx(side_by_side.after, rel=1e-9)
 
 
 def test_expected_sds_are_no_promise_where_no_output_follows_an_input():

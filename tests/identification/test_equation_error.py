@@ -1,7 +1,6 @@
 """Starts by equation error: against least squares by hand and known truth, with gaps, hidden
 states, stepwise selection, and in sentences where nothing can be done."""
 
-import json
 import math
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, linear_model, load_config, models, run_fit
+from heli_jax import Flight, Free, Model, linear_model, load_config, models
 from heli_jax.config import problem
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.errors import basis_of, covariance, partial_f
@@ -281,29 +280,6 @@ def config(tmp_path):
     (tmp_path / "aileron.yaml").write_text(MODEL)
     (tmp_path / "fit.yaml").write_text(CONFIG)
     return tmp_path / "fit.yaml"
-
-
-@pytest.mark.slow
-def test_a_configuration_without_starts_is_fitted(config, capsys):
-    from heli_jax.output import print_fit
-
-    said = []
-    run = run_fit(config, config.parent / "run", progress=said.append)
-    assert any("Start by equation error of Lp, Lda" in line for line in said)
-    assert run.fit.estimates["Lp"].value == pytest.approx(-4.0, rel=0.1)
-    content = json.loads((config.parent / "run" / "fit.json").read_text())
-    guess = content["equation_error_start"]
-    assert guess["values"]["Lp"]["origin"] == "equation error"
-    assert guess["values"]["Lp"]["sd"] > 0
-    assert guess["values"]["Lda"]["value"] > 26.0  # moved inside its bound
-    assert content["parameters"]["Lp"]["start"] == guess["values"]["Lp"]["value"]
-    page = (config.parent / "run" / "report.html").read_text()
-    assert "By equation error: where the fit began, not its result" in page
-    print_fit(run)
-    assert "Where the fit began, by equation error (no result)" in capsys.readouterr().out
-    # The copy runs again: what was left out is left out there too.
-    again = problem(load_config(config.parent / "run" / "config.yaml"))
-    assert again.free["Lp"].start == run.problem.free["Lp"].start
 
 
 def test_wrong_starts_are_said_in_a_sentence(config):

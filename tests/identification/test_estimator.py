@@ -71,20 +71,6 @@ def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     assert "least squares on differences" in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.slow
-def test_three_parameters_are_no_more_identifiable_by_another_method(differences):
-    free = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0)}
-    problem = Problem(
-        models.roll_on_stand,
-        vehicle(BENCH),
-        [record(BENCH, seed=3, n=1500, noise=1e-3)],
-        free,
-        Nuisance(bias=False),
-        method="differences",
-    )
-    assert set(check(problem).verdict.undetermined) == {"Ixx", "If", "a"}
-
-
 def test_an_unknown_method_is_refused_with_the_known_ones():
     with pytest.raises(
         ValueError,

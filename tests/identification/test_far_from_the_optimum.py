@@ -2,15 +2,13 @@
 exchanged, bounds, and swings that the samples hardly show."""
 
 import json
-from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
-from heli_jax.identification.frequency_start import frequency_error_start
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.problem import MAX_TIME_SHIFT
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import with_limits
@@ -129,27 +127,6 @@ def test_two_lags_in_series_are_told_to_be_exchangeable(starts):
     )
 
 
-@pytest.mark.slow
-def test_a_start_by_frequency_error_takes_either_of_two_solutions():
-    free = {"T1": Free(0.6), "T2": Free(0.02)}
-    problem = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
-    guess = frequency_error_start(problem)
-    assert {v.origin for v in guess.values.values()} == {"frequency error"}
-    assert sorted(v.value for v in guess.values.values()) == pytest.approx([0.06, 0.3], rel=0.1)
-    assert "at one of the solutions that the spectra do not tell apart" in " ".join(guess.sentences)
-
-
-@pytest.mark.slow
-def test_bounds_that_tell_lags_apart_are_enough():
-    T1, T2 = Free(0.2, lower=0.12, upper=2.0), Free(0.05, lower=0.01, upper=0.12)
-    problem = Problem(LAGS, TRUTH, [SECOND], {"T1": T1, "T2": T2}, Nuisance(bias=False))
-    assert fit(problem).verdict.twins == ()
-    assert check(problem).verdict.twins == ()
-    free = {"T1": Free(0.2, sign="keep"), "T2": Free(0.05, sign="keep")}
-    open_ = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
-    assert check(open_).verdict.twins == (("T1", "T2"),)
-
-
 @pytest.mark.parametrize(
     "method", ["output-error", pytest.param("frequency-error", marks=pytest.mark.slow)]
 )
@@ -177,16 +154,6 @@ def test_no_interval_of_a_time_shift_is_wider_than_its_search():
     shift = Estimate(end, 0.18, 0.1, 0.85, "s", 0.0, 0.0, at_bound=True)
     found = with_limits({"time_shift": shift}, {"time_shift": (0.003, 1.26)})["time_shift"]
     assert (found.lower95, found.upper95) == (0.003, MAX_TIME_SHIFT)
-
-
-@pytest.mark.slow
-def test_a_shift_beyond_its_search_ends_there():
-    late = replace(FIRST, inputs={"u": np.roll(U, -40)})
-    free = {"K": Free(8.0)}
-    fitted = fit(Problem(SUM, TRUTH, [late], free, Nuisance(bias=False, time_shift=True)))
-    estimate = fitted.nuisance["time_shift"]
-    assert estimate.at_bound
-    assert estimate.upper95 is None or estimate.upper95 <= MAX_TIME_SHIFT
 
 
 def test_a_fast_swing_is_no_white_noise():
@@ -219,19 +186,3 @@ def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate(method
     assert (none.code, none.severity) == ("excitation.no-output-follows", "refuse")
     assert "loop.no-instrument" not in {f.code for f in found.findings}
     assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
-
-
-@pytest.mark.slow
-def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
-    phi = np.full(N, np.deg2rad(3.0))
-    record = Flight(dt=DT, inputs={"u": U}, outputs={"p": FIRST.outputs["p"], "s": phi})
-    both = Model(
-        "both",
-        LAGS.vector_field,
-        lambda q, x, i: x,
-        Params, Two, Inputs, Two, linear=True,
-    )  # fmt: skip
-    free = {"T1": Free(0.3), "K": Free(10.0)}
-    found = fit(Problem(both, TRUTH, [record], free, Nuisance(bias=False)), starts=1)
-    [still] = [f for f in found.findings if f.code == "quality.never-moves"]
-    assert still.subjects == ("s",)

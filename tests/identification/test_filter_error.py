@@ -23,7 +23,6 @@ from heli_jax.identification.validation.inputs_explain import (
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
-from tests.dynamics.paper import BENCH, matrices
 
 DT, N = 0.02, 2000
 TRUTH = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 1.0}
@@ -111,42 +110,10 @@ def test_white_noise_alone_ends_as_output_error(bench30):
     assert "noise.no-disturbance" in {f.code for f in filtered.findings}
 
 
-@pytest.mark.slow
-def test_damping_of_stand_and_flybar_are_named_together(bench30):
-    model, _, start, flight = made(bench30, 0)
-    found = fit(Problem(model, start, [flight], {**FREE, "zeta": Free(0.3)}, method="filter-error"))
-    text = found.verdict.text
-    assert all(part in text for part in ("If", "zeta", "fix one of"))
-
-
 def test_a_model_without_disturbance_is_refused(bench30):
     _, _, _, flight = made(bench30, 0)
     with pytest.raises(ValueError, match="has no disturbance"):
         Problem(models.roll_on_stand, bench30, [flight], FREE, method="filter-error")
-
-
-@pytest.mark.parametrize(
-    "fixed",
-    [
-        ("sigma_y", "tau_w"),
-        ("sigma_w", "tau_w", "sigma_y"),
-    ],
-    ids=" ".join,
-)
-@pytest.mark.slow
-def test_noise_may_be_fixed(disturbed, fixed):
-    params, problem, free = disturbed
-    start = replace(problem.vehicle, sigma_w=params.sigma_w, tau_w=params.tau_w)
-    flights = [dataclasses.replace(problem.flights[0], sd={"roll": 2e-3})]
-    found = fit(dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed))
-    assert found.status == "converged"
-    assert found.nuisance.keys().isdisjoint(fixed)
-    assert all(abs(e) < 4 for e in errors(found, params).values())
-    for name, one in found.estimates.items():
-        assert one.sd == pytest.approx(free.estimates[name].sd, rel=0.4)
-        assert one.value == pytest.approx(free.estimates[name].value, abs=one.sd)
-    assert 0.0 <= free.log_likelihood - found.log_likelihood < 8.0
-    assert found.noise == {"flight 1/roll": 2e-3}
 
 
 def test_missing_samples_cost_information_and_no_more(disturbed):
@@ -181,66 +148,6 @@ def test_an_output_of_every_tenth_sample(disturbed):
         # At other estimates the same information is another sd: not exactly larger.
         assert one.sd > 0.9 * full.sd
         assert one.value == pytest.approx(full.value, abs=2.0 * one.sd)
-
-
-@pytest.mark.slow
-def test_outputs_of_different_quality_get_each_its_noise(bench30):
-    model, params, start, flight = made(bench30, 2)
-    rng = np.random.default_rng(7)
-    run = simulate(
-        model,
-        params,
-        model.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"])),
-        dt=DT,
-        key=jax.random.key(2),
-    )
-    rate = np.asarray(run.outputs.roll_rate) + 0.05 * rng.standard_normal(N)
-    both = Flight(dt=DT, inputs=flight.inputs, outputs={**flight.outputs, "roll_rate": rate})
-    found = fit(Problem(model, start, [both], FREE, method="filter-error"))
-    assert found.status == "converged"
-    assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
-    assert found.noise["flight 1/roll_rate"] == pytest.approx(0.05, rel=0.05)
-    assert all(abs(e) < 4 for e in errors(found, params).values())
-
-
-@pytest.mark.slow
-def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
-    """Truth by Euler-Maruyama in NumPy; the stand's spring is a sine."""
-    n, fine = 1500, 40
-    A, B, *_ = (np.asarray(m) for m in matrices(BENCH, True))
-    A = A.copy()
-    A[1, 0] = 0.0
-    rng = np.random.default_rng(11)
-    u = 3e-6 * random_steps(n, DT, rng, (0.2, 1.5))
-    h = DT / fine
-    x, w, y = np.zeros(4), 0.0, np.empty(n)
-    kicks = rng.standard_normal((n, fine)) * 1.04 * np.sqrt(2.0 * h)
-    for k in range(n):
-        y[k] = x[0]
-        for j in range(fine):
-            rates = A @ x + B[:, 0] * u[k]
-            rates[1] += w - 4.0 * np.sin(6.0 * x[0]) / 6.0
-            x, w = x + h * rates, w - h * w + kicks[k, j]
-    y += 2e-3 * rng.standard_normal(n)
-    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
-
-    def field(p, s, u):
-        rates = models.roll_on_stand.vector_field(p, s, u)
-        return replace(rates, dphi=rates.dphi - p.kappa * (jnp.sin(6.0 * s.phi) / 6.0 - s.phi))
-
-    spring = dataclasses.replace(
-        models.roll_on_stand, name="sine spring", vector_field=field, linear=False
-    )
-    model = with_disturbance(spring, "roll")
-    _, params, start, _ = made(bench30, 0)
-    problem = Problem(
-        model, start, [flight], {"Ixx": Free(0.03), "kappa": Free(3.0)}, method="filter-error",
-        substeps=2,
-    )  # fmt: skip
-    found = fit(problem)
-    assert found.status == "converged"
-    assert found.white
-    assert all(abs(e) < 4 for e in errors(found, params).values())
 
 
 def test_noise_that_cannot_be_is_told(disturbed):

@@ -35,12 +35,11 @@ from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
-from heli_jax.identification.frequency_start import _value, frequency_error_start, started
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.report.method_content import methods_content
-from heli_jax.report.tables import first_guess, methods
+from heli_jax.report.tables import methods
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
 
 DT = 0.02
@@ -163,39 +162,6 @@ def test_the_noise_to_check_by_is_what_the_inputs_leave():
     assert np.mean(1.0 / np.abs(begun.whitening[0][swept, 0, 0]) ** 2 / true[swept]) > 5.0
 
 
-@pytest.mark.slow
-def test_an_unstable_machine_needs_no_windows(tmp_path):
-    """Roll with a divergence of 1 1/s, flown for 30 s in which it grows by 1e13."""
-    path = tmp_path / "falling.yaml"
-    path.write_text(FALLING)
-    model = linear_model(path)
-    rng = np.random.default_rng(2)
-    M = np.zeros((3, 3))
-    M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
-    E = scipy.linalg.expm(M * DT)
-    n = 1500
-    steps = np.repeat(rng.uniform(-0.1, 0.1, n // 20 + 1), 20)[:n]
-    x, u, y = np.zeros(2), np.zeros(n), np.zeros((n, 2))
-    for k in range(n):
-        y[k] = x + rng.standard_normal(2) * [0.02, 0.005]
-        # A pilot who sees no noise, so that nothing of it comes back through the stick.
-        u[k] = steps[k] - 0.3 * x[0] - 0.9 * x[1]
-        x = E[:2, :2] @ x + E[:2, 2] * u[k]
-    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": y[:, 0], "phi": y[:, 1]})
-    truth = {"Lphi": 2.0, "Lp": -1.0, "Llat": 10.0}
-    free = {n: Free(1.4 * v) for n, v in truth.items()}
-    found = fit(
-        Problem(
-            model.model, model.vehicle().params, [flight], free, Nuisance(bias=False),
-            method="frequency-error",
-        )
-    )  # fmt: skip
-    assert found.verdict.identifiable
-    for name, one in found.estimates.items():
-        assert one.lower95 < truth[name] < one.upper95
-        assert one.sd < 0.1 * abs(truth[name])
-
-
 def test_the_noise_spectrum_of_two_outputs_is_found():
     """A matrix over the outputs: correlated noise, white in one and slow in the other."""
     rng = np.random.default_rng(1)
@@ -245,46 +211,11 @@ def test_a_flight_is_cut_at_its_missing_samples():
     assert (note.code, note.subjects) == ("frequency.flight-cut", ("roll",))
 
 
-@pytest.mark.slow
-def test_estimates_of_a_flight_that_was_cut():
-    noisy = with_holes(record(BENCH, seed=3, n=1500), *HOLES)
-    found = fit(problem_of(noisy, with_holes(noisy, slice(3, 500, 2), hold_out=True)))
-    assert found.status == "converged"
-    assert "frequency.flight-cut" in {f.code for f in found.findings}
-    for name, one in found.estimates.items():
-        assert one.lower95 < BENCH[name] < one.upper95
-    # A flight held out is predicted in time, with an initial state and a bias of its own.
-    assert found.validation["roll"].vaf > 0.999
-
-
 def test_an_output_that_is_sparse_throughout_is_refused():
     whole = record(BENCH, seed=3, n=1500)
     sparse = with_holes(whole, *(slice(k, None, 5) for k in range(1, 5)), name="first")
     with pytest.raises(ValueError, match=r"first: output roll lacks 80 % .* lower flights\[\]"):
         problem_of(sparse)
-
-
-@pytest.mark.slow
-def test_a_fit_in_time_begins_at_the_estimate_in_frequency():
-    """A stand that swings 60 times in the record, every start four times too small: by itself the
-    simulation loses count."""
-    swinging = {**BENCH, "zeta": 0.02, "kappa": 40.0}
-    free = {n: Free(0.25 * swinging[n]) for n in FREE}
-    flight = record(swinging, seed=3, n=3000)
-    problem = Problem(models.roll_on_stand, vehicle(swinging), [flight], free)
-    guess = frequency_error_start(problem)
-    begun = started(problem, guess)
-    for name, value in guess.values.items():
-        assert value.origin == "frequency error"
-        assert value.value == pytest.approx(swinging[name], rel=0.01)
-        assert begun.free[name].start == value.value
-    found = fit(begun)
-    assert found.status == "converged"
-    assert found.starts[0].steps < 5
-    assert "Start by frequency error of Ixx, If, kappa" in guess.sentences[0]
-    assert [row[3] for row in first_guess(guess).rows] == ["frequency error"] * 3
-    # What is not determined begins as it was stated.
-    assert _value(found.estimates["Ixx"]._replace(sd=None), "not-identifiable", 0.5).value == 0.5
 
 
 def test_methods_are_laid_side_by_side(by):

@@ -3,10 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
-import scipy.signal
 
-from heli_jax import Flight, Free, Problem, fit, linear_model, models
+from heli_jax import Free, Problem, fit, models
 from heli_jax.identification.estimation import frequency_error
 from heli_jax.identification.estimation.evaluation import least_share
 from heli_jax.identification.estimation.first_search import first_optima
@@ -103,45 +101,3 @@ def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):
     assert parts[:2] == [0.25, 1.0]
     for name, one in whole.estimates.items():
         assert abs(found.estimates[name].value - one.value) < 0.05 * one.sd
-
-
-def a_mode_at_ten_hertz():
-    """Its rate in 60 s of a sweep of 0.3 to 20 Hz and gusts, sampled at 50 Hz."""
-    rng, N, dt, K = np.random.default_rng(2), 3000, 0.02, (20.0 * np.pi) ** 2
-    A, t = np.array([[0.0, 1.0], [-K, -0.2 * np.sqrt(K)]]), 0.02 * np.arange(3000)
-    block = scipy.linalg.expm(np.block([[A, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) * dt)
-    lat = 0.1 * scipy.signal.chirp(t, 0.3, t[-1], 20.0, "logarithmic", -90)
-    gusts = scipy.signal.lfilter([0.35], [1.0, -0.94], 0.02 * K * rng.standard_normal(N))
-    x, p = np.zeros(2), np.zeros(N)
-    for k in range(N):
-        p[k] = x[1]
-        x = block[:2, :2] @ x + block[:2, 2] * (0.5 * K * lat[k] + gusts[k])
-    p += 0.13 * rng.standard_normal(N)
-    return Flight(dt=dt, inputs={"lat": lat}, outputs={"p": p})
-
-
-MODE = """
-name: mode
-states: {phi: rad, p: rad/s}
-inputs: {lat: "1"}
-outputs: {p: rad/s}
-parameters:
-  K: {value: 3948, unit: 1/s^2}
-  D: {value: 12.6, unit: 1/s}
-  L: {value: 1974, unit: 1/s^2}
-A: {phi: {p: 1}, p: {phi: -K, p: -D}}
-B: {p: {lat: L}}
-"""
-
-
-@pytest.mark.slow
-def test_where_a_quarter_leads_to_an_unstable_model_all_lines_are_tried(tmp_path, monkeypatch):
-    monkeypatch.setattr(frequency_error, "_MANY", 0)
-    (tmp_path / "mode.yaml").write_text(MODE)
-    mode = linear_model(tmp_path / "mode.yaml")
-    # At the start values the mode is in the quarter, and it is beyond.
-    free = {"K": Free(197.4), "D": Free(15.12), "L": Free(98.7)}
-    flight = a_mode_at_ten_hertz()
-    asked = Problem(mode.model, mode.vehicle().params, [flight], free, method="frequency-error")
-    found = fit(asked, starts=1)
-    assert found.estimates["K"].value == pytest.approx(3948, rel=0.02)

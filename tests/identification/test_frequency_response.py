@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
+from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
 from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
@@ -18,11 +18,9 @@ from heli_jax.identification.fit import first_guess
 from heli_jax.report import tables
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, record, vehicle
-from tests.identification.test_frequency_error import FALLING
 from tests.test_log_responses import CONFIG
 from tests.test_log_responses import record as logged
 
-DT = 0.02
 FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
 
 
@@ -100,45 +98,6 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
         np.testing.assert_allclose(made.J[:, i], slope, atol=1e-6 * np.max(np.abs(slope)))
     # Initial states are numbers here.
     assert not np.asarray(made.J)[: -z.size, 3:].any()
-
-
-@pytest.mark.slow
-def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
-    """Gusts that come back through the stick bias a direct response; the logged steps do not."""
-    path = tmp_path / "falling.yaml"
-    path.write_text(FALLING)
-    model = linear_model(path)
-    rng = np.random.default_rng(5)
-    M = np.zeros((3, 3))
-    M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
-    E = scipy.linalg.expm(M * DT)
-    n = 6000
-    steps = np.repeat(rng.uniform(-0.1, 0.1, n // 20 + 1), 20)[:n]
-    x, u, y = np.zeros(2), np.zeros(n), np.zeros((n, 2))
-    for k in range(n):
-        y[k] = x + rng.standard_normal(2) * [0.02, 0.005]
-        u[k] = steps[k] - 0.3 * x[0] - 0.9 * x[1]
-        x = E[:2, :2] @ x + E[:2, 2] * u[k] + [0.02 * rng.standard_normal(), 0.0]
-    flight = Flight(
-        dt=DT,
-        inputs={"lat": u},
-        outputs={"p": y[:, 0], "phi": y[:, 1]},
-        instruments={"lat": steps},
-    )
-    truth = {"Lphi": 2.0, "Lp": -1.0, "Llat": 10.0}
-    free = {n: Free(1.4 * v) for n, v in truth.items()}
-    found = fit(
-        Problem(
-            model.model, model.vehicle().params, [flight], free,
-            Nuisance(bias=False, initial_state=False), method="frequency-response",
-            frequency=ResponseOptions(window=10.0),
-        )
-    )  # fmt: skip
-    assert found.responses.instruments == ("lat",)
-    assert not any(pair.simulated for pair in found.responses.pairs)
-    for name, one in found.estimates.items():
-        assert abs(one.value - truth[name]) < 3.0 * one.sd
-        assert one.sd < 0.3 * abs(truth[name])
 
 
 @pytest.mark.parametrize(

@@ -159,17 +159,6 @@ def fitted():
     return fit(problem([record(BENCH, seed=3, n=150)]))
 
 
-@pytest.mark.slow
-def test_a_bootstrap_is_what_it_was_run_by_run(fitted, monkeypatch):
-    found = bootstrap(fitted, 24)
-    monkeypatch.setattr(many_runs, "_MANY", 100)
-    expected = bootstrap(fitted, 24)
-    assert found.records == expected.records
-    for name, values in expected.values.items():
-        spread = np.std(values)
-        np.testing.assert_allclose(found.values[name], values, rtol=0, atol=1e-4 * spread)
-
-
 def test_records_fitted_together_are_as_each_by_itself(fitted):
     records = [record(BENCH, seed=k, n=150) for k in range(5, 8)]
     found = refit(fitted, [*records, *records, *[[r] for r in records * 6]])
@@ -198,30 +187,6 @@ def test_many_records_are_fitted_as_scipy_fits_them():
         sd = np.sqrt(np.diag(np.linalg.inv(alone.jac.T @ alone.jac)) * 2.0 * alone.cost / 148)
         for name, value, spread in zip(free, alone.x, sd, strict=True):
             assert abs(found.values[name][k] - value) < 1e-2 * spread
-
-
-@pytest.mark.slow
-def test_a_records_cost_is_its_own(fitted):
-    whole = record(BENCH, seed=5, n=150)
-    # Of the last one too few, of the one before as many as `fit` takes.
-    counts = (150, 40, 0, 8, 7)
-    records = [
-        dataclasses.replace(whole, outputs={"roll": np.where(np.arange(150) < c, y, np.nan)})
-        for c in counts
-        for y in [np.asarray(whole.outputs["roll"])]
-    ]
-    together, many = refit(fitted, records), refit(fitted, records * 6)
-    for k, r in enumerate(records):
-        alone = refit(fitted, [r])
-        for found in (together, many):
-            assert found.converged[k] == alone.converged[0]
-            np.testing.assert_allclose(found.cost[k], alone.cost[0], rtol=1e-6)
-            for name, value in alone.values.items():
-                np.testing.assert_allclose(found.values[name][k], value[0], rtol=1e-5)
-    np.testing.assert_array_equal(together.converged[[0, 1, 2, 4]], [True, True, False, False])
-    assert np.isnan(together.cost[[2, 4]]).all()
-    assert np.isnan(together.values["Ixx"][[2, 4]]).all()
-    np.testing.assert_array_equal(np.isfinite(together.cost), np.array(counts) >= 8)
 
 
 def test_records_unlike_the_fits_are_refused(fitted):

@@ -5,12 +5,10 @@ import importlib.util
 
 import numpy as np
 import pytest
-import scipy.stats
 
-from heli_jax import Free, Prior, Problem, fit, models
+from heli_jax import Free, Problem, fit, models
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
-from heli_jax.identification.uncertainty.profile_likelihood import profile
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "kappa": Free(3.0)}
@@ -38,33 +36,6 @@ def test_on_white_noise_all_agree(white):
     if bayes:
         assert found.posterior is not None
         assert found.posterior.trusted
-
-
-@pytest.mark.slow
-def test_the_profile_is_the_likelihood_of_the_others_at_their_best(white):
-    """A point of the profile is a fit with that parameter held."""
-    found = profile(white, ["Ixx"], points=5)["Ixx"]
-    problem = Problem(
-        models.roll_on_stand,
-        vehicle({**BENCH, "Ixx": float(found.values[1])}),
-        [record(BENCH, seed=3, n=400)],
-        {n: f for n, f in FREE.items() if n != "Ixx"},
-    )
-    held = fit(problem)
-    lost = 2.0 * (white.log_likelihood - held.log_likelihood)
-    assert found.deviance[1] == pytest.approx(lost, rel=0.05)
-    assert np.all(np.diff(found.deviance[:3]) < 0)
-    assert np.all(np.diff(found.deviance[2:]) > 0)
-
-
-@pytest.mark.slow
-def test_a_prior_is_drawn_anew(white):
-    free = {**FREE, "a": Free(5.0, prior=Prior(5.1, 0.3))}
-    resting = made(free=free)
-    found = intervals(resting, runs=100)
-    low, high = found.by_parameter["a"]["bootstrap"]
-    width = 2 * scipy.stats.norm.ppf(0.975) * 0.3
-    assert high - low == pytest.approx(width, rel=0.25)
 
 
 def test_coloured_residuals_are_told(white):

@@ -109,14 +109,6 @@ def test_a_stick_whose_steps_fall_on_samples_is_not():
     assert found.estimates["Lp"].value == pytest.approx(-12.0, rel=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("grid", [1, EVERY])
-def test_a_filter_says_it_too(grid):
-    late = late_ones(fit(problem(grid, filtered=True)))
-    assert len(late) == (grid != EVERY)
-    assert all(0.004 < one.value < 0.016 for one in late)
-
-
 def test_check_says_what_half_a_sample_of_the_stick_does():
     found = check(problem(1, start=(-14.0, 70.0))).findings
     [finding] = [f for f in found if f.code == "timing.slow-stick"]

@@ -6,16 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Free, Problem, fit, models
+from heli_jax import Free, Problem
 from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Axis
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import (
     at_limit,
-    disturbance_or_none,
     from_other_taus,
 )
-from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import (
@@ -24,40 +23,10 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relaxed_from,
 )
-from heli_jax.identification.uncertainty.estimates import extreme_noise_notes
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import layout_of, unpack
-from heli_jax.naming import asdict
-from tests.identification.bench import BENCH, record, vehicle
+from heli_jax.identification.unknowns.layout import layout_of
 from tests.identification.test_equation_error import ROLL
 from tests.identification.test_equation_error import record as gusty
-from tests.identification.test_filter_error import made
-
-MODEL = with_disturbance(models.roll_on_stand, "roll")
-FREE = {"Ixx": Free(0.048), "If": Free(6.8e-5)}
-
-
-def problem(seed, n=1000):
-    values = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
-    params = MODEL.Params(**{**asdict(vehicle(BENCH)), **values})
-    return Problem(MODEL, params, [record(BENCH, seed=seed, n=n)], FREE, method="filter-error")
-
-
-# Of seeds 0 to 59 number 23 ended with sigma_w = 9e-105 +- 4e-119, tau_w = 3e197 s.
-@pytest.mark.parametrize("seed", [22, 23])
-@pytest.mark.slow
-def test_white_noise_has_no_disturbance(seed):
-    found = fit(problem(seed))
-    assert found.status == "converged"
-    sigma_w, tau_w = found.nuisance["sigma_w"], found.nuisance["tau_w"]
-    assert sigma_w.value == 0.0
-    assert sigma_w.sd is None
-    assert tau_w.sd is None
-    assert 0.99 * 0.02 / 100 < tau_w.value < 1.01 * 1000 * 20.0
-    assert "noise.no-disturbance" in {f.code for f in found.findings}
-    for name, true in (("Ixx", 0.024), ("If", 0.00017)):
-        one = found.estimates[name]
-        assert abs(one.value - true) < 4 * one.sd
 
 
 def test_what_has_no_effect_is_not_known():
@@ -73,43 +42,6 @@ def test_what_has_no_effect_is_not_known():
     assert sds[0] == pytest.approx(np.sqrt(np.linalg.inv(both.T @ both)[0, 0]), rel=1e-9)
     assert np.isinf(sds[1:]).all()
     assert np.isinf(deviations(np.full((5, 2), np.nan))).all()
-
-
-@pytest.mark.slow
-def test_a_disturbance_has_ends():
-    one = problem(1, 200)
-    layout, data = layout_of(one, one.training), data_of(one, one.training)
-    z = start_vector(layout, data, one)
-    at = layout.disturbance_at("tau_w")
-    for far, tau_w in ((-900.0, 0.02 / 100), (900.0, 1e3 * 4.0)):
-        out = z.at[at].set(far).at[layout.disturbance_at("sigma_w")].set(0.0)
-        assert float(unpack(layout, data, out).noise["tau_w"]) == pytest.approx(tau_w, rel=1e-9)
-        J = evaluate(layout, data, first_noise(one, one.training), out).J
-        assert np.isinf(deviations(J)[at])
-        [said] = extreme_noise_notes(layout, data, out)
-        assert (said.code, said.subjects) == ("noise.disturbance-open", ("tau_w",))
-    assert extreme_noise_notes(layout, data, z.at[at - 1].set(0.0)) == []
-
-
-@pytest.mark.slow
-def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
-    # The optimiser's word is 'converged', at a point below the model without disturbance.
-    model, _, start, flight = made(bench30, 1)
-    free = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
-    one = Problem(model, start, [flight], free, method="filter-error")
-    layout, data = layout_of(one, one.training), data_of(one, one.training)
-    noise = first_noise(one, one.training)
-    z = start_vector(layout, data, one)
-    z = z.at[0].add(2.0).at[layout.disturbance_at("sigma_w")].set(-25.0)
-    z = z.at[layout.disturbance_at("tau_w")].set(-7.0)
-    found = RelaxedOptimum(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
-    search = Search(one, layout, data, 200)
-    settled = disturbance_or_none(search, found)
-    e = evaluate(layout, data, settled.noise, settled.best.z)
-    best = fit(one)
-    reached = layout.estimator.log_likelihood(layout, data, settled.noise, e)
-    assert reached == pytest.approx(best.log_likelihood, abs=2.0)
-    assert "search.begun-anew" in {f.code for f in settled.notes}
 
 
 @pytest.mark.slow

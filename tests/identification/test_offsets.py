@@ -6,10 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import Scalar
@@ -41,41 +39,6 @@ def test_an_offset_of_the_stick_does_not_move_the_inertia(share):
     assert e.unit == "m"
     assert e.value == pytest.approx(offset, abs=4 * e.sd)
     assert e.sd < 0.02 * offset
-
-
-@pytest.mark.slow
-def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
-    flights, offsets = zip(
-        *(flown(seed, share) for seed, share in ((1, 0.02), (2, -0.03))), strict=True
-    )
-    problem = Problem(models.roll, vehicle(BENCH), flights, FREE, window=10.0)
-    found = fit(problem)
-    for name in FREE:
-        e = found.estimates[name]
-        assert e.lower95 < BENCH[name] < e.upper95
-    for i, offset in enumerate(offsets):
-        e = found.nuisance[f"flight {i + 1}/offset x_roll"]
-        assert e.value == pytest.approx(offset, abs=4 * e.sd)
-    # The derivatives of many windows at once are the derivatives.
-    at = found.reached
-    J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
-    column = at.layout.size - 1
-    h = 1e-4
-    low, high = (rows_of(at.layout, at.data, at.noise, at.z.at[column].add(s)) for s in (-h, h))
-    slope = (np.asarray(high) - np.asarray(low)) / (2 * h)
-    assert np.abs(J[:, column] - slope).max() < 1e-6 * np.abs(slope).max()
-
-
-@pytest.mark.slow
-def test_the_identifiability_analysis_knows_the_offset():
-    flight, _ = flown(3, 0.0)
-    sds = []
-    for asked in (None, False):
-        nuisance = Nuisance(input_offset=asked)
-        verdict = check(Problem(models.roll, vehicle(BENCH), [flight], FREE, nuisance)).verdict
-        sds.append(np.sqrt(np.diag(verdict.covariance)))
-    assert np.all(sds[0] >= sds[1])
-    assert sds[0][1] > 1.02 * sds[1][1]
 
 
 class Params(NamedTuple):

@@ -5,7 +5,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pytest
 
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
@@ -136,18 +135,3 @@ def test_values_that_are_as_likely_are_not_determined(flight):
     assert not said.identifiable
     assert said.undetermined == ("Zw",)
     assert "Zw = -9.1 and tn = 1.8 answer the inputs as do Zw = -0.55 and tn = 0.11" in said.text
-
-
-@pytest.mark.slow
-def test_a_filter_begun_on_the_wrong_side_finds_the_right_one(flight):
-    model = with_disturbance(MODEL, "w")
-    start = model.Params(**START._asdict())
-    wrong = exchanged(**START._asdict())
-    free = {n: f._replace(start=wrong[n]) for n, f in FREE.items()}
-    found = fit(Problem(model, start, [flight], free, method="filter-error"))
-    assert found.status == "converged"
-    for name, true in START._asdict().items():
-        e = found.estimates[name]
-        assert e.sd is not None, name
-        assert abs(e.value - true) < 4.0 * e.sd, name
-    assert "search.same-responses" in {f.code for f in found.findings}

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
 from heli_jax.identification.estimation.drawn_starts import _draw_values
-from heli_jax.identification.unknowns.transforms import changes_sign
 from tests.identification.bench import steps
 
 
@@ -127,21 +126,6 @@ def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
     assert "search.by-windows" in {f.code for f in found.findings}
 
 
-@pytest.mark.slow
-def test_the_sign_may_be_kept():
-    free = {"Ld": Free(10.0), "Nd": Free(1.0, sign="keep"), "Lr": Free(1.0, lower=0.0)}
-    one = problem(free)
-    assert [changes_sign(f) for f in one.free.values()] == [True, False, False]
-    found = fit(one)
-    assert found.status == "not-identifiable"
-    assert found.estimates["Nd"].value > 0
-    kept = fit(problem(free | {"Nd": Free(-1.0, sign="keep")}))
-    assert kept.status == "converged"
-    open_ = fit(problem(free | {"Nd": Free(1.0)}))
-    assert open_.estimates["Nd"].value == pytest.approx(kept.estimates["Nd"].value, rel=1e-4)
-    assert open_.log_likelihood == pytest.approx(kept.log_likelihood, abs=1e-3)
-
-
 def test_one_bound_beyond_zero_is_kept():
     found = fit(problem({"Ld": Free(1.0, upper=10.0), "Nd": Free(1.0, lower=-20.0)}))
     assert found.estimates["Ld"].at_bound
@@ -159,22 +143,6 @@ def test_a_parameter_that_is_zero_is_determined():
     assert found.status == "converged"
     assert abs(one.value) < 4 * one.sd
     assert one.sd < 0.2
-
-
-@pytest.mark.slow
-def test_what_says_nothing_is_not_determined():
-    # A record without motion but noise: every derivative is anybody's guess.
-    rng = np.random.default_rng(1)
-    still = Flight(
-        dt=DT,
-        inputs={"d": 1e-4 * FLIGHT.inputs["d"]},
-        outputs={n: NOISE * rng.standard_normal(N) for n in ("p", "r")},
-    )
-    verdict = check(problem({"Ld": Free(1.0), "Nd": Free(1.0)}, record=still)).verdict
-    assert not verdict.identifiable
-    assert set(verdict.undetermined) == {"Ld", "Nd"}
-    # The same with a start that asks for less: three times its size is told.
-    assert check(problem({"Ld": Free(1e3), "Nd": Free(1e3)}, record=still)).verdict.identifiable
 
 
 def test_many_starts_are_of_both_signs():

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, models
+from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
@@ -115,31 +115,11 @@ def test_without_one_of_the_two_it_is_determined(off):
     assert found.estimates["L0"].prior_share < 1e-4
 
 
-@pytest.mark.slow
-def test_a_prior_determines_it_and_is_said_to():
-    verdict = check(problem(BOUNDED._replace(prior=Prior(0.0, 0.1)))).verdict
-    assert verdict.identifiable
-    assert verdict.rank_without_priors == 2
-    assert verdict.resting == ("L0",)
-    assert verdict.prior_share["L0"] > 0.99
-    assert "rests on the prior of L0" in verdict.text
-
-
 def test_two_flights_have_a_bias_and_a_start_each():
     verdict = check(problem(BOUNDED, flights=2)).verdict
     assert not verdict.identifiable
     assert len(verdict.exchangeable) == 4
     assert verdict.text.count("the bias of p") == 1
-
-
-@pytest.mark.slow
-def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
-    how = {"window": 2.0, "flights": 1}
-    verdict = check(problem(BOUNDED, Nuisance(bias=False), continuity=0.01, **how)).verdict
-    assert verdict.identifiable
-    verdict = check(problem(BOUNDED, **how)).verdict
-    assert verdict.undetermined == ("L0",)
-    assert "switch off nuisance.bias, fix L0" in verdict.text
 
 
 @pytest.mark.slow

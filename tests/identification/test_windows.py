@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, models
+from heli_jax import Free, Nuisance, Problem, fit, models
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise
@@ -79,14 +79,6 @@ def test_windows_that_hang_together_are_one_run():
     assert [f.value for f in stopped.findings if f.code == "search.stopped"] == [2.0]
 
 
-@pytest.mark.slow
-def test_a_flight_held_out_is_cut_as_well():
-    one = problem(2, window=1.0)
-    held = dataclasses.replace(one.flights[1], hold_out=True, name="held")
-    found = fit(dataclasses.replace(one, flights=[one.flights[0], held]))
-    assert found.validation["roll"].vaf > 0.99
-
-
 @pytest.mark.parametrize(
     ("how", "words"),
     [
@@ -106,15 +98,3 @@ def test_a_window_as_long_as_the_flight_is_the_flight():
     one, other = fit(problem()), fit(problem(window=100.0))
     for name, found in one.estimates.items():
         assert other.estimates[name].value == pytest.approx(found.value, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_gaps_and_a_short_last_window():
-    flight = problem().flights[0]
-    y = flight.outputs["roll"].copy()
-    y[40:90:3] = np.nan
-    gappy = Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": y})
-    found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [gappy], FREE, window=0.75))
-    assert found.status == "converged"
-    for name, one in found.estimates.items():
-        assert abs(one.value - BENCH[name]) < 4 * one.sd
