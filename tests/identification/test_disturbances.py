@@ -175,24 +175,6 @@ def test_two_that_cannot_be_told_apart_are_named_together():
     assert (note.code, note.subjects) == ("identifiability.disturbances-exchangeable", ("a", "b"))
 
 
-@pytest.mark.parametrize(
-    ("on", "said"),
-    [
-        (("p", "x"), "no axis or state 'x' to disturb, expected one of p, q"),
-        (("p", "p"), "'p' names state 'p', which is disturbed twice"),
-        ((), "needs an axis or a state to act on, got none"),
-    ],
-)
-def test_bad_names_are_said_in_one_sentence(on, said):
-    with pytest.raises(ValueError, match=said):
-        with_disturbance(MODEL, on)
-
-
-def test_a_fixed_name_that_is_none_is_refused(whole):
-    with pytest.raises(ValueError, match=r"expected some of sigma_w_p, tau_w_p, .*got sigma_w"):
-        problem(whole[0], fixed_noise=("sigma_w",))
-
-
 def test_other_axes_are_candidates_too():
     from heli_jax import linear_model
 

@@ -69,15 +69,3 @@ def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     assert {g.passed for g in card(problem, found) if g.what.startswith("Cramer")} <= {True, None}
     write_report(tmp_path, Analysis(found, problem), "differences", {})
     assert "least squares on differences" in (tmp_path / "report.html").read_text()
-
-
-def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(
-        ValueError,
-        match="expected one of output-error, filter-error, frequency-error, frequency-response, "
-        "got 'x'",
-    ):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [record(BENCH, seed=3, n=1500)],
-            {"Ixx": Free(0.03)}, method="x",
-        )  # fmt: skip

@@ -110,12 +110,6 @@ def test_white_noise_alone_ends_as_output_error(bench30):
     assert "noise.no-disturbance" in {f.code for f in filtered.findings}
 
 
-def test_a_model_without_disturbance_is_refused(bench30):
-    _, _, _, flight = made(bench30, 0)
-    with pytest.raises(ValueError, match="has no disturbance"):
-        Problem(models.roll_on_stand, bench30, [flight], FREE, method="filter-error")
-
-
 def test_missing_samples_cost_information_and_no_more(disturbed):
     params, problem, _ = disturbed
     [flight] = problem.flights

@@ -205,36 +205,6 @@ def test_unstable_start_is_an_error_not_a_result(bench_run):
         fit(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], free))
 
 
-@pytest.mark.parametrize(
-    ("free", "words"),
-    [
-        ({}, "nothing is free"),
-        ({"Ixy": Free(1.0)}, "Ixy.*did you mean"),
-        ({"Ixx": Free(float("nan"))}, "Ixx.start: missing"),
-        ({"Ixx": Free(-0.1)}, "start.*Ixx must be more than zero, got -0.1"),
-        ({"Ixx": Free(0.1, 0.2, 0.3)}, "Ixx.start.*inside 0.2 to 0.3"),
-        ({"Ixx": Free(0.1, 0.3, 0.2)}, "lower must be below upper, got 0.3 and 0.2"),
-        ({"Ixx": Free(0.1, prior=Prior(0.1, 0.0))}, "prior.sd"),
-        ({"kappa": Free(0.0)}, "got 0 without two bounds"),
-        ({"R1": Free(0.3)}, "R1 must be less than R2"),
-    ],
-)
-def test_what_cannot_be_free_is_refused(bench_run, free, words):
-    with pytest.raises(ValueError, match=words):
-        Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], free)
-
-
-def test_known_must_not_be_free_and_must_exist(bench_run):
-    for known, words in (
-        ({"Ixx": 0.02}, "expected known or free, got both"),
-        ({"Ixx_aded": 0.02}, "did you mean 'Ixx_added'"),
-        ({"Ixx_added": -1.0}, "Ixx_added must be zero or more, got -1"),
-    ):
-        flight = dataclasses.replace(bench_run, known=known)
-        with pytest.raises(ValueError, match=words):
-            Problem(models.roll_on_stand, vehicle(BENCH), [flight], {"Ixx": IXX})
-
-
 def test_pitch_needs_its_inertia(bench_run):
     flight = Flight(
         dt=0.02, inputs={"x_pitch": bench_run.inputs["x_roll"]},

@@ -211,13 +211,6 @@ def test_a_flight_is_cut_at_its_missing_samples():
     assert (note.code, note.subjects) == ("frequency.flight-cut", ("roll",))
 
 
-def test_an_output_that_is_sparse_throughout_is_refused():
-    whole = record(BENCH, seed=3, n=1500)
-    sparse = with_holes(whole, *(slice(k, None, 5) for k in range(1, 5)), name="first")
-    with pytest.raises(ValueError, match=r"first: output roll lacks 80 % .* lower flights\[\]"):
-        problem_of(sparse)
-
-
 def test_methods_are_laid_side_by_side(by):
     main, other = by["output-error"], by["frequency-error"]
     stopped = Finding("search.stopped", "doubt", "The optimiser stopped.")

@@ -20,7 +20,6 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     residual_and_jacobian,
 )
 from heli_jax.identification.fit import cautions
-from heli_jax.identification.model_selection import choose
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.enough import _of_feedback
 from heli_jax.identification.validation.excitation_test import _in_bands
@@ -171,28 +170,12 @@ def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leanin
     assert direct.exit_code == 3
 
 
-def test_an_instrument_that_is_not_there_is_refused(leaning):
-    flight = flown(1, 400)
-    bare = Flight(dt=DT, inputs=flight.inputs, outputs=flight.outputs, name="second")
-    with pytest.raises(ValueError, match="instrument of lat: second holds none"):
-        problem(leaning, [flight, bare], instrument=("lat",))
-    with pytest.raises(ValueError, match="no such input"):
-        problem(leaning, [flight], instrument=("lot",))
-    with pytest.raises(ValueError, match="takes no input by an instrument"):
-        problem(leaning, [flight], instrument=("lat",), method="output-error")
-
-
 def test_a_band_that_the_fit_does_not_keep_to_is_told(leaning):
     band = ResponseOptions(band=(0.2, 5.0))
     for method, said in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
         asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
         assert sum(f.code == "frequency.band-unused" for f in cautions(asked)) == said
     assert cautions(problem(leaning, [flown(1, 1000)])) == ()
-
-
-def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
-    with pytest.raises(ValueError, match="no likelihood to be compared by"):
-        choose({"one": problem(leaning, [flown(1, 400)])})
 
 
 def test_a_response_far_larger_than_the_measured_one_explains_nothing():

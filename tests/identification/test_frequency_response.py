@@ -100,28 +100,6 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
     assert not np.asarray(made.J)[: -z.size, 3:].any()
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (ResponseOptions(coherence=0.99999), "no response is left"),
-        (ResponseOptions(pairs=(PairOptions("roll", "roll"),)), r"pairs\[0\].input: .* no input"),
-        (
-            ResponseOptions(window=10.0, pairs=(PairOptions("x_roll", "roll", (30.0, 40.0)),)),
-            "holds a line of the window",
-        ),
-        (ResponseOptions(window=10.0, band=(0.4, 0.4001)), "more independent numbers than the 3"),
-        (ResponseOptions(window=50.0), "independent averages for 1 input, got"),
-    ],
-)
-def test_what_it_cannot_do_is_refused_with_a_reason(options, said):
-    flight = record(BENCH, seed=3, n=3000)
-    with pytest.raises(ValueError, match=said):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [flight], FREE,
-            method="frequency-response", frequency=options,
-        )  # fmt: skip
-
-
 FIT = """
   band: [0.5, 8]
   coherence: 0.3

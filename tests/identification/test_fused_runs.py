@@ -206,11 +206,6 @@ def test_records_unlike_the_fits_are_refused(fitted):
         refit(fitted, [None])
 
 
-def test_a_bootstrap_of_nothing_is_refused(fitted):
-    with pytest.raises(ValueError):  # noqa: PT011
-        bootstrap(fitted, 0)
-
-
 def test_many_records_that_are_no_program_say_why(fitted, monkeypatch):
     few = bootstrap(fitted, 2)
     assert few.note == ""

@@ -148,17 +148,6 @@ def test_squared_errors_alone_are_a_note(found):
     assert of(found, "same").findings == []
 
 
-def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
-    other = dataclasses.replace(flights[-1], hold_out=False)
-    with pytest.raises(ValueError, match="both: output roll_rate is not in every flight"):
-        fit(
-            Problem(
-                models.roll_on_stand, vehicle(BENCH), [flights[0], other], FREE,
-                method="frequency-error",
-            )
-        )  # fmt: skip
-
-
 def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
     """Its responses are those of feedback, and passed for another machine (p below 1e-6)."""
     roll, dt, n = linear_model("roll-flybarless"), 0.02, 3000

@@ -3,11 +3,10 @@
 import dataclasses
 import importlib.util
 
-import numpy as np
 import pytest
 
 from heli_jax import Free, Problem, fit, models
-from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
+from heli_jax.identification.uncertainty.bootstrap import bootstrap
 from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
 from tests.identification.bench import BENCH, record, vehicle
 
@@ -50,17 +49,6 @@ def test_coloured_residuals_are_told(white):
     assert _sentences(in_frequency, by, None, None) == []
 
 
-def test_a_name_that_is_not_free_is_refused(white):
-    with pytest.raises(ValueError, match="profile: expected one of Ixx, If, kappa, got mass"):
-        intervals(white, profiles=["mass"])
-
-
-def test_the_old_names_of_a_fits_properties_warn(white):
-    for old, new in (("lost", "not_identifiable"), ("narrow", "overconfident")):
-        with pytest.warns(DeprecationWarning, match=f"Fit: {old} is deprecated, expected {new}"):
-            assert getattr(white, old) == getattr(white, new)
-
-
 def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
     open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in white.estimates.items()}
     poor = dataclasses.replace(white, estimates=open_, status="not-identifiable")
@@ -70,11 +58,3 @@ def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
     assert found.bootstrap is None
     with pytest.raises(ValueError, match="bootstrap: the data do not determine If"):
         bootstrap(poor, 5)
-
-
-def test_what_a_bootstrap_estimates_without_an_interval_is_named(white):
-    shifted = dataclasses.replace(white, nuisance={"time_shift": white.estimates["Ixx"]})
-    booted = Bootstrap({n: np.zeros(2) for n in white.estimates}, 0, (0, 1))
-    assert _sentences(white, {}, booted, None) == []
-    [said] = _sentences(shifted, {}, booted, None)
-    assert "without an interval of it here: time_shift" in said

@@ -157,17 +157,6 @@ def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30, poles,
         np.testing.assert_allclose(extended.variance[n], exact.variance[n], rtol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({}, "expected dt, .* got None"), ({"dt": DT, "solver": "rk4"}, "expected no solver")],
-)
-def test_an_option_of_simulations_alone_is_refused(bench30, options, message):
-    model, params, u, y = case(bench30, 1)
-    inputs = model.Inputs(x_roll=jnp.asarray(u))
-    with pytest.raises(TypeError, match=message):
-        innovations(model, params, inputs, y, SD, **options)
-
-
 @pytest.mark.parametrize("hold", ["linear", "zero-order"])
 def test_explicit_steps_follow_the_moments_of_the_kinematics(hold):
     model, noise, dt, count = kinematics.attitude, 0.02, 0.02, 31

@@ -105,11 +105,6 @@ def test_a_stand_takes_the_offset_up_in_the_bias():
     assert offset_inputs(Problem(models.roll_on_stand, limp, [flight], FREE)) == ("x_roll",)
 
 
-def test_an_input_that_the_model_lacks_is_named():
-    with pytest.raises(ValueError, match=r"input_offset: model aircraft-roll has no input 'dd'"):
-        problem_of({"Lp": Free(-2.0)}, ("p",), Nuisance(input_offset=("dd",)))
-
-
 def test_the_scale_of_the_offset_is_that_of_the_stick():
     flight, _ = flown(3, 0.0)
     problem = Problem(models.roll, vehicle(BENCH), [flight], FREE)

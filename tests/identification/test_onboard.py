@@ -8,9 +8,6 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.estimation.delay_starts import delay_starts
-from heli_jax.identification.estimation.multistart import named_values
-from heli_jax.identification.fit import first_guess
 
 ROLL = linear_model("roll-flybarless")
 LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
@@ -67,38 +64,6 @@ def test_a_servo_and_two_delays_are_recovered():
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
-
-
-@pytest.mark.slow
-def test_a_servo_that_is_left_out_is_named():
-    model = models.with_delays(ROLL.model, ["lat"])
-    flight = record(1)
-    rate = Flight(dt=DT, inputs=flight.inputs, outputs={"p": flight.outputs["p"]})
-    free = {"Lb": Free(120.0), "delay_lat": Free(0.01)}
-    found = fit(Problem(model, params(model, delay_lat=0.0), [rate], free))
-    # It passes for a delay of 2 zeta/omega, and all but one number look well.
-    absorbed = found.estimates["delay_lat"].value - DELAY_LAT
-    assert absorbed == pytest.approx(2.0 * ZETA / OMEGA, abs=4e-3)
-    assert found.metrics["p"].vaf > 0.99
-    assert not found.white
-    [left] = [f for f in found.findings if f.code == "dynamics.residual-follows-input"]
-    assert left.subjects == ("p", "lat")
-    assert 1 <= len(found.starts) <= 3
-    assert found.starts[0].optimum == 1
-
-
-@pytest.mark.slow
-def test_each_of_two_delays_starts_in_its_valley():
-    model = models.with_servos(ROLL.model, ["lat"])
-    model = models.with_delays(model, ["lat"], ["phi"])
-    start = params(model, omega_servo=OMEGA, zeta_servo=ZETA, delay_lat=0.15, delay_phi=0.01)
-    free = {"Lb": Free(120.0), "delay_lat": Free(0.15), "delay_phi": Free(0.01)}
-    problem = Problem(model, start, [record(2)], free)
-    layout, data, noise, z0, e, _ = first_guess(problem)
-    points = delay_starts(problem, layout, data, noise, z0, (e.r, e.J))
-    best = named_values(layout, data, points[0])
-    assert best["delay_lat"] == pytest.approx(DELAY_LAT, abs=DT)
-    assert best["delay_phi"] == pytest.approx(DELAY_PHI, abs=DT)
 
 
 LOOP = """

@@ -152,10 +152,3 @@ def test_many_starts_are_of_both_signs():
     assert np.all(_draw_values(Free(2.0, sign="keep"), 50, rng) > 0)
     near = _draw_values(Free(2.0, prior=Prior(2.0, 0.1), sign="any"), 50, rng)
     assert np.all(np.abs(near - 2.0) < 1.0)
-
-
-def test_a_sign_is_one_of_two():
-    with pytest.raises(ValueError, match=r"free.Ld.sign: expected 'keep' or 'any', got 'plus'"):
-        problem({"Ld": Free(1.0, sign="plus")})  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="sign: any"):
-        problem({"Ld": Free(0.0, sign="keep")})

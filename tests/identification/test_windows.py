@@ -79,21 +79,6 @@ def test_windows_that_hang_together_are_one_run():
     assert [f.value for f in stopped.findings if f.code == "search.stopped"] == [2.0]
 
 
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ({"window": -1.0}, "window must be above zero, got -1 s"),
-        ({"continuity": 0.1}, "continuity is for windows only"),
-        ({"window": 1.0, "continuity": 0.0}, "continuity must be above zero, got 0"),
-        ({"window": 0.05}, "must hold 4 samples at least, got 2 in 0.05 s"),
-        ({"window": 1.0, "nuisance": Nuisance(initial_state=False)}, "windows need"),
-    ],
-)
-def test_refused(how, words):
-    with pytest.raises(ValueError, match=words):
-        problem(**how)
-
-
 def test_a_window_as_long_as_the_flight_is_the_flight():
     one, other = fit(problem()), fit(problem(window=100.0))
     for name, found in one.estimates.items():
