@@ -61,7 +61,6 @@ def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
     said = unless_inputs_explain_nothing(*point(found), first.verdict)
     assert not said.identifiable
     assert said.undetermined == ("Ixx", "If", "kappa")
-    assert "do not determine Ixx, If or kappa: x_roll explains nothing" in said.text
     # With the stick as it was the verdict stands, and where none moves, as in a free decay.
     assert gain_of_inputs(*point(first)) > 100.0
     assert first.verdict.identifiable

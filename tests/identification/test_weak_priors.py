@@ -12,7 +12,6 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
@@ -94,12 +93,8 @@ def test_a_constant_term_is_exchangeable_with_bias_and_initial_state():
     assert v.undetermined == ("L0",)
     assert v.prior_share["L0"] == 1.0
     assert found.estimates["L0"].sd is None
+    assert found.nuisance["flight 1/initial unseen"].prior_share == pytest.approx(1.0)
     assert v.exchangeable == ("flight 1/initial p", "flight 1/bias p")
-    assert "L0, the initial p and the bias of p are exchangeable" in v.text
-    assert "switch off nuisance.initial_state or nuisance.bias, fix L0, or give it a prior" in (
-        v.text
-    )
-    assert "The data determine Lp and Ld." in v.text
     for name, wanted in zip(("Lp", "Ld"), sd, strict=False):
         assert found.estimates[name].sd == pytest.approx(wanted, rel=0.15)  # of the residual's sd
         assert found.estimates[name].prior_share < 1e-6
@@ -119,7 +114,6 @@ def test_two_flights_have_a_bias_and_a_start_each():
     verdict = check(problem(BOUNDED, flights=2)).verdict
     assert not verdict.identifiable
     assert len(verdict.exchangeable) == 4
-    assert verdict.text.count("the bias of p") == 1
 
 
 @pytest.mark.slow
@@ -181,16 +175,3 @@ def test_the_prior_share_is_the_variance_that_all_priors_explain():
     np.testing.assert_allclose([share[n] for n in "abcd"], wanted, atol=0.01)
     assert min(share[n] for n in "ab") > 0.3
     assert share["d"] < 0.1
-
-
-def test_autocorrelated_residuals_and_a_state_that_no_output_shows():
-    """No warning on the way, and no remedy that there is not: the model has no axis to disturb."""
-    one = problem(BOUNDED, Nuisance(bias=False))
-    flight = one.flights[0]
-    drift = np.cumsum(np.random.default_rng(2).standard_normal(N)) * 0.1
-    slow = Flight(dt=DT, inputs=flight.inputs, outputs={"p": flight.outputs["p"] + drift})
-    found = fit(Problem(roll_rate, one.vehicle, [slow], one.free, one.nuisance))
-    assert found.coloured
-    assert not found.disturbable
-    assert found.nuisance["flight 1/initial unseen"].prior_share == pytest.approx(1.0)
-    assert "filter-error" not in whiteness_note(found) + " ".join(found.notes)

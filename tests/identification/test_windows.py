@@ -22,15 +22,9 @@ def problem(flights=1, **how):
     return Problem(models.roll_on_stand, vehicle(BENCH), made, FREE, **how)
 
 
-@pytest.mark.parametrize(
-    ("continuity", "nuisance"),
-    [
-        (None, Nuisance(bias=False, input_gain=True)),
-        pytest.param(0.01, Nuisance(), marks=pytest.mark.slow),
-    ],
-)
-def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
-    one = problem(2, window=1.0, continuity=continuity, nuisance=nuisance)
+def test_the_jacobian_by_colours_is_the_jacobian():
+    nuisance = Nuisance(bias=False, input_gain=True)
+    one = problem(2, window=1.0, continuity=0.01, nuisance=nuisance)
     # Two outputs, and not in the order of their names.
     flights = [
         dataclasses.replace(
@@ -54,8 +48,8 @@ def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     )
     wanted = (high - low).T / 2e-4
     np.testing.assert_allclose(e.J, wanted, rtol=1e-5, atol=1e-7 * np.abs(wanted).max())
-    jumps = 0 if continuity is None else 4 * (3 + 4)
-    assert e.r.size == 2 * (200 + 240) + jumps + 2 + (layout.size - layout.first_nuisance)
+    # Four states at three and four seams.
+    assert e.r.size == 2 * (200 + 240) + 4 * (3 + 4) + 2 + (layout.size - layout.first_nuisance)
 
 
 @pytest.mark.slow
@@ -73,10 +67,6 @@ def test_windows_that_hang_together_are_one_run():
         assert loose.sd > one.sd
         assert abs(loose.value - BENCH[name]) < 4 * loose.sd
     assert apart.signals[0].simulated["roll"].shape == (200,)
-    assert "flight 1/initial phi of window 4" in apart.nuisance
-    stopped = fit(problem(window=1.0), max_steps=2)
-    assert stopped.status == "not-converged"
-    assert [f.value for f in stopped.findings if f.code == "search.stopped"] == [2.0]
 
 
 def test_a_window_as_long_as_the_flight_is_the_flight():
