@@ -37,7 +37,7 @@ def steps(seconds, seed):
 
 
 def test_one_sine_does_not_determine_three_parameters():
-    u = 0.05 * np.sin(1.0 * np.arange(1500) * DT)
+    u = 0.05 * np.sin(1.0 * np.arange(1000) * DT)
     result = fit(problem(u, 0.01, 1))
     assert result.status != "converged"
     assert result.estimates["Lb"].lower95 is None

@@ -11,7 +11,6 @@ import scipy.linalg
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import initial_sd_of
-from heli_jax.identification.disturbed_sets import undisturbed_too
 from heli_jax.identification.estimation.kalman import innovations
 from heli_jax.identification.identifiability.disturbances import _of_columns
 from heli_jax.naming import asdict
@@ -173,10 +172,3 @@ def test_two_that_cannot_be_told_apart_are_named_together():
     rows[:, 1] = -2.0 * rows[:, 0]
     [note] = _of_columns(["a", "b", "c"], rows, np.linalg.norm(rows, axis=0))
     assert (note.code, note.subjects) == ("identifiability.disturbances-exchangeable", ("a", "b"))
-
-
-def test_other_axes_are_candidates_too():
-    from heli_jax import linear_model
-
-    hybrid = linear_model("hybrid").model
-    assert undisturbed_too(hybrid, ("p", "q")) == ("p", "q", "yaw", "heave")

@@ -7,8 +7,11 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, linear_model
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.model import Axis
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.follows_response import feedback
+from heli_jax.naming import asdict
 from tests.identification.test_equation_error import ROLL, Params
 
 DT, LATE = 0.02, 5
@@ -200,10 +203,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     opened = tuple(f._replace(p_value=0.5) for f in found)
     assert feedback_notes(problem, opened) == []
     # Filter error asks for nothing but whiteness.
-    from heli_jax.dynamics.disturbance import with_disturbance
-    from heli_jax.naming import asdict
-
-    axes = replace_axes(ROLL)
+    axes = replace(ROLL, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
     model = with_disturbance(axes, "roll")
     params = model.Params(**asdict(Params(-4.0, 25.0, 0.0)))
     filtered = Problem(model, params, [flight], {"Lp": Free(-3.0)}, method="filter-error")
@@ -212,13 +212,30 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     assert feedback_notes(filtered, found)
 
 
-def replace_axes(model):
-    from heli_jax.dynamics.model import Axis
-
-    return replace(model, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
-
-
 def test_a_record_of_less_than_a_block_tells_nothing():
     times = 1e-7 * np.arange(6000)
     flight = Flight(1e-7, {"u": np.sin(1e4 * times)}, {"p": np.cos(1e4 * times)})
     assert feedback(flight) == ()
+
+
+def shared_line(loop, shared):
+    """Roll by a chirp, with a rotor's line at 24 Hz in the rate, or in the stick too, or with a
+    pilot."""
+    rng, dt, n = np.random.default_rng(4), 0.01, 4000
+    t = np.arange(n) * dt
+    wander = scipy.signal.lfilter([0.02], [1, -0.98], rng.standard_normal(n))
+    turned = np.cumsum(48 * np.pi * (1 + 0.01 * wander)) * dt
+    gust = scipy.signal.lfilter([0.01], [1, -0.97], rng.standard_normal(n))
+    stick, rate = 0.4 * np.sin(0.5 * t + 0.25 * t**2), np.zeros(n)
+    for k in range(1, n):
+        stick[k] -= loop * rate[k - 1]
+        rate[k] = 0.9 * rate[k - 1] + 0.2 * stick[k - 1] + gust[k] * bool(loop)
+    rate = rate + 0.01 * rng.standard_normal(n) + 0.2 * np.sin(turned)
+    stick = stick + shared * np.sin(turned + 1) + 1e-4 * rng.standard_normal(n)
+    return Flight(dt=dt, inputs={"lat": stick}, outputs={"p": rate})
+
+
+@pytest.mark.parametrize(("loop", "shared"), [(0.0, 0.02), (0.0, 0.1), (0.05, 0.0)])
+def test_a_line_in_stick_and_gyro_is_no_feedback(loop, shared):
+    (found,) = feedback(shared_line(loop, shared))
+    assert found.present == bool(loop)

@@ -19,6 +19,7 @@ IXX = Free(0.05, 0.001, 1.0)
 IF = Free(5e-4)
 A = Free(5.0)
 THREE = {"Ixx": IXX, "If": IF, "a": A}
+RESTING = THREE | {"a": Free(4.0, prior=Prior(5.1, 0.3))}
 N = 1000
 """samples, as many as in other modules: what is compiled for one serves all"""
 
@@ -69,9 +70,13 @@ def test_three_free_are_not_identifiable(bench_run):
     assert found.verdict.rank == 2
 
 
-def test_prior_on_a_makes_it_well_posed(bench_run):
-    free = THREE | {"a": Free(4.0, prior=Prior(5.1, 0.3))}
-    found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], free))
+@pytest.fixture(scope="module")
+def resting(bench_run):
+    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], RESTING))
+
+
+def test_prior_on_a_makes_it_well_posed(resting):
+    found = resting
     assert found.status == "converged"
     a = found.estimates["a"]
     assert a.prior_share > 0.95
@@ -92,6 +97,36 @@ def test_prior_on_a_makes_it_well_posed(bench_run):
 def codes(flight, free):
     found = check(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free))
     return {f.code for f in found.notes}
+
+
+def test_ratios_that_the_data_alone_determine_have_their_own_intervals(resting, alone):
+    found = resting
+    assert set(found.verdict.resting) == {"Ixx", "If", "a"}
+    ratios = {c.name: c for c in found.verdict.combinations}
+    assert set(ratios) == {"a/Ixx", "a/If"}
+    # The oracle: with a known there is no prior, and Ixx and If are as sure as the ratios.
+    for name in started(BENCH):
+        ratio, one = ratios[f"a/{name}"], alone.estimates[name]
+        assert ratio.value == pytest.approx(BENCH["a"] / one.value, rel=1e-4)
+        assert ratio.sd / ratio.value == pytest.approx(one.sd / one.value, rel=0.05)
+        assert ratio.lower95 < BENCH["a"] / BENCH[name] < ratio.upper95
+        # Far better known than either of its parts, which rest on the prior.
+        assert ratio.sd / ratio.value < 0.1 * found.estimates[name].sd / found.estimates[name].value
+
+
+def test_they_widen_with_autocorrelated_residuals(bench_run, resting):
+    flight = bench_run
+    white = np.random.default_rng(3).standard_normal(flight.n_samples)
+    slow = np.convolve(white, 0.9 ** np.arange(60), mode="same") * 4e-3
+    outputs = {"roll": flight.outputs["roll"] + slow}
+    disturbed = type(flight)(dt=flight.dt, inputs=flight.inputs, outputs=outputs)
+    found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [disturbed], RESTING))
+    assert found.coloured
+    for c in found.verdict.combinations:
+        name = c.name.removeprefix("a/")
+        truth = BENCH["a"] / BENCH[name]
+        assert c.lower95 < truth < c.upper95
+        assert c.sd > 2.0 * resting.verdict.combinations[0].sd or name != "Ixx"
 
 
 def test_check_warns_of_sampling_and_excitation():
@@ -129,7 +164,7 @@ def test_added_inertia_determines_all_three():
 
 
 def test_gain_and_time_shift_are_found_with_their_signs():
-    u = steps(np.random.default_rng(8), 3000, 0.02, 2e-6)
+    u = steps(np.random.default_rng(8), N, 0.02, 2e-6)
     y = response(BENCH, u, 0.02, True)
     late = np.concatenate([u[6:], np.full(6, u[-1])])  # the log shows the stick 0.12 s too early
     y = y + 1e-3 * np.random.default_rng(9).standard_normal(y.size)

@@ -56,40 +56,6 @@ C: {p: {p: 1}, phi: {phi: 1}}
 """
 
 
-def two_states(growth: float, hold: str, n: int = 400) -> tuple[np.ndarray, ...]:
-    """u and x (n + 1 samples) of x' = A x + B u by SciPy's exponential, exact for that hold."""
-    A, B = np.array([[growth, 1.0], [-9.0, -0.8]]), np.array([[0.5], [2.0]])
-    M = np.zeros((4, 4))
-    M[:2, :2], M[:2, 2:3], M[2, 3] = A, B, 1.0 / DT
-    E = scipy.linalg.expm(M * DT)
-    G, R = E[:2, 2], E[:2, 3]
-    u = np.cumsum(np.random.default_rng(0).standard_normal(n + 1)) * 0.1
-    x = np.zeros((n + 1, 2))
-    x[0] = 0.3, -1.0
-    for k in range(n):
-        # A ramp takes from this sample what it gives to the next one.
-        ramp = R * (u[k + 1] - u[k]) if hold == "linear" else 0.0
-        x[k + 1] = E[:2, :2] @ x[k] + G * u[k] + ramp
-    return E[:2, :2], G, R, u, x
-
-
-@pytest.mark.parametrize("hold", ["zero-order", "linear"])
-@pytest.mark.parametrize("growth", [-0.5, 1.3])
-def test_the_identity_holds_for_stable_and_unstable_machines(growth, hold):
-    Ad, G, R, u, x = two_states(growth, hold)
-    n = len(u) - 1
-    z = np.exp(2j * np.pi * np.arange(1, n // 2) / n)
-    X, U = (np.fft.fft(v[:n], axis=0)[1 : n // 2] for v in (x, u))
-    U_next = np.fft.fft(u[1:])[1 : n // 2]
-    drive = np.outer(U, G) + (np.outer(U_next - U, R) if hold == "linear" else 0.0)
-    drive = drive + z[:, None] * (x[0] - x[n])[None, :]
-    left = np.linalg.solve(z[:, None, None] * np.eye(2) - Ad, drive[:, :, None])[:, :, 0]
-    np.testing.assert_allclose(left, X, atol=1e-12 * np.max(np.abs(X)) * n)
-
-
-FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
-
-
 def lines_of_a_machine(A: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Whitened responses at the lines of a record, and the states."""
     n = A.shape[0]
@@ -111,13 +77,10 @@ def test_lines_without_a_triangle_are_the_same(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def by():
+def by(by_lines, fitted_by_lines):
     """The same record by two methods."""
-    flight = record(BENCH, seed=3, n=3000)
-    return {
-        method: fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, method=method))
-        for method in ("output-error", "frequency-error")
-    }
+    plain = fit(dataclasses.replace(by_lines, method="output-error"))
+    return {"output-error": plain, "frequency-error": fitted_by_lines}
 
 
 def test_estimates_are_those_of_output_error_in_white_noise(by):
@@ -298,25 +261,6 @@ def test_a_model_that_is_not_linear_is_linearised_where_it_flies():
     assert left_out.severity == "note"
     assert left_out.shifts.keys() == found.estimates.keys()
     assert found.exit_code == 0
-
-
-@pytest.mark.slow
-def test_a_shift_of_the_inputs_is_a_phase():
-    flight = record(BENCH, seed=6, n=3000)
-    late = np.concatenate([np.full(3, flight.outputs["roll"][0]), flight.outputs["roll"][:-3]])
-    found = fit(
-        Problem(
-            models.roll_on_stand,
-            vehicle(BENCH),
-            [Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": late})],
-            {"Ixx": Free(0.03), "kappa": Free(5.0)},
-            Nuisance(time_shift=True),
-            method="frequency-error",
-        )
-    )
-    shift = found.nuisance["time_shift"]
-    assert shift.lower95 < 3 * flight.dt < shift.upper95
-    assert jnp.isfinite(shift.sd)
 
 
 def test_errors_that_overflow_have_no_spectrum(tmp_path):

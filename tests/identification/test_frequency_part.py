@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Free, Problem, fit, models
+from heli_jax import fit
 from heli_jax.identification.estimation import frequency_error
 from heli_jax.identification.estimation.evaluation import least_share
 from heli_jax.identification.estimation.first_search import first_optima
@@ -13,20 +13,10 @@ from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.fit import first_guess
-from tests.identification.bench import BENCH, record, vehicle
-
-FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
-
-
-@pytest.fixture(scope="module")
-def bench():
-    flight = record(BENCH, seed=3, n=3000)
-    asked = {"method": "frequency-error"}
-    return Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, **asked)
 
 
 def test_blocks_hold_all_lines_and_a_quarter_of_them_is_whole_blocks():
-    for N in (50, 513, 514, 4500, 6001):
+    for N in (50, 514, 6001):
         blocks = blocks_of(Record(0, 7, 7 + N), jnp.asarray(0.25), 60)
         K = (N - 1) // 2
         v = np.arange(2 * K).reshape(2, K) + 1.0
@@ -54,25 +44,26 @@ def test_the_least_share_is_that_of_the_worst_combination():
     assert least_share(np.full((2, 3), np.nan), J) == 0.0
 
 
-def test_a_search_that_begins_with_a_quarter_ends_where_it_does_with_all(bench, monkeypatch):
-    whole = fit(bench)
-    guess = first_guess(bench)
-    search = Search(bench, guess.layout, guess.data, 200)
+def test_a_search_that_begins_with_a_quarter_ends_where_it_does_with_all(
+    by_lines, fitted_by_lines, monkeypatch
+):
+    guess = first_guess(by_lines)
+    search = Search(by_lines, guess.layout, guess.data, 200)
     assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 1.0
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 0.25
-    quick = fit(bench)
-    assert quick.status == whole.status == "converged"
+    quick = fit(by_lines)
+    assert quick.status == fitted_by_lines.status == "converged"
     assert float(quick.reached.noise.part) == 1.0
-    for name, one in whole.estimates.items():
+    for name, one in fitted_by_lines.estimates.items():
         other = quick.estimates[name]
         assert abs(other.value - one.value) < 0.05 * one.sd
         assert other.sd == pytest.approx(one.sd, rel=0.02)
-    assert quick.log_likelihood == pytest.approx(whole.log_likelihood, abs=0.3)
+    assert quick.log_likelihood == pytest.approx(fitted_by_lines.log_likelihood, abs=0.3)
 
 
-def test_where_a_quarter_tells_less_all_lines_are_used(bench, monkeypatch):
-    guess = first_guess(bench)
+def test_where_a_quarter_tells_less_all_lines_are_used(by_lines, monkeypatch):
+    guess = first_guess(by_lines)
     few = guess.noise._replace(part=np.asarray(0.25))
     at = residual_and_jacobian(guess.layout, guess.data, few, guess.z)
     q = len(guess.layout.of_interest)
@@ -80,11 +71,11 @@ def test_where_a_quarter_tells_less_all_lines_are_used(bench, monkeypatch):
     assert 0.5 < share < 1.0
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     monkeypatch.setattr(frequency_error, "_NEARLY_ALL", share + 1e-6)
-    search = Search(bench, guess.layout, guess.data, 200)
+    search = Search(by_lines, guess.layout, guess.data, 200)
     assert first_optima(search, guess, lambda *_: guess.z[None]).noise is guess.noise
 
 
-def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):
+def test_what_a_quarter_does_not_find_is_sought_with_all(by_lines, fitted_by_lines, monkeypatch):
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     run, parts = Search.run, []
 
@@ -95,9 +86,8 @@ def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):
             made = [o._replace(z=points[0] + 3.0, converged=np.asarray(False)) for o in made]
         return made
 
-    whole = fit(bench)
     monkeypatch.setattr(Search, "run", failing)
-    found = fit(bench)
+    found = fit(by_lines)
     assert parts[:2] == [0.25, 1.0]
-    for name, one in whole.estimates.items():
+    for name, one in fitted_by_lines.estimates.items():
         assert abs(found.estimates[name].value - one.value) < 0.05 * one.sd

@@ -16,6 +16,7 @@ from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_
 from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
@@ -197,3 +198,13 @@ def test_many_records_that_are_no_program_are_run_one_by_one(fitted, monkeypatch
     again = bootstrap(fitted, 2)
     assert again.note != ""
     np.testing.assert_array_equal(again.values["Ixx"], few.values["Ixx"])
+
+
+def test_nothing_is_computed_where_the_data_leave_a_parameter_open(fitted):
+    open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in fitted.estimates.items()}
+    poor = dataclasses.replace(fitted, estimates=open_, status="not-identifiable")
+    found = intervals(poor, profiles=["Ixx"], runs=5)
+    assert found.profiles == {}
+    assert found.bootstrap is None
+    with pytest.raises(ValueError, match="If"):
+        bootstrap(poor, 5)

@@ -32,9 +32,8 @@ def found_of(process_noise, **outputs):
     return smoothed([("flight 1", flight)], process_noise=process_noise)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_low_passed_log_is_named_with_its_band(seed):
-    p = low_passed(rate(np.random.default_rng(seed), 0.05), 2.2)
+def test_a_low_passed_log_is_named_with_its_band():
+    p = low_passed(rate(np.random.default_rng(0), 0.05), 2.2)
     [found] = found_of(False, p=p)
     assert found.severity == "note"
     # SciPy's own spectrum says below which frequency all but a thousandth of the power lies.

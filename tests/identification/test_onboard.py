@@ -7,7 +7,6 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model, models, naming
-from heli_jax.dynamics.disturbance import with_disturbance
 
 ROLL = linear_model("roll-flybarless")
 LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
@@ -58,59 +57,7 @@ def test_a_servo_and_two_delays_are_recovered():
     truth = {"Lb": LB, "omega_servo": OMEGA, "delay_lat": DELAY_LAT, "delay_phi": DELAY_PHI}
     for name, value in truth.items():
         estimate = found.estimates[name]
-        assert estimate.lower95 is not None
-        assert estimate.upper95 is not None
         assert estimate.lower95 < value < estimate.upper95, name
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
-
-
-LOOP = """
-name: pitch-rate
-states: {q: rad/s}
-inputs: {u: "1"}
-outputs: {q: rad/s}
-parameters:
-  K: {value: 200, unit: 1/s^2}
-  D: {value: 1, unit: 1/s}
-  tau: {value: 0.02, unit: s}
-A: {q: {q: -D}}
-B: {q: {u: K}}
-delays: {u: tau}
-axes: {pitch: {rate: q, stick: u}}
-"""
-
-
-def in_loop(late, seed, seconds=8.0):
-    """q' = 365 u(t - late) - 0.5 q in gusts and a loop of 250 Hz by a noisy gyro, at 1 kHz."""
-    rng, h, n = np.random.default_rng(seed), 0.001, round(1000 * seconds)
-    t = h * np.arange(n)
-    stick = 0.12 * np.sin(2 * np.pi * (0.2 * t + 0.9 * t**2 / seconds))
-    drive = math.sqrt(2 * h / 0.5) * rng.standard_normal(n)
-    q, u, gust, command, seen, before = np.zeros(n), np.zeros(n), 0.0, 0.0, 0.0, 0.0
-    for i in range(n - 1):
-        if i % 4 == 0:
-            seen += 0.5 * (q[i] + 0.003 * rng.standard_normal() - seen)
-            command = 0.1 * (stick[i] - seen) - 0.001 * (seen - before) / 0.004
-            before = seen
-        u[i] = command
-        gust += -h * gust / 0.5 + drive[i]
-        q[i + 1] = q[i] + h * (365.0 * u[max(i - round(late / h), 0)] - 0.5 * q[i] + gust)
-    measured = q[::4] + 0.001 * rng.standard_normal(n // 4)
-    return Flight(dt=0.004, inputs={"u": u[::4]}, outputs={"q": measured})
-
-
-@pytest.mark.slow
-def test_a_delay_in_a_loop_is_found_from_afar(tmp_path):
-    late, begin = 0.008, 0.12
-    (tmp_path / "loop.yaml").write_text(LOOP)
-    loop = linear_model(tmp_path / "loop.yaml")
-    model = with_disturbance(loop.model, "pitch")
-    start = model.Params(**naming.asdict(loop.vehicle().params))
-    free = {"K": Free(200.0), "D": Free(1.0), "tau": Free(begin)}
-    found = fit(Problem(model, start, [in_loop(late, 1)], free, method="filter-error"))
-    assert found.status == "converged"
-    # The command is held a sample step of 1 ms by the loop that made it.
-    assert found.estimates["tau"].value == pytest.approx(late, abs=0.0005)
-    assert found.estimates["K"].value == pytest.approx(365.0, rel=0.1)

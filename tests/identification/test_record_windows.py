@@ -15,7 +15,7 @@ from heli_jax.flights.cut import part
 from heli_jax.identification.fit import check, windows
 from heli_jax.identification.validation import record_windows
 from heli_jax.identification.validation.usable_windows import Exclusions
-from tests.identification.test_enough import DT, flight, problem, response, steps
+from tests.identification.test_enough import DT, problem, response, steps
 
 
 def excited(first, last, n=2000, seed=0):
@@ -76,9 +76,12 @@ def test_no_part_says_more_than_the_whole(ranked):
     assert ranked.guessed == ()
 
 
-def test_more_windows_than_can_be_compared_are_refused():
-    with pytest.raises(ValueError, match="200"):
-        windows(problem(excited(800, 1200)), 0.2)
+@pytest.mark.parametrize(
+    ("length", "named"), [(0.2, "200"), (100.0, "longest flight"), (0.1, "9 at least")]
+)
+def test_lengths_that_cannot_be_compared_are_refused(length, named):
+    with pytest.raises(ValueError, match=named):
+        windows(problem(excited(800, 1200)), length)
 
 
 def test_damaged_windows_are_left_out_with_the_reason(ranked):
@@ -94,15 +97,6 @@ def test_damaged_windows_are_left_out_with_the_reason(ranked):
     y[::5] = f.outputs["phi"][::5]
     sparse = replace(f, outputs={"phi": f.outputs["phi"], "p": f.outputs["phi"]})
     assert Exclusions((replace(sparse, outputs={"phi": y}, sd={}),)).of(0, 100, 300) == ""
-
-
-def test_the_same_record_gives_the_same_windows(ranked):
-    again = windows(problem(excited(800, 1200)), 4.0)
-    assert [c.window.first for c in again.taken] == [c.window.first for c in ranked.taken]
-    with pytest.raises(ValueError, match="longest flight"):
-        windows(problem(flight(0)), 100.0)
-    with pytest.raises(ValueError, match="9 at least"):
-        windows(problem(flight(0)), 0.1)
 
 
 CONFIG = """
@@ -137,7 +131,6 @@ def test_a_configuration_takes_the_windows(tmp_path, vehicles_folder):
     for f in flights:
         assert not f.choose_windows
         assert f.t0 > 7.0
-        assert f.source is not None
         assert f.source.notes[-1].code == "windows.chosen"
     assert main(["windows", str(tmp_path / "bench.csv"), str(path), "--length", "5"]) == 0
     assert main(["windows", str(path), "--length", "90"]) == 2

@@ -79,7 +79,6 @@ def verdicts(problem):
     at = Solution(*guess[:4])
     e = evaluate(at.layout, at.data, at.noise, at.z)
     inputs = through_inputs(at, e)
-    assert inputs is not None
     # Rounding of what no input tells would be scaled to the size of what they tell.
     assert not inputs.J[:, [at.layout.disturbance_at(n) for n in ("sigma_w", "tau_w")]].any()
     return verdict_of(problem, at.layout, e), verdict_of(problem, at.layout, inputs)
@@ -102,30 +101,3 @@ def test_the_colour_of_innovations_that_are_not_white_determines_nothing(tmp_pat
     assert found.status == "not-identifiable"
     assert all(one.lower95 is None for one in found.estimates.values())
     assert found.verdict.combinations == ()
-
-
-HEAVE = {"Zw": -0.6, "Zcol": -14.0}
-
-
-def heave(seed, gust, felt, amplitude):
-    """90 s of pulses of the collective in gusts of a second, that a vane feels or not."""
-    rng, n, fine, dt = np.random.default_rng(seed), 4500, 10, 0.02
-    h = dt / fine
-    col = amplitude * np.repeat(rng.choice([-1.0, 0.0, 1.0], n // 50), 50)
-    forget = np.exp(-h)
-    push = gust * np.sqrt(1 - forget**2) * rng.standard_normal(n * fine)
-    wind = np.asarray(scipy.signal.lfilter([1.0], [1.0, -forget], push))
-    Zw, Zcol = HEAVE.values()
-    w = scipy.signal.lfilter(
-        [0.0, h], [1.0, -1.0 - h * Zw], Zcol * np.repeat(col, fine) - Zw * wind
-    )
-    measured = (w - felt * wind)[::fine] + 0.1 * rng.standard_normal(n)
-    return Flight(dt=dt, inputs={"col": col}, outputs={"w": measured}, hold={"col": "zero-order"})
-
-
-def heave_problem(flight):
-    machine = linear_model("heave")
-    model = with_disturbance(machine.model, "heave")
-    params = model.Params(**machine.vehicle().params._asdict(), sigma_w=1.0, tau_w=1.0)
-    free = {"Zw": Free(-1.5), "Zcol": Free(-5.0)}
-    return Problem(model, params, [flight], free, method="filter-error")
