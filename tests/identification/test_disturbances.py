@@ -84,7 +84,7 @@ def problem(flight, model=BOTH, **options):
 
 @pytest.fixture(scope="module")
 def whole():
-    flight = record(1, 1500)
+    flight = record(1, 1000)
     return flight, fit(problem(flight))
 
 
@@ -131,7 +131,7 @@ def test_sizes_and_times_are_recovered_within_their_intervals(whole):
 
 
 def test_one_that_is_not_there_freezes_no_other():
-    flight = record(2, 1500, np.array([2.0, 0.0]))
+    flight = record(2, 1000, np.array([2.0, 0.0]))
     found = fit(problem(flight))
     assert found.status == "converged"
     assert found.nuisance["sigma_w_q"].value == 0.0
@@ -148,7 +148,7 @@ def test_noise_of_the_models_own_is_kept_and_fitted():
     intensity = asdict(both.noise_intensity(params(both, gust=0.3, sigma_w=1.0, tau_w=2.0)))
     assert {n: float(v) for n, v in intensity.items()} == {"p": 0.3, "q": 0.0, "w1_q": 1.0}
     rng = np.random.default_rng(0)
-    n, phi = 1500, np.exp(-5.0 * DT)
+    n, phi = 1000, np.exp(-5.0 * DT)
     lat = 0.2 * random_steps(n, DT, rng, (0.3, 1.5))
     p = np.zeros(n)
     # An exact first-order step: white noise of intensity 0.5 through a lag.

@@ -39,13 +39,13 @@ def record(seed, gain, kind="steps", n=1000, gust=1.0):
 
 @pytest.mark.parametrize("kind", ["steps", "smooth"])
 def test_in_an_open_loop_there_are_hardly_false_alarms(kind):
-    alarms = [any(f.present for f in feedback(record(s, 0.0, kind))) for s in range(50)]
-    assert sum(alarms) <= 2
+    alarms = [any(f.present for f in feedback(record(s, 0.0, kind))) for s in range(20)]
+    assert sum(alarms) <= 1
 
 
 def test_a_pilot_who_holds_the_bank_angle_is_found():
-    found = [feedback(record(s, 0.3)) for s in range(10)]
-    assert sum(any(f.present for f in one) for one in found) >= 9
+    found = [feedback(record(s, 0.3)) for s in range(5)]
+    assert sum(any(f.present for f in one) for one in found) >= 4
     (one,) = found[0]
     # He takes the stick against the motion, no sooner than he sees it.
     assert one.correlation < 0
@@ -75,14 +75,13 @@ def seen(seed, gain, noise, frequency, machine, rate=100.0):
 
 
 def test_slow_feedback_shows_through_a_noisy_sensor():
-    found = [feedback(seen(s, 0.15, 0.7, 1.0, (0.7, -14.0, 0.1))) for s in range(6)]
-    assert sum(one[0].present for one in found) >= 5
+    found = [feedback(seen(s, 0.15, 0.7, 1.0, (0.7, -14.0, 0.1))) for s in range(4)]
+    assert sum(one[0].present for one in found) >= 3
 
 
-@pytest.mark.parametrize("rate", [50.0, 100.0])
-def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback(rate):
+def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback():
     # What the stick does within a sample moves the machine, and the stick goes on from there.
-    records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), rate) for s in range(6)]
+    records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), 50.0) for s in range(4)]
     assert sum(feedback(record)[0].present for record in records) <= 1
 
 
@@ -107,9 +106,9 @@ def logged_late(seed, samples, n=2000):
 
 
 def test_a_stick_that_is_logged_late_is_taken_when_it_acted():
-    late = [logged_late(s, 3) for s in range(4)]
+    late = [logged_late(s, 3) for s in range(2)]
     # As logged it follows what it caused itself.
-    assert sum(any(f.present for f in feedback(flight)) for flight in late) >= 3
+    assert sum(any(f.present for f in feedback(flight)) for flight in late) == 2
     # 0.06 s, and a little more than it was: as the interval of an estimate has it.
     for earlier in (0.06, 0.063):
         found = [feedback(flight, 1, {"da": earlier}) for flight in late]
@@ -163,12 +162,11 @@ def test_steps_without_any_other_motion_are_no_feedback():
     assert feedback(short) == ()
 
 
-@pytest.mark.parametrize("tau", [0.08, 0.12])
-def test_programmed_doublets_that_a_filter_rounded_are_no_feedback(tau):
+def test_programmed_doublets_that_a_filter_rounded_are_no_feedback():
     # A command as autopilots shape it: no corner of it is a single jump, and it comes to rest by
     # and by. Nothing follows anything, and nothing is measured with noise.
     pattern = np.repeat([0.0, 0.3, -0.3, 0.0], [100, 40, 40, 170])
-    keep = np.exp(-DT / tau)
+    keep = np.exp(-DT / 0.08)
     u = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.tile(pattern, 12))
     phi, p, v = np.zeros(u.size), np.zeros(u.size), 0.0
     for k in range(u.size - 1):

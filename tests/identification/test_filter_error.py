@@ -24,7 +24,7 @@ from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
 
-DT, N = 0.02, 2000
+DT, N = 0.02, 1000
 TRUTH = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 1.0}
 FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
 
@@ -55,10 +55,10 @@ def disturbed(bench30):
 def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
     # A record of gusts alone: what follows of it for the machine stands and falls with the noise.
     _, problem, first = disturbed
-    record = made(bench30, 1, amplitude=1e-10)[3]
-    found = fit(dataclasses.replace(problem, flights=[record]))
-    assert found.status == "not-identifiable"
-    said = unless_inputs_explain_nothing(*point(found), first.verdict)
+    gusts = dataclasses.replace(problem, flights=[made(bench30, 1, amplitude=1e-10)[3]])
+    at = first.reached._replace(data=data_of(gusts, gusts.training))
+    e = evaluate(at.layout, at.data, at.noise, at.z)
+    said = unless_inputs_explain_nothing(at, e, first.verdict)
     assert not said.identifiable
     assert said.undetermined == ("Ixx", "If", "kappa")
     # With the stick as it was the verdict stands, and where none moves, as in a free decay.
@@ -82,19 +82,17 @@ def errors(found, params):
     return {n: (e.value - float(getattr(params, n))) / e.sd for n, e in found.estimates.items()}
 
 
-def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(bench30, disturbed):
-    params, problem, first = disturbed
-    other = dataclasses.replace(problem, flights=[made(bench30, 0)[3]])
-    for found in (first, fit(other)):
-        assert found.status == "converged"
-        assert found.steps <= 40
-        assert all(abs(e) < 4 for e in errors(found, params).values())
-        assert found.estimates["Ixx"].sd < 0.1 * float(params.Ixx)
-        for name in ("sigma_w", "tau_w"):
-            one = found.nuisance[name]
-            assert abs(np.log(one.value / TRUTH[name])) < 4 * one.sd / one.value
-        assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
-        assert found.white
+def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(disturbed):
+    params, _, found = disturbed
+    assert found.status == "converged"
+    assert found.steps <= 40
+    assert all(abs(e) < 4 for e in errors(found, params).values())
+    assert found.estimates["Ixx"].sd < 0.1 * float(params.Ixx)
+    for name in ("sigma_w", "tau_w"):
+        one = found.nuisance[name]
+        assert abs(np.log(one.value / TRUTH[name])) < 4 * one.sd / one.value
+    assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
+    assert found.white
 
 
 def test_white_noise_alone_ends_as_output_error(bench30):
@@ -114,33 +112,14 @@ def test_missing_samples_cost_information_and_no_more(disturbed):
     [flight] = problem.flights
     roll = flight.outputs["roll"].copy()
     gone = np.random.default_rng(0).uniform(size=N) < 0.3
-    gone[400:600] = True
+    gone[400:500] = True
     flight = dataclasses.replace(flight, outputs={"roll": np.where(gone, np.nan, roll)})
-    for method in ("filter-error", "output-error"):
-        found = fit(dataclasses.replace(problem, flights=[flight], method=method))
-        assert found.status == "converged"
-        assert found.n_samples == np.count_nonzero(~gone)
-        assert all(abs(e) < 4 for e in errors(found, params).values())
-        simulated = found.signals[0].simulated["roll"]
-        assert np.isfinite(simulated).all()
-        assert np.isfinite(found.metrics["roll"].vaf)
-
-
-def test_an_output_of_every_tenth_sample(disturbed):
-    """The same programs as above: a slow sensor is one of which most samples are missing."""
-    params, problem, first = disturbed
-    [flight] = problem.flights
-    roll = np.where(np.arange(N) % 10 == 7, flight.outputs["roll"], np.nan)
-    flight = dataclasses.replace(flight, outputs={"roll": roll})
     found = fit(dataclasses.replace(problem, flights=[flight]))
     assert found.status == "converged"
-    assert found.n_samples == N // 10
+    assert found.n_samples == np.count_nonzero(~gone)
     assert all(abs(e) < 4 for e in errors(found, params).values())
-    for name, one in found.estimates.items():
-        full = first.estimates[name]
-        # At other estimates the same information is another sd: not exactly larger.
-        assert one.sd > 0.9 * full.sd
-        assert one.value == pytest.approx(full.value, abs=2.0 * one.sd)
+    assert np.isfinite(found.signals[0].simulated["roll"]).all()
+    assert np.isfinite(found.metrics["roll"].vaf)
 
 
 def test_noise_that_cannot_be_is_told(disturbed):
@@ -152,7 +131,7 @@ def test_noise_that_cannot_be_is_told(disturbed):
         flights = [dataclasses.replace(flight, sd={"roll": sd})]
         fixed = ("sigma_w", "tau_w", "sigma_y")
         fixed_ = dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed)
-        return fit(fixed_, max_steps=30)
+        return fit(fixed_, max_steps=12)
 
     too_small = run(2e-4)
     [size] = [f for f in too_small.findings if f.code == "noise.innovations-size"]

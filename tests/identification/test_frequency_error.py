@@ -139,28 +139,18 @@ def test_the_noise_spectrum_of_two_outputs_is_found():
     np.testing.assert_allclose(S[middle, 1, 1].real, slow[middle], rtol=0.25)
 
 
-def with_holes(flight: Flight, *holes: slice, **more) -> Flight:
-    roll = flight.outputs["roll"].copy()
-    for hole in holes:
-        roll[hole] = np.nan
-    return Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, **more)
-
-
-def problem_of(*flights: Flight, nuisance: Nuisance = Nuisance(), **free: Free) -> Problem:
-    frees = free or {"Ixx": Free(0.035), "kappa": Free(7.0)}
-    return Problem(
-        models.roll_on_stand, vehicle(BENCH), flights, frees, nuisance, method="frequency-error"
-    )
-
-
-HOLES = slice(700, 701), slice(1200, 1260), slice(1290, 1500)
-
-
 def test_a_flight_is_cut_at_its_missing_samples():
     """Of SciPy's noiseless record the model's error is nothing but rounding in each part."""
-    exact = with_holes(record(BENCH, seed=3, n=1500, noise=0.0), *HOLES)
+    whole = record(BENCH, seed=3, n=1500, noise=0.0)
+    roll = whole.outputs["roll"].copy()
+    for hole in (slice(700, 701), slice(1200, 1260), slice(1290, 1500)):
+        roll[hole] = np.nan
+    exact = dataclasses.replace(whole, outputs={"roll": roll})
     still = Nuisance(initial_state=False, bias=False)
-    problem = problem_of(exact, nuisance=still, Ixx=Free(BENCH["Ixx"]))
+    problem = Problem(
+        models.roll_on_stand, vehicle(BENCH), [exact], {"Ixx": Free(BENCH["Ixx"])}, still,
+        method="frequency-error",
+    )  # fmt: skip
     layout = layout_of(problem, problem.training)
     assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
     data, noise = data_of(problem, problem.training, layout), first_noise(problem, [exact])
