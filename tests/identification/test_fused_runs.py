@@ -39,22 +39,20 @@ def one(**how):
     return [holes(record(BENCH, seed=3, n=150, **how))]
 
 
-def two(**how):
-    return [*one(**how), record(BENCH, seed=4, n=90, known={"kappa": 5.0}, **how)]
-
-
 def problem(flights, free=FREE, **how):
     return Problem(models.roll_on_stand, vehicle(BENCH), flights, free, **how)
 
 
 NONE = Nuisance(False, False)
-CASES = {
-    "rk4": lambda: problem(one(), solver="rk4", substeps=1),
-    "two flights, offsets and gains, straight lines between samples": lambda: problem(
-        two(hold={"x_roll": "linear"}),
-        nuisance=Nuisance(False, False, input_gain=True, input_offset=True),
-    ),
-}
+
+
+def rk4():
+    nuisance = Nuisance(False, False, input_gain=True, input_offset=True)
+    return problem(one(hold={"x_roll": "linear"}), nuisance=nuisance, solver="rk4", substeps=1)
+
+
+def exactly():
+    return problem([*one(), record(BENCH, seed=4, n=90, known={"kappa": 5.0})])
 
 
 def pieces(problem, seed=0, apart=0.05):
@@ -94,8 +92,10 @@ def products(r, J):
     return np.einsum("bni,bnj->bij", rows, rows)
 
 
-def agree(problem, own):
-    layout, data, noise, z = pieces(problem)
+@pytest.mark.parametrize("made", [rk4, pytest.param(exactly, marks=pytest.mark.slow)])
+def test_rows_and_jacobians_are_as_jax_makes_them(made):
+    own = Own(True, True)
+    layout, data, noise, z = pieces(made())
     numbers = tiled(data, own)
     found = products(*FusedRuns(layout, data, noise, own)(numbers, jnp.asarray(z)))
     each = jax.vmap(lambda d, z: differentiate(layout, d, noise, z))(numbers, z)
@@ -110,17 +110,8 @@ def agree(problem, own):
     )
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_as_jax_makes_them(case):
-    agree(CASES[case](), Own(False, True))
-
-
-def test_records_of_each_runs_own():
-    agree(problem(one()), Own(True, True))
-
-
 def test_a_run_that_leaves_all_numbers_is_not_a_number():
-    layout, data, noise, z = pieces(CASES["rk4"]())
+    layout, data, noise, z = pieces(rk4())
     z[3, 0] = -60.0  # Ixx of 1e-28 kg m^2
     own = Own(False, False)
     r, J = FusedRuns(layout, data, noise, own)(tiled(data, own), jnp.asarray(z))

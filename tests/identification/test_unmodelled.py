@@ -133,6 +133,7 @@ def test_what_is_left_out_takes_the_intervals_that_it_moves(made, method, noise,
     assert untrusted is None or found.exit_code == 3
 
 
+@pytest.mark.slow
 def test_a_flight_with_a_stick_of_another_scale_is_named():
     rng, flights = np.random.default_rng(5), []
     for name, scale in (("one", 1.0), ("two", 1.1), ("three", 1.0)):
