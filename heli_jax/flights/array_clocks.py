@@ -12,7 +12,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
 from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
-from heli_jax.flights.row_clock import rate_cautions, rate_of
+from heli_jax.flights.row_clock import contradicted_rate
 from heli_jax.flights.table import Table, listed, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
@@ -48,11 +48,11 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     topics = tuple(_topic(table, arrays, c, seconds[c], names) for c, names in of_clock.items())
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
+    steps = [float(np.median(np.diff(t.times))) for t in topics]
     cautions = [
         caution
-        for t in topics
-        for rate in [1.0 / float(np.median(np.diff(t.times)))]
-        for caution in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
+        for t, step in zip(topics, steps, strict=True)
+        for caution in contradicted_rate(table, t.clock, 1.0 / step)
     ]
     return ChannelLog(
         table.path,
@@ -63,27 +63,6 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
         notes=notes,
         cautions=tuple(cautions),
     )
-
-
-def _stated(
-    clock: str, clocks: Sequence[_Clock], arrays: Mapping[str, np.ndarray]
-) -> dict[float, str]:
-    """What states the rate of a clock, by rate [Hz]: a number in its group, called as it is."""
-    own = next(c for c in clocks if c.name == clock)
-    beside = {c.stem for c in clocks if c.group == own.group}
-    stated = {}
-    for name, values in arrays.items():
-        *group, leaf = _LEVEL.split(name)
-        words = words_in(leaf)
-        # p_fs beside p_t, and fs beside t where that is alone.
-        rest = tuple(w for w in own.stem if w in words)
-        if tuple(group) != own.group or (rest != own.stem and len(beside) > 1):
-            continue
-        plain = "_".join(w for w in words if w not in own.stem)
-        rate = rate_of(plain, values.astype(np.float64))
-        if rate is not None:
-            stated[rate] = f"{shown(name)} = {values.ravel()[0]:g}"
-    return stated
 
 
 def clock_notes(table: Table) -> tuple[Finding, ...]:

@@ -21,9 +21,7 @@ from heli_jax import import_path
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import mat_file, packed, stacked
-from heli_jax.flights.mat_labels import labelled
-from heli_jax.flights.mat_references import References
-from heli_jax.flights.named_columns import NamedColumns, as_lists
+from heli_jax.flights.array_names import NamedColumns, as_lists, labelled
 from heli_jax.flights.stacked import unstacked
 from heli_jax.flights.table import (
     Budget,
@@ -130,30 +128,21 @@ def open_mat(path: Path) -> ArrayTable:
     # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
+    sets = DataSets(Budget(str(path), len(data)))
     try:
-        read = mat_file.read_mat(data, Budget(str(path), len(data)))
-        whole, units = labelled(read.arrays, read.texts)
+        read = mat_file.read_mat(data, sets.budget)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
-    notes: tuple[Finding, ...] = ()
     if read.objects:
-        _require_arrays(path, whole, read.objects)
+        _require_arrays(path, read.arrays, read.objects)
         each = listed(f"{shown(n)} ({kind})" for n, kind in read.objects.items())
-        notes = (note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects),)
-    real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
-    named = NamedColumns(real, as_lists(read.texts))
-    arrays, of_parts = {}, {}
-    for name, array in real.items():
-        for i, (part, vector) in enumerate(_vectors(name, array)):
-            called = named.name(name, i) or part
-            arrays[called] = vector
-            of_parts[called] = named.unit(name, i) or units.get(name, "")
-    notes = (*notes, *of_stacks)
-    if complex_ones := [n for n, array in whole.items() if array.dtype.kind == "c"]:
-        words = "complex numbers, of which the real part is read: "
-        words += listed(map(shown, complex_ones))
-        notes = (*notes, note("channels.complex", words, *complex_ones))
-    return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
+        sets.note(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects))
+    for name, array in read.arrays.items():
+        sets.add(name, array, {})
+    sets.labels |= read.texts
+    for name, texts in as_lists(read.texts).items():
+        sets.add_texts(name, texts)
+    return sets.table(str(path), "mat", data)
 
 
 _WAYS = {
@@ -228,13 +217,15 @@ class DataSets:
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
+        self.labels: dict[str, str] = {}
+        """texts by path"""
         self._stored: dict[str, np.ndarray] = {}
+        self._complex: list[str] = []
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._notes: list[Finding] = []
-        self.references = References()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -248,6 +239,9 @@ class DataSets:
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
         self.budget.take_numbers(stored.size, stored.nbytes)
+        if stored.dtype.kind == "c":
+            self._complex.append(name)
+            stored = np.real(stored)
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
             values, missing = packed.unpack(stored, packing)
@@ -275,13 +269,14 @@ class DataSets:
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
-        notes = packed.notes_of(self._missing, self._left_out)
-        paths = {name: self.references.path(name) for name in self._stored}
-        whole = labelled(
-            {paths[name]: values for name, values in self._stored.items()}, self.references.texts
-        )
-        stated = {paths[name]: unit for name, unit in self._units.items()} | whole.units
-        flat, of_stacks = unstacked(whole.arrays)
+        notes = [*packed.notes_of(self._missing, self._left_out), *self._notes]
+        if self._complex:
+            words = "complex numbers, of which the real part is read: "
+            words += listed(map(shown, self._complex))
+            notes.append(note("channels.complex", words, *self._complex))
+        whole, units_beside = labelled(self._stored, self.labels)
+        stated = self._units | units_beside
+        flat, of_stacks = unstacked(whole)
         named = NamedColumns(flat, self._texts)
         arrays, units = {}, {}
         for name, values in flat.items():
@@ -289,7 +284,7 @@ class DataSets:
                 called = named.name(name, i) or part
                 arrays[called] = vector
                 units[called] = named.unit(name, i) or stated.get(name, "")
-        return arrays, units, (*notes, *self._notes, *of_stacks)
+        return arrays, units, (*notes, *of_stacks)
 
 
 def open_hdf5(path: Path) -> ArrayTable:

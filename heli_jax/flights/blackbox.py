@@ -14,16 +14,16 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
-from heli_jax.flights.blackbox_columns import narrowed
-from heli_jax.flights.blackbox_frames import Frames, find_frames
-from heli_jax.flights.blackbox_header import (
+from heli_jax.flights.blackbox_fields import (
     HOME,
     LAST_TIME,
     MARK,
     FrameLayout,
     Header,
+    narrowed,
     read_header,
 )
+from heli_jax.flights.blackbox_frames import Frames, find_frames
 from heli_jax.flights.blackbox_main import MainFrames, main_frames, other_frames
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.table import wrong

@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Sequence
+from pathlib import PurePath
 
 import numpy as np
 
 from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.px4_commands import are_commands
+from heli_jax.flights.log import holds_commands
 from heli_jax.flights.runs import restarts
 from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import LETTERS, likely_unit, split_unit, time_unit
@@ -110,7 +111,7 @@ def arrival_notes(table: Table, clock: str) -> tuple[Finding, ...]:
     """
     if not _is_of_sample(clock):
         sampled = clock + "_sample"
-        if sampled not in table.names or not are_commands(table.path, sampled, table.names):
+        if sampled not in table.names or not _are_commands(table, sampled):
             return ()
         why = "commands act from when they are published"
         beside = f"{shown(sampled)} is of the gyro's sample they answer"
@@ -132,7 +133,14 @@ def _says_when_sampled(table: Table, name: str) -> bool:
         return True
     # `convert` has put the clock of the topic beside what it copied. And a command acts from when
     # it was published, 0.4 to 3 ms behind the gyro's sample: as in a ULog itself.
-    return "time" not in table.names and not are_commands(table.path, name, table.names)
+    return "time" not in table.names and not _are_commands(table, name)
+
+
+def _are_commands(table: Table, stamps: str) -> bool:
+    """True where a column of times is that of commands of PX4, by the topic before it
+    (`/actuator_motors/timestamp`) or by the name of the file, as ulog2csv gives it."""
+    topic = re.split(r"[./]", stamps)[:-1]
+    return holds_commands(topic[-1] if any(topic) else PurePath(table.path).name)
 
 
 def _is_of_sample(name: str) -> bool:

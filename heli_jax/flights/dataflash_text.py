@@ -3,12 +3,12 @@
 The oldest have no TimeUS: their rows have only an order, which `info` shows and no fit can use.
 """
 
+import io
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.csv_text import lines_of
 from heli_jax.flights.dataflash import FIELDS, Format, Part, make_log
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import wrong
@@ -39,8 +39,8 @@ def open_dataflash_text(path: Path) -> ChannelLog:
     damaged = 0
     # Bytes that are no UTF-8 cost the line that they are in and not the log: a message may hold
     # damage.
-    for at, line in enumerate(lines_of(data.decode("utf-8", "replace").replace("\r", ""))):
-        name, _, rest = line.partition(",")
+    for at, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace")):
+        name, _, rest = line.rstrip("\n").partition(",")
         name = name.strip()
         if name == "FMT":
             taken = _format(rest)

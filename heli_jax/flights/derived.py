@@ -260,8 +260,6 @@ class DerivedTable:
         plain = [name for name in names if name not in derived]
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
-        # A table says more of its cells once they were read.
-        self.notes = self.table.notes
         for name, d in derived.items():
             needed = {n: columns[n] for group in d.groups for n in group}
             rows = {n: (np.arange(x.size), x) for n, x in needed.items()}

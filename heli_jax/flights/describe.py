@@ -340,9 +340,7 @@ def _with_runs(
     if not starts.size:
         return table, surveys, starts
     parted = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
-    apart = parted.numbers([signal.name])[signal.name]
-    changed = [replace(s, values=apart) if s.name == signal.name else s for s in surveys]
-    return parted, changed, starts
+    return parted, parted.survey(), starts
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:

@@ -156,9 +156,9 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
     filled = [x for x in values if x is not None]
     if filled and all(isinstance(x, str) for x in filled):
         if is_date(filled[0]):
-            dates = seconds_of_dates(values, None)
-            if not isinstance(dates, int):
-                sets.add(name, dates.seconds, {"units": "s"})
+            seconds = seconds_of_dates(values)
+            if not isinstance(seconds, int):
+                sets.add(name, seconds, {"units": "s"})
                 return
         if len(values) <= _MOST_TEXTS:
             sets.add_texts(name, values)

@@ -7,7 +7,7 @@ from pathlib import Path
 from heli_jax.flights import (
     array_table,
     arrow_table,
-    blackbox_header,
+    blackbox_fields,
     dataflash,
     dataflash_text,
     foreign_files,
@@ -17,18 +17,16 @@ from heli_jax.flights import (
     ulog,
 )
 from heli_jax.flights.blackbox import open_blackbox
-from heli_jax.flights.csv_table import open_csv
-from heli_jax.flights.gzipped import inner_ending, is_gzipped
+from heli_jax.flights.csv_table import inner_ending, is_gzipped, open_csv
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, require_short_names, shown, wrong
-from heli_jax.flights.table_view import with_joined_clock
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
-_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
+_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_fields.MARK)
 """what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
@@ -121,10 +119,7 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
     for log in opened if isinstance(opened, tuple) else (opened,):
         require_short_names(log.path, log.names)
-    # Arrays may have lengths of their own, of which no row is made.
-    if isinstance(opened, tuple | array_table.ArrayTable):
-        return opened
-    return with_joined_clock(opened)
+    return opened
 
 
 _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
@@ -180,7 +175,7 @@ def _by_content(head: bytes) -> _Reader | None:
         return _one(dataflash.open_dataflash)
     # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
     # mind what stands before the first.
-    if blackbox_header.MARK in head:
+    if blackbox_fields.MARK in head:
         return open_blackbox
     if head.startswith(b"PAR1"):
         return open_parquet

@@ -80,17 +80,14 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     if request.time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
-    file = table.table if isinstance(table, DerivedTable) else table
+    file = _below(table)
     of_stack = isinstance(file, ArrayTable) and NUMBER in file.names
     if of_stack and request.time.name == ROWS and not request.options.runs:
         problem = f"its rows are of several runs, which {NUMBER!r} numbers"
         remedy = f"expected time: {{rate: HZ, runs: {NUMBER}}}, which makes a flight of each"
         raise wrong(table.path, f"{problem}; {remedy}")
-    if isinstance(table, DerivedTable):
-        if request.time.name == ROWS:
-            table = DerivedTable(counted(table.table, request.time), table.swashplate)
-    else:
-        table = counted(table, request.time)
+    if request.time.name == ROWS:
+        table = _over(table, counted(file))
     numbers = table.numbers(request.columns)
     if request.options.split:
         table, numbers = _with_runs(table, request, numbers)
@@ -99,10 +96,7 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
         return joined
     rows = first_of_copies(numbers[request.time.name], list(numbers.values()))
     if rows is not None:
-        if isinstance(table, DerivedTable):
-            table = DerivedTable(seen_once(table.table, rows), table.swashplate)
-        else:
-            table = seen_once(table, rows)
+        table = _over(table, seen_once(_below(table), rows))
         numbers = table.numbers(request.columns)
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
@@ -113,12 +107,21 @@ def _with_runs(
     """The table with its runs one after another, and its columns (N,)."""
     assert request.time is not None  # or `load_table` would have refused it
     clock, runs = request.time, request.options.runs
-    inner = table.table if isinstance(table, DerivedTable) else table
-    parted = with_runs(inner, clock.name, numbers, clock_scale(table, clock), runs)
-    if parted is inner:
+    parted = with_runs(_below(table), clock.name, numbers, clock_scale(table, clock), runs)
+    if parted is _below(table):
         return table, numbers
-    whole = DerivedTable(parted, table.swashplate) if isinstance(table, DerivedTable) else parted
+    whole = _over(table, parted)
     return whole, whole.numbers(request.columns)
+
+
+def _below(table: Table) -> Table:
+    """The file's own columns."""
+    return table.table if isinstance(table, DerivedTable) else table
+
+
+def _over(table: Table, other: Table) -> Table:
+    """Another view of the file's columns with those derived that a table has."""
+    return DerivedTable(other, table.swashplate) if isinstance(table, DerivedTable) else other
 
 
 def table_window_note(loaded: LoadedTable, request: Request) -> tuple[Finding, ...]:

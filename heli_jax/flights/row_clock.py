@@ -11,6 +11,7 @@ from heli_jax.finding import Finding
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.table_view import TableView
 
 ROWS = "row number"
 """what the numbers of rows are called, from 0, as a column"""
@@ -34,54 +35,13 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
-class CountedTable:
-    """A `Table` of which the numbers of the rows can be asked for as a column."""
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-        self.path, self.format, self.size = table.path, table.format, table.size
-        self.names = (*table.names, ROWS)
-        self.notes, self.units = table.notes, table.units
-
-    @property
-    def sha256(self) -> str:
-        """Of the file."""
-        return self.table.sha256
-
-    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), the numbers of the rows from 0."""
-        own = [n for n in names if n != ROWS] or list(self.table.names[:1])
-        columns = self.table.numbers(own)
-        # A table says more of its cells once they were read.
-        self.notes = self.table.notes
-        columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
-        return {n: columns[n] for n in names}
-
-    def survey(self) -> list[Survey]:
-        """Every column of the file."""
-        return self.table.survey()
-
-    def place(self, row: int) -> str:
-        """Where a row stands."""
-        return self.table.place(row)
-
-    def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
-        return str(row) if name == ROWS else self.table.cell_text(name, row)
-
-    def time_unit(self, name: str) -> str | None:
-        """The unit of a column of time stamps."""
-        return None if name == ROWS else self.table.time_unit(name)
-
-
-def counted(table: Table, time: Signal | None) -> Table:
-    """A table with its rows' numbers, where they are the clock.
+def counted(table: Table) -> Table:
+    """A table of which the numbers of the rows can be asked for as a column, `ROWS`.
 
     Args:
         table: of rows.
-        time: the clock that is asked for.
     """
-    return table if time is None or time.name != ROWS else CountedTable(table)
+    return TableView(table, columns={ROWS: None})
 
 
 def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:

@@ -12,7 +12,8 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
-from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.table import Survey, Table, listed, shown
+from heli_jax.flights.table_view import TableView
 
 _BETWEEN = 10.0
 """s, which no gap that is bridged is long"""
@@ -24,50 +25,6 @@ _NAMES = {
     *("run", "runs", "segment", "seg", "maneuver", "manoeuvre", "experiment", "exp", "trial"),
     *("test", "record", "repetition", "rep", "case", "leg"),
 }
-
-
-class RunsTable:
-    """A `Table` whose runs follow one another."""
-
-    def __init__(self, table: Table, clock: str, stamps: np.ndarray, note: Finding) -> None:
-        """
-        Args:
-            table: of all runs.
-            clock: the column of times.
-            stamps: what stands there in place of the file's (N,).
-            note: of the runs.
-        """
-        self.table, self._clock, self._stamps, self._note = table, clock, stamps, note
-        self.path, self.format, self.size = table.path, table.format, table.size
-        self.names, self.units = table.names, table.units
-        self.notes = (*table.notes, note)
-
-    @property
-    def sha256(self) -> str:
-        """Of the file."""
-        return self.table.sha256
-
-    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), the times those of runs that follow one another."""
-        columns = self.table.numbers(names)
-        self.notes = (*self.table.notes, self._note)
-        return columns | ({self._clock: self._stamps} if self._clock in names else {})
-
-    def survey(self) -> list[Survey]:
-        """Every column, in the file's order."""
-        return self.table.survey()
-
-    def place(self, row: int) -> str:
-        """Where a row stands."""
-        return self.table.place(row)
-
-    def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
-        return self.table.cell_text(name, row)
-
-    def time_unit(self, name: str) -> str | None:
-        """The unit of a column of time stamps."""
-        return self.table.time_unit(name)
 
 
 def restarts(stamps: np.ndarray) -> np.ndarray:
@@ -105,38 +62,6 @@ def changes(numbers: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(numbers) != 0) + 1
 
 
-def set_apart(stamps: np.ndarray, starts: np.ndarray, scale: float) -> np.ndarray:
-    """Stamps (N,) of runs that follow one another with some seconds between.
-
-    Args:
-        stamps: (N,)
-        starts: rows in which runs begin, but for the first (n,).
-        scale: [s] of a unit of the stamps.
-    """
-    apart = stamps.copy()
-    for start in starts:
-        apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
-    return apart
-
-
-def run_note(table: Table, starts: np.ndarray, column: str = "") -> Finding:
-    """That a table holds several runs, and where they begin.
-
-    Args:
-        table: of all runs.
-        starts: rows in which they begin, but for the first (n,).
-        column: that numbers them; empty where the time begins anew.
-    """
-    places = ", ".join(table.place(int(start)) for start in starts[:4])
-    more = f" and {starts.size - 4} more" if starts.size > 4 else ""
-    why = f"{shown(column)} is another" if column else "the time begins anew"
-    words = (
-        f"{why} in {places}{more}: {starts.size + 1} runs, put one after another with "
-        f"{_BETWEEN:g} s between"
-    )
-    return note("clock.runs", words, value=starts.size + 1)
-
-
 def clock_scale(table: Table, time: Signal) -> float:
     """Of the unit of a clock, or of its counts [s].
 
@@ -166,8 +91,17 @@ def with_runs(
     starts = changes(numbers[column]) if column else restarts(stamps)
     if not starts.size:
         return table
-    apart = set_apart(stamps, starts, scale)
-    return RunsTable(table, clock, apart, run_note(table, starts, column))
+    apart = stamps.copy()
+    for start in starts:
+        apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
+    places = listed(table.place(int(start)) for start in starts)
+    why = f"{shown(column)} is another" if column else "the time begins anew"
+    words = (
+        f"{why} in {places}: {starts.size + 1} runs, put one after another with "
+        f"{_BETWEEN:g} s between"
+    )
+    said = note("clock.runs", words, value=starts.size + 1)
+    return TableView(table, columns={clock: apart}, note=said)
 
 
 def numbering_notes(column: str) -> tuple[Finding, ...]:

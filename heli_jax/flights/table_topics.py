@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.row_clock import ROWS, CountedTable
+from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.runs import clock_scale, with_runs
 from heli_jax.flights.table import Table, listed, shown, wrong
 from heli_jax.flights.table_view import numbers_once
@@ -153,7 +153,7 @@ def _table_topic(
         table = in_runs(table, clock)
         notes += table.notes[-1:]
     if is_rows:
-        numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
+        numbers, copies = counted(table).numbers([*names, ROWS]), ()
     else:
         numbers, copies = numbers_once(table, clock.column, names)
     stamps = without_overflow(numbers.pop(clock.column))

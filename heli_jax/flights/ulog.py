@@ -14,8 +14,7 @@ import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.log import ChannelLog, Topic, require_samples
-from heli_jax.flights.px4_commands import is_command
+from heli_jax.flights.log import ChannelLog, Topic, holds_commands, require_samples
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
@@ -355,7 +354,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
 
 def _clock(name: str, rows: np.ndarray) -> str:
     names = rows.dtype.names or ()
-    if "timestamp_sample" in names and not is_command(name):
+    if "timestamp_sample" in names and not holds_commands(name):
         stamps = rows["timestamp_sample"]
         # Some modules leave the field at zero, or publish one sample twice.
         if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):

@@ -18,7 +18,7 @@ from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.row_clock import ROWS, CountedTable
+from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.flights.table_topics import in_runs, rate_note
 from heli_jax.flights.table_view import numbers_once
@@ -117,7 +117,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
     if time.said:
         notes = (rate_note(time),)
     clock = time.column
-    table = CountedTable(table) if clock == ROWS else in_runs(table, time)
+    table = counted(table) if clock == ROWS else in_runs(table, time)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]

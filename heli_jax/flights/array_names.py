@@ -1,7 +1,8 @@
-"""Names of a matrix's columns that a file has as texts beside it.
+"""Names and units of arrays that a file has as texts beside them.
 
-System identification toolboxes keep `OutputData` beside `OutputName`, ground stations `ATT` beside
-`ATT_label`, pandas `block0_values` beside `block0_items`, others a list of names beside a matrix.
+Simulink's structures with time are arrays of structures with `values` and `label`, dSPACE's have
+`Data`, `Name` and `Unit`. System identification toolboxes keep `OutputData` beside `OutputName`,
+ground stations `ATT` beside `ATT_label`, pandas `block0_values` beside `block0_items`.
 """
 
 import re
@@ -13,13 +14,55 @@ from heli_jax import units
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.time_units import time_unit
 
+_LABELS, _UNITS = ("label", "name", "signalname"), ("unit", "units")
+_INDEXED = re.compile(r"(.*)\[\d+\]")
+
+
+def labelled(
+    arrays: Mapping[str, np.ndarray], texts: Mapping[str, str]
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Arrays of structures' elements called by their labels, `out.signals.phi`, where all labels
+    differ, and the units that stand beside them.
+
+    Args:
+        arrays: by path.
+        texts: by path.
+    """
+    beside: dict[str, dict[str, str]] = {}
+    for path, text in texts.items():
+        element, _, field = path.rpartition(".")
+        beside.setdefault(element, {})[field.casefold()] = text
+    # Of an element with several arrays of samples label and unit may be those of any.
+    samples: dict[str, list[str]] = {}
+    for path, values in arrays.items():
+        if values.size > 1:
+            samples.setdefault(path.rpartition(".")[0], []).append(path)
+    names: dict[str, str] = {}
+    units: dict[str, str] = {}
+    for element, (path, *others) in samples.items():
+        said = beside.get(element, {})
+        if others or not said:
+            continue
+        if unit := next((said[u] for u in _UNITS if u in said), ""):
+            units[path] = unit
+        label = next((said[n] for n in _LABELS if n in said), "")
+        if label and (match := _INDEXED.fullmatch(element)):
+            names[path] = f"{match[1]}.{label}"
+    taken = [*names.values(), *(path for path in arrays if path not in names)]
+    names = {path: name for path, name in names.items() if taken.count(name) == 1}
+    return (
+        {names.get(path, path): values for path, values in arrays.items()},
+        {names.get(path, path): unit for path, unit in units.items()},
+    )
+
+
 _NAMES = {
     *("name", "names", "label", "labels", "columns", "column", "channel", "channels", "items"),
     *("header", "headers", "fields", "signals", "variables", "varnames", "legend", "colheaders"),
     *("ch", "component", "components", "axis", "state", "states", "output", "outputs", "input"),
     *("inputs", "sensor", "sensors", "var", "vars", "param", "params", "parameters"),
 }
-_UNITS = {"unit", "units"}
+_UNIT_WORDS = {"unit", "units"}
 _FEWEST_SHARED = 3
 """letters by which a matrix and a list of names belong together: OutputData, OutputName"""
 
@@ -95,12 +138,12 @@ def _are_names(path: str, texts: Sequence[str]) -> bool:
     if not all(texts) or len(set(texts)) < len(texts):
         return False
     words = set(words_in(_leaf(path)))
-    return not words & _UNITS and bool(words & _NAMES)
+    return not words & _UNIT_WORDS and bool(words & _NAMES)
 
 
 def _are_units(path: str, texts: Sequence[str]) -> bool:
     words = set(words_in(_leaf(path)))
-    return bool(words & _UNITS) and any(time_unit(t) or units.is_unit(t) for t in texts)
+    return bool(words & _UNIT_WORDS) and any(time_unit(t) or units.is_unit(t) for t in texts)
 
 
 def _leaf(path: str) -> str:
