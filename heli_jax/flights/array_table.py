@@ -1,4 +1,4 @@
-"""Logs of named arrays: MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5).
+"""Logs of named arrays: MATLAB (.mat), NetCDF (.nc), HDF5 (.h5, .hdf5) and NumPy (.npy, .npz).
 
 An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 """
@@ -6,11 +6,13 @@ An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` 
 import copy
 import hashlib
 import importlib.util
+import io
 import json
 import signal
 import subprocess
 import sys
 import threading
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,8 +43,10 @@ _SECONDS, _RATE = 20, 10**7
 """processor time [s] that an HDF5 file may take, and bytes for which it has a second more"""
 _PATIENCE = 10
 """times as long by the clock"""
+_MOST_ARRAYS = 1000
 _MOST_ELEMENTS = 100
 """columns of a matrix: more are data of another shape than a log's"""
+NUMPY_MAGIC = b"\x93NUMPY"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -194,8 +198,6 @@ def open_netcdf(path: Path) -> ArrayTable:
         return _from_hdf5(path, "netcdf", data)
     if not data.startswith((b"CDF\x01", b"CDF\x02")):
         raise wrong(str(path), "is no NetCDF file, expected one that begins with its mark")
-    import io
-
     import xarray
 
     def read() -> DataSets:
@@ -210,6 +212,75 @@ def open_netcdf(path: Path) -> ArrayTable:
             return read
 
     return guarded(path, "NetCDF file", read).table(str(path), "netcdf", data)
+
+
+def open_numpy(path: Path) -> ArrayTable:
+    """A file of NumPy: one array (.npy), or several by name (.npz).
+
+    Without pickle, which would run what a file says: arrays of Python's objects are passed over.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    where = str(path)
+    data = read_regular(path, "a file of NumPy", _LARGEST)
+    sets, objects = DataSets(Budget(where, len(data))), []
+
+    def read() -> None:
+        for name, content in _arrays(data, sets.budget):
+            file = io.BytesIO(content)
+            version = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+            shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
+            if dtype.hasobject:
+                objects.append(name)
+            # What is claimed beyond the bytes that there are would be allocated.
+            elif np.prod(shape, dtype=object) * dtype.itemsize > len(content) or not dtype.itemsize:
+                raise ValueError("cut off")
+            else:
+                _add(sets, name, np.load(io.BytesIO(content), allow_pickle=False))
+
+    guarded(path, "file of NumPy", read)
+    if objects:
+        words = f"objects of Python, which are not read: {listed(map(shown, objects))}"
+        if not sets.names:
+            problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
+            raise wrong(where, problem)
+        sets.note(note(LEFT_OUT, words, *objects))
+    return sets.table(where, "numpy", data)
+
+
+def _arrays(data: bytes, budget: Budget) -> Iterator[tuple[str, bytes]]:
+    """The arrays of a file by name, each as a .npy file has it."""
+    if data.startswith(NUMPY_MAGIC):
+        yield "data", data
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()[:_MOST_ARRAYS]
+        budget.take(sum(m.file_size for m in members))
+        for member in members:
+            if member.filename.endswith(".npy"):
+                yield member.filename.removesuffix(".npy"), archive.read(member)
+
+
+def _add(sets: "DataSets", name: str, array: np.ndarray) -> None:
+    kind = array.dtype.kind
+    if array.dtype.names is not None:
+        for field in array.dtype.names:
+            _add(sets, f"{name}.{field}" if name != "data" else field, array[field])
+    elif kind in "US" and 0 < array.size <= _MOST_ELEMENTS:
+        sets.add_texts(name, [str(x)[:1000] for x in array.astype(str).ravel()])
+    elif kind in "mM":
+        unit, count = np.datetime_data(array.dtype)
+        if unit in ("s", "ms", "us", "ns") and count == 1:
+            ticks = array.astype(np.int64).astype(np.float64)
+            sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
+    elif holds_numbers(array.dtype, array.ndim):
+        # In the machine's own order of bytes.
+        sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
+    else:
+        sets.leave_out(name, array.dtype, array.shape)
 
 
 class DataSets:
@@ -269,7 +340,15 @@ class DataSets:
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
-        notes = [*packed.notes_of(self._missing, self._left_out), *self._notes]
+        notes = list(self._notes)
+        if self._missing:
+            each = listed(f"{shown(name)} ({n})" for name, n in self._missing.items())
+            words = f"the file's marks for no value are taken as missing samples: {each}"
+            total = sum(self._missing.values())
+            notes.append(note("samples.marks", words, *self._missing, value=total))
+        if self._left_out:
+            words = listed(f"{shown(n)}, {why}" for n, why in self._left_out.items())
+            notes.append(note(LEFT_OUT, f"left out: {words}", *self._left_out))
         if self._complex:
             words = "complex numbers, of which the real part is read: "
             words += listed(map(shown, self._complex))

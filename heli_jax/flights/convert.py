@@ -198,9 +198,8 @@ def _clocks(
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
         # All channels of a topic share its stamps, so any one of them tells the clock.
         times, _ = log.channel(next(iter(topic.columns)))
-        elapsed = times - log.first_time
         try:
-            clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, window)
+            clocks[topic.name] = topic_clock(log, topic.name, times, window)
         except InputError as e:
             # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
             # there is.

@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import arrival_notes, counter_notes
+from heli_jax.flights.clock_guess import arrival_notes, counter_notes, table_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -37,7 +37,6 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.table_clock import table_clock
 from heli_jax.flights.table_view import without_copies
 from heli_jax.flights.time_units import SECONDS
 

@@ -6,20 +6,16 @@ from pathlib import Path
 
 from heli_jax.flights import (
     array_table,
-    arrow_table,
     blackbox_fields,
     dataflash,
-    dataflash_text,
-    foreign_files,
     json_log,
-    numpy_file,
+    parquet_table,
     progress,
     ulog,
 )
 from heli_jax.flights.blackbox import open_blackbox
 from heli_jax.flights.csv_table import inner_ending, is_gzipped, open_csv
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, require_short_names, shown, wrong
 from heli_jax.regular_file import open_regular, require_regular
 
@@ -129,11 +125,11 @@ def _reader(path: Path) -> _Reader:
     ending = path.suffix.lower()
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
-    foreign_files.refuse(path, head)
+    _refuse_foreign(path, head)
     # By the ending first where it says enough, so that a damaged Parquet file is called so and not
     # read as text.
     if ending == ".parquet":
-        return open_parquet
+        return parquet_table.open_parquet
     if is_gzipped(path):
         if inner_ending(path) not in _TEXTS:
             problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
@@ -159,8 +155,8 @@ def _reader(path: Path) -> _Reader:
         ".bbl": open_blackbox,
         ".bfl": open_blackbox,
     }
-    by_ending |= dict.fromkeys((".npy", ".npz"), numpy_file.open_numpy)
-    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), arrow_table.open_arrow)
+    by_ending |= dict.fromkeys((".npy", ".npz"), array_table.open_numpy)
+    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), parquet_table.open_arrow)
     by_ending |= dict.fromkeys((".json", ".jsonl", ".ndjson"), json_log.open_json)
     if ending not in by_ending:
         raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
@@ -178,26 +174,102 @@ def _by_content(head: bytes) -> _Reader | None:
     if blackbox_fields.MARK in head:
         return open_blackbox
     if head.startswith(b"PAR1"):
-        return open_parquet
+        return parquet_table.open_parquet
     if head.startswith(b"MATLAB "):
         return array_table.open_mat
     if head.startswith((b"CDF\x01", b"CDF\x02")):
         return array_table.open_netcdf
     if head.startswith(array_table.HDF5_MAGIC):
         return array_table.open_hdf5
-    if head.startswith(numpy_file.MAGIC):
-        return numpy_file.open_numpy
-    if head.startswith(arrow_table.MARK):
-        return arrow_table.open_arrow
-    if dataflash_text.is_dataflash_text(head):
-        return _one(dataflash_text.open_dataflash_text)
+    if head.startswith(array_table.NUMPY_MAGIC):
+        return array_table.open_numpy
+    if head.startswith(parquet_table.ARROW_MARK):
+        return parquet_table.open_arrow
+    if dataflash.is_dataflash_text(head):
+        return _one(dataflash.open_dataflash_text)
     return None
 
 
 def _is_exported(head: bytes) -> bool:
     """Whether a text begins with the formats of a DataFlash log, as no table does."""
-    return head.lstrip().startswith(b"FMT,") and dataflash_text.is_dataflash_text(head)
+    return head.lstrip().startswith(b"FMT,") and dataflash.is_dataflash_text(head)
 
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
     return lambda path: (reader(path),)
+
+
+# Files that hold flights and are not read: what each is, and what to make of it instead.
+
+_SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
+_ROS = "is a bag of ROS"
+_TOPICS = "export its topics to CSV (PlotJuggler does)"
+_ARCHIVE = "is an archive; unpack it and name the log in it"
+_TELEMETRY = (
+    "is telemetry of MAVLink, thinned out on its way to the ground; take the autopilot's own log "
+    "(.bin, .ulg), or export messages: mavlogdump.py --format csv --types ATTITUDE FILE"
+)
+_BY_ENDING = {
+    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods", ".numbers"), _SHEET),
+    ".bag": f"{_ROS} 1; {_TOPICS}",
+    ".mcap": f"is a recording in MCAP, as ROS 2 makes them; {_TOPICS}",
+    ".db3": f"{_ROS} 2; {_TOPICS}",
+    ".tlog": _TELEMETRY,
+    ".rlog": _TELEMETRY,
+    **dict.fromkeys(
+        (".pkl", ".pickle", ".joblib"),
+        "is a pickle of Python, which may run anything; save a table, frame.to_parquet(FILE), or "
+        "arrays, numpy.savez(FILE, t=t, p=p)",
+    ),
+    **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".xz", ".bz2", ".zst"), _ARCHIVE),
+    **dict.fromkeys(
+        (".mf4", ".mdf"), "is a measurement in MDF; export it to CSV, or to MATLAB by asammdf"
+    ),
+    ".tdms": "is a measurement of LabVIEW in TDMS; export it to CSV (nptdms does)",
+    ".c3d": "is a motion capture in C3D; export it to CSV",
+    ".slx": "is a model of Simulink; save the signals that it logged as .mat",
+    ".fig": "is a figure of MATLAB; save the numbers in it as .mat",
+    ".kml": "is a track for a map, without attitudes; take the log that it was made from",
+    ".gpx": "is a track for a map, without attitudes; take the log that it was made from",
+    ".pdf": "is a document; expected the numbers as a table in text",
+}
+_BY_MARK = (
+    (b"\x89MCAP0\r\n", _BY_ENDING[".mcap"]),
+    (b"#ROSBAG V", _BY_ENDING[".bag"]),
+    (b"SQLite format 3\0", _BY_ENDING[".db3"]),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", _SHEET),
+    (
+        b"version https://git-lfs.github.com/spec/",
+        "is a pointer of Git LFS that stands for the log; git lfs pull fetches the log itself",
+    ),
+    (
+        b"/annex/objects/",
+        "is a pointer of git-annex that stands for the log; git annex get fetches the log itself",
+    ),
+    (b"FEA1", "is of the first version of Feather; write it anew, frame.to_feather(FILE)"),
+    (b"TDSm", _BY_ENDING[".tdms"]),
+    (b"MDF     ", _BY_ENDING[".mf4"]),
+    (b"%PDF-", _BY_ENDING[".pdf"]),
+)
+_ZIP = b"PK\x03\x04"
+
+
+def _refuse_foreign(path: Path, head: bytes) -> None:
+    """Refuse a file that is known not to be read, by its first bytes or by its ending.
+
+    Args:
+        path: of the file.
+        head: its first bytes.
+
+    Raises:
+        InputError: with what to make of it.
+    """
+    ending = path.suffix.lower()
+    words = next((words for mark, words in _BY_MARK if head.startswith(mark)), None)
+    if words is None and head.startswith(_ZIP) and ending != ".npz":
+        # Spreadsheets are archives inside.
+        is_sheet = b"xl/" in head or b"[Content_Types].xml" in head or b"spreadsheet" in head
+        words = _SHEET if is_sheet else _ARCHIVE
+    words = words or _BY_ENDING.get(ending)
+    if words is not None:
+        raise wrong(str(path), words)

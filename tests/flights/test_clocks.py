@@ -5,9 +5,8 @@ import pytest
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
-from heli_jax.flights.clock_steps import step_notes
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.resample import new_clock
+from heli_jax.flights.resample import new_clock, step_notes
 from heli_jax.flights.time_units import likely_unit, split_unit, time_unit
 
 N, DT = 300, 0.01
