@@ -31,9 +31,6 @@ class _Clock(NamedTuple):
 def by_clocks(table: ArrayTable) -> ChannelLog | None:
     """Arrays as topics, each with the times of its group or of the nearest above that has some of
     its length; None where all have one clock.
-
-    Args:
-        table: of arrays.
     """
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
     clocks = [c for name, x in arrays.items() if (c := _clock(name, x)) is not None]
@@ -66,11 +63,7 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
 
 
 def clock_notes(table: Table) -> tuple[Finding, ...]:
-    """That arrays have clocks of their own, where they have.
-
-    Args:
-        table: of rows or arrays.
-    """
+    """That arrays have clocks of their own, where they have."""
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()

@@ -23,10 +23,6 @@ def labelled(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Arrays of structures' elements called by their labels, `out.signals.phi`, where all labels
     differ, and the units that stand beside them.
-
-    Args:
-        arrays: by path.
-        texts: by path.
     """
     beside: dict[str, dict[str, str]] = {}
     for path, text in texts.items():
@@ -155,11 +151,7 @@ def _group(path: str) -> str:
 
 
 def as_lists(texts: Mapping[str, str]) -> dict[str, list[str]]:
-    """Texts by path, `names[0]` and so on, as lists; a single one is a list too.
-
-    Args:
-        texts: by path.
-    """
+    """Texts by path, `names[0]` and so on, as lists; a single one is a list too."""
     lists: dict[str, list[str]] = {}
     for path, text in texts.items():
         match = re.fullmatch(r"(.*)\[\d+\]", path)

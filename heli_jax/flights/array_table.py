@@ -3,7 +3,6 @@
 An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 """
 
-import copy
 import hashlib
 import importlib.util
 import io
@@ -70,18 +69,6 @@ class ArrayTable:
         if not arrays:
             raise wrong(path, "holds no rows of numbers, expected a log")
         require_few_columns(path, len(arrays))
-
-    def lengths(self) -> dict[int, tuple[str, ...]]:
-        """The arrays' names by their number of samples, the longest first."""
-        sizes = sorted({x.size for x in self._arrays.values()}, reverse=True)
-        return {size: tuple(n for n, x in self._arrays.items() if x.size == size) for size in sizes}
-
-    def only(self, names: Sequence[str]) -> "ArrayTable":
-        """The same file with some of its arrays."""
-        part = copy.copy(self)
-        part.names = tuple(names)
-        part._arrays = {name: self._arrays[name] for name in names}
-        return part
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The arrays as float64 (N,).

@@ -256,7 +256,7 @@ MARK = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
 """with which every flight of a file begins"""
 
 PREVIOUS, STRAIGHT_LINE, AVERAGE, MIN_THROTTLE, MOTOR_0, INCREMENT = 1, 2, 3, 4, 5, 6
-HOME, FIFTEEN_HUNDRED, VBAT_REFERENCE, LAST_TIME, MIN_MOTOR = 7, 8, 9, 10, 11
+FIFTEEN_HUNDRED, VBAT_REFERENCE, MIN_MOTOR = 8, 9, 11
 _LAST_PREDICTOR = MIN_MOTOR
 _MOST_FIELDS = 256
 """of a frame: ten times what firmware writes in its largest"""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.flights import blackbox_fields as header
-from heli_jax.flights.blackbox_fields import FrameLayout, Header, narrowed
+from heli_jax.flights.blackbox_fields import Header, narrowed
 from heli_jax.flights.blackbox_frames import Frames
 
 _LONGEST_JUMP = 10_000_000
@@ -44,12 +44,7 @@ class MainFrames:
 
 
 def main_frames(frames: Frames, head: Header) -> MainFrames:
-    """The frames I and P with predictions added, in the order of the file.
-
-    Args:
-        frames: what was found.
-        head: the flight's header.
-    """
+    """The frames I and P with predictions added, in the order of the file."""
     # The finder keeps each kind apart. A difference needs the frame that stood before it in the
     # file, so the two kinds are merged by their positions.
     intra, inter = frames.starts["I"], frames.starts["P"]
@@ -160,41 +155,6 @@ def _inside(runs: Runs, count: int) -> np.ndarray:
 
 def _goes_on(before: int, stamp: int) -> bool:
     return ((stamp - before) & 0xFFFFFFFF) < _LONGEST_JUMP
-
-
-def other_frames(
-    frames: Frames, letter: str, head: Header, main: MainFrames, home: np.ndarray | None
-) -> np.ndarray:
-    """Frames S, G or H (M, F) int64: settings that change, positions, and where home is.
-
-    Args:
-        frames: what was found.
-        letter: the kind.
-        head: the flight's header.
-        main: the frames of the control loop, of which the last one's time may be a prediction.
-        home: by G frame, the home position (M, 2) in the log's unit; None where it has none.
-    """
-    layout, values = head.layouts[letter], frames.rows[letter].astype(np.int64)
-    coordinate = 0
-    last = np.searchsorted(main.starts, frames.starts[letter]) - 1
-    for column, predictor in enumerate(layout.predictors):
-        if predictor == header.HOME:
-            if home is not None:
-                values[:, column] += home[:, min(coordinate, 1)]
-            coordinate += 1
-        # The time is a difference from the last main frame in the file, which is why those are
-        # computed before all others.
-        elif predictor == header.LAST_TIME and main.times.size:
-            values[:, column] += main.times[np.maximum(last, 0)]
-        else:
-            values[:, column] += constant(predictor, head)
-    return _wrapped(values, layout)
-
-
-def _wrapped(values: np.ndarray, layout: FrameLayout) -> np.ndarray:
-    """As numbers of 32 bits, with a sign or without."""
-    half = np.where(layout.signed, 1 << 31, 0)
-    return ((values + half) & 0xFFFFFFFF) - half
 
 
 def constant(predictor: int, head: Header) -> int:

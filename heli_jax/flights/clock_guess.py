@@ -1,5 +1,7 @@
-"""Which column of a table is its clock, where nobody says so."""
+"""The clock of a table: as a user states it, as the file does, or as its columns look; and what is
+wrong with its times, in words."""
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import PurePath
@@ -11,6 +13,7 @@ from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.grid import not_increasing, shared_stamps
 from heli_jax.flights.log import holds_commands
 from heli_jax.flights.row_clock import by_rate, stated_rate
 from heli_jax.flights.runs import restarts
@@ -106,12 +109,7 @@ def is_called_time(name: str) -> bool:
 
 
 def arrival_notes(table: Table, clock: str) -> tuple[Finding, ...]:
-    """Which of two clocks was taken, and why, where one is that of a message's arrival.
-
-    Args:
-        table: of rows.
-        clock: the column that is taken.
-    """
+    """Which of two clocks was taken, and why, where one is that of a message's arrival."""
     if not _is_of_sample(clock):
         sampled = clock + "_sample"
         if sampled not in table.names or not _are_commands(table, sampled):
@@ -165,11 +163,7 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
 
 
 def counter_of(surveys: Sequence[Survey]) -> str | None:
-    """The column that counts rows or frames, some of which may be lost; None without one.
-
-    Args:
-        surveys: of a table's columns.
-    """
+    """The column that counts rows or frames, some of which may be lost; None without one."""
     with_numbers = [(s.name, s.values) for s in surveys if s.values is not None]
     return next((n for n, x in with_numbers if _increases(x) and _is_counter(n, x)), None)
 
@@ -274,3 +268,40 @@ def asked_time(table: Table, surveys: Sequence[Survey], time: str | Signal) -> S
         except ValueError as e:
             raise wrong(table.path, str(e), column(signal.name)) from e
     return signal
+
+
+def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
+    """A note where the file, or the name of its clock, says another unit than the configuration."""
+    named = split_unit(time.name)[1]
+    factor = units.factor(time.unit, "s")
+    if stated and not math.isclose(units.factor(stated, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
+        return (note("units.contradicted", f"{words}, and not in {time.unit}"),)
+    if not stated and named and not math.isclose(units.factor(named, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
+        words += f": if that is right, state unit: {named} beside it"
+        return (note("units.contradicted", words),)
+    return ()
+
+
+def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
+    """Refuse a clock of which a stamp is not later than the one before it."""
+    back = not_increasing(stamps)
+    if back is None:
+        return
+    row, fault = back
+    after, now = table.cell_text(name, row - 1), table.cell_text(name, row)
+    problem = f"the time {fault}, got {now} after {after}, expected increasing times"
+    words = f"{problem}; {_remedy(table, stamps, row)}"
+    raise wrong(table.path, words, table.place(row), column(name))
+
+
+def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
+    """What to do about a stamp that is not later than the one before it, in words."""
+    # Where the one before is left out the times go on: it is the wrong one.
+    if row > 1 and stamps[row - 2] < stamps[row] and stamps[row] < stamps[row - 1]:
+        return f"{table.place(row - 1)} is out of order with those around it: leave it out"
+    if (starts := restarts(stamps)).size:
+        runs = f"{starts.size + 1} runs in one file"
+        return f"there are {runs}: gaps: split beside log: makes a flight of each"
+    return shared_stamps(stamps) or "sort the rows by time, or leave out those that go back"

@@ -334,11 +334,7 @@ def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
 
 
 def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
-    """The units in a row beside the names, brackets taken off; empty where it is no such row.
-
-    Args:
-        cells: of the row, one for each column.
-    """
+    """The units in a row beside the names, brackets taken off; empty where it is no such row."""
     bare = [re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip().strip('"')).strip() for cell in cells]
     # A row of marks for nothing says nothing of units.
     words = [word for word in bare if word not in ("", "-", "1", "--", *MISSING)]

@@ -140,9 +140,6 @@ _ATTRIBUTES = ("columns", "names", "labels", "channels", "column_names", "channe
 def content(item: Any) -> np.ndarray:
     """All of a data set. Nothing else here reads one.
 
-    Args:
-        item: a data set of h5py.
-
     Raises:
         InputError: it is kept in another file, any of which a log could name.
     """
@@ -153,11 +150,7 @@ def content(item: Any) -> np.ndarray:
 
 
 def list_of(item: Any) -> Sequence[Any] | None:
-    """The texts of a data set that is a list of them; None of any other.
-
-    Args:
-        item: a data set of h5py.
-    """
+    """The texts of a data set that is a list of them; None of any other."""
     if not 0 < (item.size or 0) <= _MOST_TEXTS:
         return None
     if item.dtype.kind == "S" and item.dtype.itemsize <= _LONGEST:
@@ -226,12 +219,7 @@ class References:
 
     # Any: h5py's classes cannot be named where it is not installed.
     def add(self, path: str, item: Any) -> None:
-        """A data set of references.
-
-        Args:
-            path: of it, dotted.
-            item: a data set of h5py.
-        """
+        """A data set of references."""
         if item.dtype.kind != "O" or not 0 < (item.size or 0) <= _MOST_ELEMENTS:
             return
         parent, _, field = path.rpartition(".")
@@ -244,12 +232,7 @@ class References:
             self._paths.setdefault(target, f"{path}[{i}]" if is_cell else f"{parent}[{i}].{field}")
 
     def add_letters(self, path: str, item: Any) -> None:
-        """A data set of letters, which may be the label of an array.
-
-        Args:
-            path: of it, dotted.
-            item: a data set of h5py.
-        """
+        """A data set of letters, which may be the label of an array."""
         if 0 < (item.size or 0) <= _LONGEST:
             self._letters[path] = "".join(map(chr, np.ravel(content(item))))
 

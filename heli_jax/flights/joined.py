@@ -93,13 +93,7 @@ def _all_begun(columns: Mapping[str, np.ndarray]) -> slice:
 def joined_log(
     table: Table, request: Request, numbers: Mapping[str, np.ndarray]
 ) -> ChannelLog | None:
-    """A table whose rows are those of several topics as a log of these; else None.
-
-    Args:
-        table: the file.
-        request: names the clock and the signals.
-        numbers: the columns (N,) of both.
-    """
+    """A table whose rows are those of several topics as a log of these; else None."""
     assert request.time is not None  # no table is read without
     stamps = numbers[request.time.name]
     # What is no clock is told by its line where rows are read.

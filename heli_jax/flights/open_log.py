@@ -75,11 +75,6 @@ def chosen_flights(
 ) -> Table | tuple[ChannelLog, ...]:
     """The flight of a number, or all without one.
 
-    Args:
-        path: for the message.
-        logs: what was opened.
-        flight: from 1.
-
     Raises:
         InputError: there is none of this number.
     """
@@ -202,7 +197,10 @@ def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
 # Files that hold flights and are not read: what each is, and what to make of it instead.
 
 _SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
-_ROS = "is a bag of ROS"
+_PICKLE = (
+    "is a pickle of Python, which may run anything; save a table, frame.to_parquet(FILE), or "
+    "arrays, numpy.savez(FILE, t=t, p=p)"
+)
 _TOPICS = "export its topics to CSV (PlotJuggler does)"
 _ARCHIVE = "is an archive; unpack it and name the log in it"
 _TELEMETRY = (
@@ -211,27 +209,12 @@ _TELEMETRY = (
 )
 _BY_ENDING = {
     **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods", ".numbers"), _SHEET),
-    ".bag": f"{_ROS} 1; {_TOPICS}",
-    ".mcap": f"is a recording in MCAP, as ROS 2 makes them; {_TOPICS}",
-    ".db3": f"{_ROS} 2; {_TOPICS}",
-    ".tlog": _TELEMETRY,
-    ".rlog": _TELEMETRY,
-    **dict.fromkeys(
-        (".pkl", ".pickle", ".joblib"),
-        "is a pickle of Python, which may run anything; save a table, frame.to_parquet(FILE), or "
-        "arrays, numpy.savez(FILE, t=t, p=p)",
-    ),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), f"is a log of ROS; {_TOPICS}"),
+    **dict.fromkeys((".tlog", ".rlog"), _TELEMETRY),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib"), _PICKLE),
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".xz", ".bz2", ".zst"), _ARCHIVE),
-    **dict.fromkeys(
-        (".mf4", ".mdf"), "is a measurement in MDF; export it to CSV, or to MATLAB by asammdf"
-    ),
-    ".tdms": "is a measurement of LabVIEW in TDMS; export it to CSV (nptdms does)",
-    ".c3d": "is a motion capture in C3D; export it to CSV",
-    ".slx": "is a model of Simulink; save the signals that it logged as .mat",
-    ".fig": "is a figure of MATLAB; save the numbers in it as .mat",
-    ".kml": "is a track for a map, without attitudes; take the log that it was made from",
-    ".gpx": "is a track for a map, without attitudes; take the log that it was made from",
-    ".pdf": "is a document; expected the numbers as a table in text",
+    **dict.fromkeys((".mf4", ".mdf", ".tdms", ".c3d"), "is a measurement; export it to CSV"),
+    **dict.fromkeys((".slx", ".fig"), "is no data of MATLAB; save the signals as arrays in .mat"),
 }
 _BY_MARK = (
     (b"\x89MCAP0\r\n", _BY_ENDING[".mcap"]),
@@ -240,26 +223,16 @@ _BY_MARK = (
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", _SHEET),
     (
         b"version https://git-lfs.github.com/spec/",
-        "is a pointer of Git LFS that stands for the log; git lfs pull fetches the log itself",
+        "is a pointer of Git LFS; run git lfs pull",
     ),
-    (
-        b"/annex/objects/",
-        "is a pointer of git-annex that stands for the log; git annex get fetches the log itself",
-    ),
+    (b"/annex/objects/", "is a pointer of git-annex; git annex get fetches the log"),
     (b"FEA1", "is of the first version of Feather; write it anew, frame.to_feather(FILE)"),
-    (b"TDSm", _BY_ENDING[".tdms"]),
-    (b"MDF     ", _BY_ENDING[".mf4"]),
-    (b"%PDF-", _BY_ENDING[".pdf"]),
 )
 _ZIP = b"PK\x03\x04"
 
 
 def _refuse_foreign(path: Path, head: bytes) -> None:
     """Refuse a file that is known not to be read, by its first bytes or by its ending.
-
-    Args:
-        path: of the file.
-        head: its first bytes.
 
     Raises:
         InputError: with what to make of it.

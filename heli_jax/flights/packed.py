@@ -24,10 +24,6 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
     """What stored numbers stand for: NaN for fills and what is no valid value, the rest scaled; and
     how many are missing.
 
-    Args:
-        stored: of a data set, of any shape.
-        attributes: of `ATTRIBUTES` those that it has.
-
     Raises:
         Packing: a scale or an offset is no number.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_faults import require_increasing, unit_notes
+from heli_jax.flights.clock_guess import require_increasing, unit_notes
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import LATEST, rounding_of, without_overflow

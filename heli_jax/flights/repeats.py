@@ -127,12 +127,7 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
 def repeats_removed(
     outputs: Mapping[str, Timed], stated: Mapping[str, str]
 ) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes.
-
-    Args:
-        outputs: by name, NaN where a sample is missing.
-        stated: one of `REPEATS` by name.
-    """
+    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes."""
     made, notes = {n: y.values for n, y in outputs.items()}, []
     runs = {n: usual_run(y) for n, y in made.items()}
     moving = [n for n, y in made.items() if runs[n] is None and _moves(y)]

@@ -36,20 +36,13 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
 
 
 def counted(table: Table) -> Table:
-    """A table of which the numbers of the rows can be asked for as a column, `ROWS`.
-
-    Args:
-        table: of rows.
-    """
+    """A table of which the numbers of the rows can be asked for as a column, `ROWS`."""
     return TableView(table, columns={ROWS: None})
 
 
 def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
     and what says so; None where there is none, or are several.
-
-    Args:
-        surveys: of all columns or arrays.
     """
     rates: dict[float, str] = {}
     for each in surveys:
@@ -66,13 +59,7 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
 
 
 def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, ...]:
-    """A caution where a file states another rate than that of its times.
-
-    Args:
-        table: of rows.
-        clock: the column of times.
-        rate: of its usual step [Hz].
-    """
+    """A caution where a file states another rate than that of its times."""
     stated: dict[float, str] = {}
     for name in table.names:
         # Of another clock than this one its path tells.
@@ -84,11 +71,6 @@ def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, .
 def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple[Finding, ...]:
     """A caution for each rate that is neither that of times nor a whole multiple, of which every
     second or tenth sample may have been logged.
-
-    Args:
-        stated: what says so, by rate [Hz].
-        clock: the column of times.
-        rate: of its usual step [Hz].
     """
     if not (math.isfinite(rate) and rate > 0):
         return ()

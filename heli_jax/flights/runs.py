@@ -28,11 +28,7 @@ _NAMES = {
 
 
 def restarts(stamps: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which the time begins anew; none where it only goes back here or there.
-
-    Args:
-        stamps: (N,), in any unit.
-    """
+    """The rows (n,) in which the time begins anew; none where it only goes back here or there."""
     none = np.zeros(0, int)
     if stamps.size < 2 * _SHORTEST or not np.isfinite(stamps).all():
         return none
@@ -54,21 +50,12 @@ def restarts(stamps: np.ndarray) -> np.ndarray:
 
 
 def changes(numbers: np.ndarray) -> np.ndarray:
-    """The rows (n,) in which a number of a run is another than in the row before.
-
-    Args:
-        numbers: (N,)
-    """
+    """The rows (n,) in which a number of a run is another than in the row before."""
     return np.flatnonzero(np.diff(numbers) != 0) + 1
 
 
 def clock_scale(table: Table, time: Signal) -> float:
-    """Of the unit of a clock, or of its counts [s].
-
-    Args:
-        table: that holds it.
-        time: the clock.
-    """
+    """Of the unit of a clock, or of its counts [s]."""
     if time.scale != 1.0:
         return time.scale
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
@@ -105,11 +92,7 @@ def with_runs(
 
 
 def numbering_notes(column: str) -> tuple[Finding, ...]:
-    """That a column numbers runs, where one does.
-
-    Args:
-        column: its name, or empty.
-    """
+    """That a column numbers runs, where one does."""
     if not column:
         return ()
     remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
@@ -118,11 +101,7 @@ def numbering_notes(column: str) -> tuple[Finding, ...]:
 
 
 def numbering(surveys: Sequence[Survey]) -> str:
-    """The column that numbers runs, by its name and numbers; empty without one.
-
-    Args:
-        surveys: of a table's columns.
-    """
+    """The column that numbers runs, by its name and numbers; empty without one."""
     for each in surveys:
         if each.values is None or not _NAMES & set(words_in(each.name)):
             continue

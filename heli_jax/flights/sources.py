@@ -59,10 +59,6 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
 
-    Args:
-        request: for the signals of the first log.
-        log: the first one where it is open already.
-
     Raises:
         InputError: a log cannot be read, or not be aligned with the first.
     """

@@ -24,11 +24,7 @@ _FEWEST = 10
 def unstacked(
     arrays: Mapping[str, np.ndarray],
 ) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
-    """Arrays of at most two dimensions, stacks as matrices of a column a channel; and notes.
-
-    Args:
-        arrays: of any shape, by path.
-    """
+    """Arrays of at most two dimensions, stacks as matrices of a column a channel; and notes."""
     deep = {n: x for n, x in arrays.items() if x.dtype.kind in "biuf" and x.ndim > 2 and x.size}
     cubes = {n: x for n, x in deep.items() if x.ndim == DEEPEST}
     times = {n: x for n, x in arrays.items() if _is_time(n, x)}

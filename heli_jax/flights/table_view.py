@@ -80,10 +80,6 @@ class TableView:
 def first_of_copies(stamps: np.ndarray, columns: Sequence[np.ndarray]) -> np.ndarray | None:
     """The rows (n,) without those that repeat an earlier one, its time and all of its numbers; None
     where none does, or the times that are left do not increase.
-
-    Args:
-        stamps: (N,)
-        columns: each (N,).
     """
     if stamps.size < 2 or np.all(stamps[1:] > stamps[:-1]):
         return None
@@ -103,12 +99,7 @@ def first_of_copies(stamps: np.ndarray, columns: Sequence[np.ndarray]) -> np.nda
 
 
 def seen_once(table: Table, rows: np.ndarray) -> TableView:
-    """A table without the rows that are there twice, which is noted.
-
-    Args:
-        table: of all rows.
-        rows: those to be seen, of `first_of_copies`.
-    """
+    """A table without the rows that are there twice, which is noted."""
     left_out = np.setdiff1d(np.arange(int(rows[-1]) + 1), rows)
     # Behind the last row that is seen there may be more.
     first = int(left_out[0]) if left_out.size else int(rows[-1]) + 1
@@ -117,13 +108,7 @@ def seen_once(table: Table, rows: np.ndarray) -> TableView:
 
 
 def without_copies(table: Table, clock: str, surveys: Sequence[Survey]) -> Table:
-    """A table without rows that are there twice, all of its numbers being the same.
-
-    Args:
-        table: of rows.
-        clock: the column of times.
-        surveys: of all columns.
-    """
+    """A table without rows that are there twice, all of its numbers being the same."""
     values = [s.values for s in surveys if s.values is not None]
     stamps = next(s.values for s in surveys if s.name == clock)
     # Arrays may have lengths of their own.
@@ -136,13 +121,7 @@ def without_copies(table: Table, clock: str, surveys: Sequence[Survey]) -> Table
 def numbers_once(
     table: Table, clock: str, names: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
-    """Columns (N,) of one length, and a note where rows that are there twice were left out.
-
-    Args:
-        table: of rows.
-        clock: the column of times.
-        names: of the columns, the clock's among them.
-    """
+    """Columns (N,) of one length, and a note where rows that are there twice were left out."""
     numbers = table.numbers(names)
     rows = first_of_copies(numbers[clock], list(numbers.values()))
     if rows is None:

@@ -12,8 +12,12 @@ import numpy as np
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_faults import require_increasing
-from heli_jax.flights.clock_guess import COUNTS_ROWS, arrival_notes, is_called_time
+from heli_jax.flights.clock_guess import (
+    COUNTS_ROWS,
+    arrival_notes,
+    is_called_time,
+    require_increasing,
+)
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
