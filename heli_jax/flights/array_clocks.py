@@ -20,11 +20,10 @@ _LEVEL = re.compile(r"[./]")
 
 
 class _Clock(NamedTuple):
-    """An array of times: its name, the group that it stands in, and the words before `time`."""
+    """An array of times: its name, the group that it stands in, and its samples."""
 
     name: str
     group: tuple[str, ...]
-    stem: tuple[str, ...]
     size: int
 
 
@@ -75,12 +74,10 @@ def clock_notes(table: Table) -> tuple[Finding, ...]:
 def _clock(name: str, values: np.ndarray) -> _Clock | None:
     *group, leaf = _LEVEL.split(name)
     words = words_in(split_unit(leaf)[0])
-    at = next((i for i in (0, len(words) - 1) if words and words[i] in TIME_NAMES), None)
     increases = values.size > 1 and bool(np.all(values[1:] > values[:-1]))
-    if at is None or not increases:
+    if not words or not TIME_NAMES & {words[0], words[-1]} or not increases:
         return None
-    # t_imu as well as imu_time.
-    return _Clock(name, tuple(group), words[:at] + words[at + 1 :], values.size)
+    return _Clock(name, tuple(group), values.size)
 
 
 def _clock_of(
@@ -88,24 +85,18 @@ def _clock_of(
 ) -> _Clock | None:
     """The clock of an array; None where its group has none of its length, or several of which not
     one alone shares the other groups' time."""
-    *group, leaf = _LEVEL.split(name)
+    group = tuple(_LEVEL.split(name)[:-1])
     for depth in range(len(group), -1, -1):
-        level = tuple(group[:depth])
-        near = [c for c in clocks if c.group == level and c.size == size]
-        if not near:
-            continue
-        # At one level by the word before: imu_t is the time of imu_gx.
-        words = (*group[depth:], *words_in(leaf))
-        own = [c for c in near if c.stem and tuple(words[: len(c.stem)]) == c.stem]
-        near = own or near
-        others = [c for c in clocks if c.group != level]
+        near = [c for c in clocks if c.group == group[:depth] and c.size == size]
+        others = [c for c in clocks if c.group != group[:depth]]
         if len(near) > 1 and others:
             # GPS time of week beside the board's time.
             times = seconds[max(others, key=lambda c: c.size).name]
             shared = (float(times[0]), float(times[-1]))
             on_it = sharing_clocks({c.name: seconds[c.name] for c in near}, shared)
             near = [c for c in near if c.name in on_it]
-        return near[0] if len(near) == 1 else None
+        if near:
+            return near[0] if len(near) == 1 else None
     return None
 
 

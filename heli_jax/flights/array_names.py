@@ -63,91 +63,53 @@ _FEWEST_SHARED = 3
 """letters by which a matrix and a list of names belong together: OutputData, OutputName"""
 
 
-class NamedColumns:
-    """Which columns of which matrices have names and units beside them."""
+def named_columns(
+    path: str, array: np.ndarray, texts: Mapping[str, Sequence[str]]
+) -> tuple[Sequence[str], Sequence[str]]:
+    """The names and the units of a matrix's columns, each empty where nothing says so.
 
-    def __init__(
-        self, arrays: Mapping[str, np.ndarray], texts: Mapping[str, Sequence[str]]
-    ) -> None:
-        """
-        Args:
-            arrays: by path.
-            texts: lists of texts by path.
-        """
-        self._names: dict[str, Sequence[str]] = {}
-        self._units: dict[str, Sequence[str]] = {}
-        for path, array in arrays.items():
-            count = _columns(array)
-            if not count:
-                continue
-            beside = {
-                p: t for p, t in texts.items() if _group(p) == _group(path) and len(t) == count
-            }
-            if names := _chosen(path, count, {p: t for p, t in beside.items() if _are_names(p, t)}):
-                self._names[path] = names
-            if units := _chosen(path, count, {p: t for p, t in beside.items() if _are_units(p, t)}):
-                self._units[path] = units
-
-    def name(self, path: str, column: int) -> str | None:
-        """What a column is called; None where nothing says so."""
-        names = self._names.get(path)
-        return f"{path}.{names[column]}" if names else None
-
-    def unit(self, path: str, column: int) -> str:
-        """The unit of a column, empty where none stands beside the matrix."""
-        units = self._units.get(path)
-        return units[column] if units else ""
-
-
-def _columns(array: np.ndarray) -> int:
-    """How many signals an array holds."""
+    Args:
+        path: of the matrix.
+        array: the matrix, or a vector.
+        texts: lists of texts by path, as many as columns in the one that names them.
+    """
     if array.dtype.kind not in "biuf" or array.ndim > 2 or array.size < 2:
-        return 0
-    return 1 if array.ndim < 2 else min(array.shape)
+        return (), ()
+    count, group = 1 if array.ndim < 2 else min(array.shape), path[: -len(_leaf(path))]
+    names, units_of = {}, {}
+    for other, each in texts.items():
+        if other[: -len(_leaf(other))] != group or len(each) != count:
+            continue
+        words = set(words_in(_leaf(other)))
+        if words & _UNIT_WORDS:
+            if any(time_unit(t) or units.is_unit(t) for t in each):
+                units_of[other] = each
+        elif words & _NAMES and all(each) and len(set(each)) == count:
+            names[other] = each
+    return _chosen(path, count, names), _chosen(path, count, units_of)
 
 
 def _chosen(path: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequence[str]:
-    """The list that belongs to an array; empty where none does, or several might."""
-    shared = {p: _shared(path, p) for p in lists}
-    most = max(shared.values(), default=0)
-    near = {p: t for p, t in lists.items() if shared[p] == most >= _FEWEST_SHARED}
-    # A vector's own name says as much as a single text that happens to stand beside it.
-    left = near or ({} if count == 1 else lists)
-    different = {tuple(t) for t in left.values()}
-    return next(iter(different)) if len(different) == 1 else ()
-
-
-def _shared(path: str, other: str) -> int:
-    """Letters with which two names at one level begin alike."""
-    first, second = _leaf(path).casefold(), _leaf(other).casefold()
-    count = 0
-    for a, b in zip(first, second, strict=False):
-        if a != b:
-            break
-        count += 1
+    """The list that belongs to an array: the one called most alike; empty where several might."""
+    own = _leaf(path).casefold()
+    shared = {p: _alike(own, _leaf(p).casefold()) for p in lists}
     # The whole name of an array may be a letter: y and y_names.
-    return max(count, _FEWEST_SHARED) if count == len(first) else count
+    shared = {p: max(n, _FEWEST_SHARED) if n == len(own) else n for p, n in shared.items()}
+    most = max(shared.values(), default=0)
+    near = [t for p, t in lists.items() if shared[p] == most >= _FEWEST_SHARED]
+    # A vector's own name says as much as a single text that happens to stand beside it.
+    different = {tuple(t) for t in near or (() if count == 1 else lists.values())}
+    return different.pop() if len(different) == 1 else ()
 
 
-def _are_names(path: str, texts: Sequence[str]) -> bool:
-    """Whether a list of texts names signals: all differ, and it is called so."""
-    if not all(texts) or len(set(texts)) < len(texts):
-        return False
-    words = set(words_in(_leaf(path)))
-    return not words & _UNIT_WORDS and bool(words & _NAMES)
-
-
-def _are_units(path: str, texts: Sequence[str]) -> bool:
-    words = set(words_in(_leaf(path)))
-    return bool(words & _UNIT_WORDS) and any(time_unit(t) or units.is_unit(t) for t in texts)
+def _alike(one: str, other: str) -> int:
+    """Letters with which two names begin alike."""
+    pairs = enumerate(zip(one, other, strict=False))
+    return next((i for i, (a, b) in pairs if a != b), min(len(one), len(other)))
 
 
 def _leaf(path: str) -> str:
     return re.split(r"[./]", path)[-1]
-
-
-def _group(path: str) -> str:
-    return path[: len(path) - len(_leaf(path))]
 
 
 def as_lists(texts: Mapping[str, str]) -> dict[str, list[str]]:

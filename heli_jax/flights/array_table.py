@@ -22,7 +22,7 @@ from heli_jax import import_path
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import mat_file, packed, stacked
-from heli_jax.flights.array_names import NamedColumns, as_lists, labelled
+from heli_jax.flights.array_names import as_lists, labelled, named_columns
 from heli_jax.flights.stacked import unstacked
 from heli_jax.flights.table import (
     Budget,
@@ -343,13 +343,13 @@ class DataSets:
         whole, units_beside = labelled(self._stored, self.labels)
         stated = self._units | units_beside
         flat, of_stacks = unstacked(whole)
-        named = NamedColumns(flat, self._texts)
         arrays, units = {}, {}
         for name, values in flat.items():
+            names, beside = named_columns(name, values, self._texts)
             for i, (part, vector) in enumerate(_vectors(name, values)):
-                called = named.name(name, i) or part
+                called = f"{name}.{names[i]}" if names else part
                 arrays[called] = vector
-                units[called] = named.unit(name, i) or stated.get(name, "")
+                units[called] = (beside[i] if beside else "") or stated.get(name, "")
         return arrays, units, (*notes, *of_stacks)
 
 

@@ -15,8 +15,7 @@ from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps
 from heli_jax.flights.log import holds_commands
-from heli_jax.flights.row_clock import by_rate, stated_rate
-from heli_jax.flights.runs import restarts
+from heli_jax.flights.row_clock import by_rate, restarts, stated_rate
 from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
 from heli_jax.flights.time_units import LETTERS, SECONDS, likely_unit, split_unit, time_unit
 
@@ -37,8 +36,6 @@ COUNTS_ROWS = "clock.counts-rows"
 _STAMP = ("header", "stamp")
 _SAMPLED = "timestamp_sample"
 """of a topic of PX4, beside `timestamp`, when it was published"""
-_ARRIVALS = ("%time", "__time", "rosbagTimestamp", "Time", "timestamp")
-"""as tools for logs of ROS and of PX4 call the column of arrival"""
 _COUNTERS = {
     *(
         "frame",
@@ -106,24 +103,6 @@ def is_called_time(name: str) -> bool:
     stem, _ = split_unit(name)
     # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
     return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
-
-
-def arrival_notes(table: Table, clock: str) -> tuple[Finding, ...]:
-    """Which of two clocks was taken, and why, where one is that of a message's arrival."""
-    if not _is_of_sample(clock):
-        sampled = clock + "_sample"
-        if sampled not in table.names or not _are_commands(table, sampled):
-            return ()
-        why = "commands act from when they are published"
-        beside = f"{shown(sampled)} is of the gyro's sample they answer"
-    else:
-        other = next((name for name in table.names if name in _ARRIVALS), None)
-        if other is None:
-            return ()
-        why = "it says when a sample was taken"
-        beside = f"{shown(other)} says when its message arrived"
-    words = f"{shown(clock)} is taken for the clock, since {why}; {beside}"
-    return (note("clock.of-several", words, clock),)
 
 
 def _says_when_sampled(table: Table, name: str) -> bool:

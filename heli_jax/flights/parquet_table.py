@@ -56,7 +56,7 @@ def open_parquet(path: Path) -> "ParquetTable":
             raise wrong(str(path), "holds no rows, expected a log")
         require_few_columns(str(path), metadata.num_columns)
         # Text stays as its dictionary: a few words that every row repeats can be large.
-        texts = [f.name for f in schema if _is_text(f.type)]
+        texts = [f.name for f in schema if pa.types.is_string(f.type) or pa.types.is_binary(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
     return ParquetTable(str(path), size, Digest(path), file)
@@ -133,7 +133,9 @@ class ColumnTable:
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text. Lists and records within cells are
         not read, so that all of their cells count as filled."""
-        nested = [is_nested(f.type) for f in self._schema]
+        import pyarrow as pa
+
+        nested = [pa.types.is_nested(f.type) for f in self._schema]
         flat = [f.name for f, n in zip(self._schema, nested, strict=True) if not n]
         data = self._read(flat if any(nested) else None)
         # By name: two columns may have the same, and come in an order of their own.
@@ -223,34 +225,16 @@ class ParquetTable(ColumnTable):
             raise wrong(self.path, "is no whole Parquet file")
 
 
-def is_nested(kind: "pa.DataType") -> bool:
-    """Whether cells hold lists or records."""
-    import pyarrow as pa
-
-    return pa.types.is_nested(kind)
-
-
-def _is_text(kind: "pa.DataType") -> bool:
-    import pyarrow as pa
-
-    types = pa.types
-    return types.is_string(kind) or types.is_binary(kind)
-
-
 def _is_number(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
-    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
     types = pa.types
-    return (
-        types.is_integer(kind)
-        or types.is_floating(kind)
-        or types.is_decimal(kind)
-        or types.is_boolean(kind)
-        or types.is_timestamp(kind)
-        or types.is_duration(kind)
-        or types.is_time(kind)
+    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
+    tests = (
+        *(types.is_integer, types.is_floating, types.is_decimal, types.is_boolean),
+        *(types.is_timestamp, types.is_duration, types.is_time),
     )
+    return any(test(kind) for test in tests)
 
 
 def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
@@ -336,9 +320,13 @@ class ArrowTable(ColumnTable):
         self._table = table
 
     def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
+        import pyarrow as pa
+
         # By place: of two columns of one name `select` takes neither.
         fields = enumerate(self._schema)
         kept = [
-            i for i, f in fields if names is None or (f.name in names and not is_nested(f.type))
+            i
+            for i, f in fields
+            if names is None or (f.name in names and not pa.types.is_nested(f.type))
         ]
         yield from self._table.select(kept).to_batches()

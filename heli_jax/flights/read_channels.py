@@ -60,6 +60,7 @@ class TopicClock:
         rounding: how coarsely they are rounded [s].
         places: where the i-th of them stands: `line 12, column 't'`; of an autopilot's log
             the topic.
+        of_table: True for the rows of a table, whose stamps are rounded in text.
     """
 
     topic: str
@@ -68,6 +69,7 @@ class TopicClock:
     begin: float
     rounding: float
     places: Callable[[int], tuple[str, ...]]
+    of_table: bool = False
 
     @property
     def usual(self) -> float:
@@ -250,7 +252,8 @@ def flight_of_signals(
         InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
     clocks, rate = clocks_of(signals.values()), request.options.rate
-    if len(clocks) == 1:
+    is_one = len(clocks) == 1 and (rate is None or clocks[0].of_table)
+    if is_one:
         # Before the samples are looked at: a wrong unit makes anything of their steps.
         grid = uniform_grid(clocks[0].seconds, clocks[0].rounding)
         if isinstance(grid, Uneven) and rate is None:
@@ -263,7 +266,7 @@ def flight_of_signals(
     values, repeated = measured_once(request, logged.signals)
     timed = {key: Timed(signals[key].clock.seconds, x) for key, x in values.items()}
     said = sample_notes(request, timed)
-    if len(clocks) == 1:
+    if is_one:
         start, t0, end = float(clocks[0].seconds[0]), clocks[0].begin, clocks[0].seconds[-1]
         dt, (samples, holds, notes) = _of_one_clock(
             source.path, request, clocks[0], grid, timed, holds

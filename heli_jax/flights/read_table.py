@@ -26,11 +26,9 @@ from heli_jax.flights.read_channels import (
     rows_in_window,
 )
 from heli_jax.flights.request import Request
-from heli_jax.flights.row_clock import ROWS, contradicted_rate, counted
-from heli_jax.flights.runs import clock_scale, with_runs
+from heli_jax.flights.row_clock import ROWS, clock_scale, contradicted_rate, counted, with_runs
 from heli_jax.flights.stacked import NUMBER
 from heli_jax.flights.table import Table, column, shown, wrong
-from heli_jax.flights.table_view import first_of_copies, seen_once
 from heli_jax.flights.time_units import require_likely
 
 
@@ -71,10 +69,6 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     joined = joined_log(table, request, numbers)
     if joined is not None:
         return joined
-    rows = first_of_copies(numbers[request.time.name], list(numbers.values()))
-    if rows is not None:
-        table = _over(table, seen_once(_below(table), rows))
-        numbers = table.numbers(request.columns)
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
 
@@ -126,7 +120,7 @@ def clocked_table(
     # Before the rounding is looked for, which steps of a wrong unit would make meaningless.
     require_steps(table.path, seconds, *places(0))
     begin, rounding = float(stamps[0] * clock.scale), rounding_of(stamps) * clock.scale
-    topic = TopicClock(Path(table.path).name, seconds, rows, begin, rounding, places)
+    topic = TopicClock(Path(table.path).name, seconds, rows, begin, rounding, places, of_table=True)
     signals = {}
     for (key, kind), signal in request.signals.items():
 

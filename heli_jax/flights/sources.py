@@ -63,7 +63,7 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
         InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
-    request = with_file_units(_log_of(first), request)
+    request = with_file_units(first if isinstance(first, ChannelLog) else first.table, request)
     keys, everything, beside = frozenset(request.signals), copy.copy(request), []
     for also in request.options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
@@ -178,27 +178,42 @@ def _whole(request: Request) -> Request:
     return request
 
 
-def _log_of(log: ChannelLog | LoadedTable) -> ChannelLog | Table:
-    return log if isinstance(log, ChannelLog) else log.table
-
-
 def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tuple[Beside, Request]:
     """The signals of a further log, its clock shifted to that of the first, and the request for
     them with the units that they have."""
-    if not also.same:
-        return _of_one_clock(log, request, also)
+    options = ReadOptions(number=also.number)
+    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    # The log that is open already may be large.
+    file = also.log or _of_file(asked)
+    asked = with_file_units(file, asked)
+    other = _open(asked, file)
+    signals, _ = _clocked(other, asked)
+    name = Path(also.path).name
+    stated = f"{name} (sha256 {file.sha256[:12]})"
+    if also.same:
+        lag, said = _aligned(log, request, also, file, stated)
+    else:
+        lag = float(other.first_time - log.first_time)
+        theirs = _span(signals, other.first_time)
+        ours = _span(_clocked(log, _whole(request))[0], log.first_time)
+        said = _as_one(request, also, ours, theirs, stated)
+    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, said), asked
+
+
+def _aligned(
+    log: ChannelLog | LoadedTable, request: Request, also: Also, file: ChannelLog | Table, name: str
+) -> tuple[float, Finding]:
+    """What has to be added to the times of a further log [s], by a motion that both hold."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
         problem = f"expected a signal of the first log ({known}), got {also.same!r:.60}"
         raise wrong(also.path, problem, "align.with")
-    options = ReadOptions(number=also.number)
     # Apart from the others, since it may well be one of them.
+    options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    file = also.log or _of_file(alone)
-    other = _open(alone, file)
     reference = _clocked(log, _only(_whole(request), frozenset({key})))[0][key].timed
-    (twin,) = _clocked(other, alone)[0].values()
+    (twin,) = _clocked(_open(alone, file), alone)[0].values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
     motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
@@ -207,51 +222,34 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
     except NotAligned as e:
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
-    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    # The log that is open already: it may be large.
-    asked = with_file_units(file, asked)
-    signals, _ = _clocked(_open(asked, file), asked)
-    name = Path(also.path).name
-    shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
-    return Beside(shifted, _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)), asked
+    return lag.lag, _note(name, also, lag)
 
 
-def _of_one_clock(
-    log: ChannelLog | LoadedTable, request: Request, also: Also
-) -> tuple[Beside, Request]:
-    """The signals of a further log whose times count as those of the first.
+def _as_one(
+    request: Request,
+    also: Also,
+    ours: tuple[float, float],
+    theirs: tuple[float, float],
+    name: str,
+) -> Finding:
+    """A note that the times of two logs, from first to last [s], count alike.
 
     Raises:
-        InputError: the two hardly overlap, so that they have no clock in common.
+        InputError: they hardly overlap, so that they have no clock in common.
     """
-    options = ReadOptions(number=also.number)
-    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    file = also.log or _of_file(asked)
-    asked = with_file_units(file, asked)
-    other = _open(asked, file)
-    signals, _ = _clocked(other, asked)
-    spans = [
-        _span(clocks, each.first_time)
-        for clocks, each in ((_clocked(log, _whole(request))[0], log), (signals, other))
-    ]
-    (begin, end), (also_begin, also_end) = spans
-    shared = min(end, also_end) - max(begin, also_begin)
-    name = Path(also.path).name
-    first = Path(request.path).name
-    if not shared >= _SHARED * min(end - begin, also_end - also_begin):
+    first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
+    if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(
             also.path,
-            f"its times go from {also_begin:.6g} s to {also_end:.6g} s and those of {first} from "
-            f"{begin:.6g} s to {end:.6g} s, so that they are no one clock; state a motion that "
-            "both hold, align: {with: ..., to: ...}",
+            f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
+            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that they are no one clock; state a motion "
+            "that both hold, align: {with: ..., to: ...}",
         )
-    lag = float(other.first_time - log.first_time)
     words = (
-        f"{name} (sha256 {file.sha256[:12]}): its times are taken as those of {first}, with which "
-        f"it shares {shared:.4g} s; if each counts from a beginning of its own, state align"
+        f"{name}: its times are taken as those of {first}, with which it shares {shared:.4g} s; if "
+        "each counts from a beginning of its own, state align"
     )
-    taken = note("clock.taken-as-one", words, value=shared)
-    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, taken), asked
+    return note("clock.taken-as-one", words, value=shared)
 
 
 def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
@@ -270,12 +268,6 @@ def _note(name: str, also: Also, lag: Lag) -> Finding:
         f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
         f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
-    if lag.drift is not None:
-        rate, sd = lag.drift
-        words += (
-            f"; the lag drifts by {-1e6 * rate:.3g} us a second (sd {1e6 * sd:.2g}), which is "
-            "not corrected"
-        )
     return Finding(
         "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
     )

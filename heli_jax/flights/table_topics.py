@@ -12,10 +12,8 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.row_clock import ROWS, counted
-from heli_jax.flights.runs import clock_scale, with_runs
+from heli_jax.flights.row_clock import ROWS, clock_scale, counted, with_runs
 from heli_jax.flights.table import Table, listed, shown, wrong
-from heli_jax.flights.table_view import numbers_once
 
 _MOST_NAMED = 6
 """columns that notes name"""
@@ -95,7 +93,6 @@ def one_topic(
     elif clock.guessed:
         words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
-    is_rows = clock.column == ROWS
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
     whole = not isinstance(table, ArrayTable)
@@ -114,12 +111,9 @@ def one_topic(
     if clock.runs > 1:
         table = in_runs(table, clock)
         notes += table.notes[-1:]
-    if is_rows:
-        numbers, copies = counted(table).numbers([*names, ROWS]), ()
-    else:
-        numbers, copies = numbers_once(table, clock.column, names)
+    names = list(dict.fromkeys([*names, clock.column]))
+    numbers = (counted(table) if clock.column == ROWS else table).numbers(names)
     stamps = without_overflow(numbers.pop(clock.column))
-    notes += copies
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)

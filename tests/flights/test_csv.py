@@ -105,7 +105,6 @@ READ = {
     "a delimiter at the end": ("a.csv", text("t,u,p", end=",")),
     "empty rows at the end": ("a.csv", text("t;u;p;;", between=";", end=";;") + ";;;;\n" * 30),
     "a last line cut off": ("a.csv", text(TUP) + "0.8,3"),
-    "rows twice": ("a.csv", text(TUP, rows=[r for r in lines() for _ in (0, 1)])),
     "marks at the beginning": ("a.csv", text(TUP).replace("t,u,p\n", "t,u,p\n-0.020000,0,NA\n")),
     "gzip": ("a.csv.gz", gzip.compress(text(TUP)[:300].encode())
              + gzip.compress(text(TUP)[300:].encode())),
@@ -119,8 +118,7 @@ READ = {
 }  # fmt: skip
 NOTED = {"units below": "text.units-line", "units above": "text.units-line",
          "units in capitals": "text.units-line", "a last line cut off": "text.line-cut-off",
-         "rows twice": "clock.rows-twice",
-         "names and units in comments": "text.units-line"}  # fmt: skip
+              "names and units in comments": "text.units-line"}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", READ)
@@ -141,7 +139,7 @@ def test_read(tmp_path, case):
     assert (info.columns[2].max, info.columns[1].kind) == (P.max(), "number")
     # A row stands where it does in the file.
     place = open_log(path).place(7 + skip).removeprefix("line ")
-    if case not in ("old mac", "utf-16", "gzip", "rows twice"):
+    if case not in ("old mac", "utf-16", "gzip"):
         raw = path.read_text(encoding="utf-8-sig").split("\n")[int(place) - 1]
         assert f"{U[7]:.6f}"[:6] in raw.replace("\u2212", "-").replace(",", ".") or "E" in raw \
             or "D" in raw or "0,4" in raw or "+" in raw  # fmt: skip
