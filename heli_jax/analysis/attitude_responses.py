@@ -57,7 +57,6 @@ def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair
     """By axis of roll, pitch and yaw its stick with the angle, or else the rate, among the outputs.
 
     Args:
-        model: any.
         outputs: those of the model's that were logged.
     """
     pairs = []
@@ -86,7 +85,6 @@ def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
     """Axes whose angle or rate was logged and that have no stick, a sentence each.
 
     Args:
-        model: any.
         outputs: those of the model's that were logged.
     """
     axes = axes_of(model)
@@ -119,7 +117,6 @@ def measured_handling(
     """Handling qualities of a measured response, or why there are none in words.
 
     Args:
-        flight_responses: the responses of some flights.
         pair: which of them.
     """
     output = flight_responses.outputs.get(pair.output)

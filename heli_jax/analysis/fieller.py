@@ -36,9 +36,7 @@ def sd_of_ratio(
 
     Args:
         omega: frequencies [rad/s].
-        S: spectra of the signals.
         signals: places of the inputs, of the outputs and of the instruments.
-        H: the responses.
         left: density of what they leave.
         spread: density of w_j over the averages.
         half95: half of a 95 % interval in standard deviations.

@@ -364,7 +364,6 @@ def steady_sd(
     Args:
         omega: (k,) [rad/s]
         output: of flights.
-        input: its name.
         seconds: length of a window.
     """
     pair = output.pairs[input]

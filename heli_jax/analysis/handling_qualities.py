@@ -172,7 +172,6 @@ class _Response:
 
         Args:
             quantity: log_gain or phase.
-            level: likewise.
             below: [rad/s]
             first: whether the lowest one is meant.
         """

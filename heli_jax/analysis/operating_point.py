@@ -54,7 +54,6 @@ def operating_point(
     that they give in a simulation, or the initial state where that diverges.
 
     Args:
-        model: any model, also one with a disturbance, which is zero at the point.
         params: its parameters, of this flight, SI.
         inputs: as they act (N,), by name, SI: as logged, times a gain where one was estimated.
         outputs: as measured (N,), by name, SI; NaN where missing.
@@ -81,9 +80,7 @@ def modes_of_flight(
     where there are no finite matrices.
 
     Args:
-        model: the model that is fitted.
         params: its parameters, SI; what is known of the flight replaces them.
-        flight: the record.
         substeps: of the simulation.
     """
     here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
@@ -145,13 +142,7 @@ def _undisturbed(model: Model) -> Model:
     State: Any = NamedTuple("State", [(n, fields[n]) for n in kept])  # type: ignore[misc]
 
     def vector_field(p: Any, s: Any, u: Any) -> Any:
-        """The model's derivatives where the disturbance is zero.
-
-        Args:
-            p: the model's Params, SI.
-            s: the State without the disturbance.
-            u: the model's Inputs.
-        """
+        """The model's derivatives where the disturbance is zero."""
         rates = model.vector_field(p, _extended(model, s), u)
         return State(**{n: getattr(rates, n) for n in kept})
 

@@ -54,8 +54,6 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
 
     Args:
         model: with sticks for its axes.
-        params: its constants.
-        trimmed: the flight to hold.
         pace: every mode of the attitude decays at least as fast [1/s].
 
     Raises:

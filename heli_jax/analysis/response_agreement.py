@@ -138,8 +138,6 @@ def pair_agreements(
         used: which take part at which frequencies.
         H: measured.
         E: measured less the model's.
-        variance: of E.
-        coherence: partial.
         simulated: by output how the model's response was made.
     """
     out = []
@@ -190,7 +188,6 @@ def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
     was estimated from what no response explains: Fisher's F.
 
     Args:
-        freedom: degrees of freedom.
         of_noise: those of the noise.
     """
     low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))

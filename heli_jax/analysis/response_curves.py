@@ -276,7 +276,6 @@ def linear_responses(
 
     Args:
         model: with n states.
-        params: its parameters, SI.
         names: of those that derivatives are taken by.
         state: the model's initial state unless given.
         inputs: zeros unless given.
@@ -321,7 +320,6 @@ def modelled_curve(
     """A model's continuous response, delays included, with errors by those of its parameters.
 
     Args:
-        of: the matrices.
         pair: input and output.
         root: (q, r) R with R R' the covariance of the parameters; NaN where it is not known.
         band: [rad/s]

@@ -155,7 +155,6 @@ def response_of(
 
     Args:
         w: the flights in windows.
-        at: of these.
         E: errors, or the outputs themselves; zero in windows that an output does not have.
     """
     S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
@@ -173,7 +172,6 @@ def noise_density(
 
     Args:
         w: the flights in windows.
-        at: of these.
         E: errors (W, k, p); zero in windows that an output does not have.
         described: of raw spectral matrices (k, q, q) of some outputs, by their place, what is known
             of their shape: the mean over lines is taken of what is left by that (`None`: nothing).
@@ -257,7 +255,6 @@ def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndar
 
     Args:
         at: what the inputs say.
-        S: the noise's spectral matrix.
     """
     P = np.nan_to_num(at.P)
     return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
@@ -271,7 +268,6 @@ def whitening(
 
     Args:
         at: what the inputs say.
-        S: the noise's spectral matrix.
         used: which responses at which frequencies.
     """
     k, p, m = used.shape
@@ -312,7 +308,6 @@ def pairs_used(
     Args:
         w: the flights in windows.
         options: pairs, bands and coherences asked for.
-        coherence: partial.
         sound: where there is a response at all.
     """
     used = np.zeros(sound.shape, bool)

@@ -45,7 +45,6 @@ def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str
 
     Args:
         flights: of one rate.
-        output: its name.
         window: samples of one, the least of a part.
     """
     parts, longest = [], 0
@@ -72,7 +71,6 @@ def records_of(
     Args:
         flights: of one rate.
         names: inputs and instruments.
-        outputs: names.
         parts: as outputs share them.
     """
     inputs, instruments = names

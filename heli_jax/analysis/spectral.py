@@ -269,7 +269,6 @@ def responses(
     where an instrument is too weak beside what else moves its input (`fieller`).
 
     Args:
-        spectra: of the signals.
         inputs: the m inputs, by their place among the signals.
         outputs: the l outputs likewise.
         instruments: as many excitations, outside of every feedback; without them the inputs are
@@ -318,7 +317,6 @@ def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     Args:
         M: cross-spectra.
         rows: densities (k, m) of the signals of the rows.
-        columns: likewise.
     """
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(rows[:, :, None] * columns[:, None, :])
@@ -348,7 +346,6 @@ def weights_by_output(
     Args:
         several: of the same signals and frequencies, of segments of different length.
         inputs: those whose responses decide, by their place among the signals.
-        outputs: likewise.
 
     Raises:
         ValueError: the frequencies differ.
@@ -376,7 +373,6 @@ def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"])
 
     Args:
         several: of the same signals and frequencies.
-        weights: of each; where all are zero all count the same.
     """
     omega, total = several[0].omega, np.sum(weights, axis=0)
     # Inputs that move as one have no response that could decide.

@@ -308,7 +308,6 @@ def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
 
     Args:
         best: the optimum, its delay free.
-        freedom: degrees of freedom.
     """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)
@@ -383,7 +382,6 @@ def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
     coherence; NaN where nothing is measured.
 
     Args:
-        measured: the response.
         model: at the same frequencies (k,).
 
     Source: Tischler and Remple (2012), section 11.2.

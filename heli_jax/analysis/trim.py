@@ -126,8 +126,6 @@ def trim(
 
     Args:
         model: the full nonlinear model of a helicopter.
-        params: its constants.
-        condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         sticks: the ends of the sticks' travel by name; those of `STICKS` unless given.
         power_off: autorotation: the throttle is zero, and the climb, which is then negative, is
@@ -181,7 +179,6 @@ def equilibrium(
     Args:
         model: the full nonlinear model of a helicopter.
         params: its constants, concrete or traced.
-        condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         power_off: as in `trim`.
 

@@ -17,7 +17,6 @@ def first_guess(
 
     Args:
         model: the full nonlinear model of a helicopter.
-        p: its constants, SI.
         climb: [m/s].
         power_off: whether the climb is found with the motor off.
     """

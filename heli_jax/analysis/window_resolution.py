@@ -41,7 +41,6 @@ def forgets(fitted: TransferFit, seconds: float) -> bool:
     record: its slowest mode falls to 1/e.
 
     Args:
-        fitted: the transfer function.
         seconds: length of a window.
     """
     poles = fitted.poles
@@ -55,7 +54,6 @@ def window_error(
     a window, so that what it does is not known from the record.
 
     Args:
-        fitted: the transfer function.
         windows: how the response was taken.
         input: the place of its input among the inputs.
         hold: what that does between samples.

@@ -226,7 +226,6 @@ def _complete(
 
     Args:
         flights: of one rate.
-        starts: of the windows.
         length: samples of a window.
         asked: the same in seconds, and how many inputs move.
     """

@@ -52,7 +52,6 @@ def cyclic_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar) -> Scalar:
     turn gives 1/8 for two blades, so an inertia found with 1/2 is a number of this model.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta_cyc: cyclic pitch of the blades [rad], eq. 11.
     """
@@ -69,7 +68,6 @@ def hub_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar, omega: Scalar) -
     In place of eqs 14-15: blade-element theory's factor, and the rotor's damping.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta_cyc: cyclic pitch of the blades [rad], eq. 11.
         omega: rate of the body about the same axis [rad/s].
@@ -95,10 +93,8 @@ def thrust(
     $\theta_{edge} = (x_{roll} + x_{pitch})/L_1$.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0: collective pitch [rad], eq. 18.
-        flow: the air that the rotor meets.
         vi: induced velocity [m/s]; solved for unless given, as by dynamic inflow.
     """
     # Blade-element theory has B/2 mu^2 theta0 in the bracket beside these three; the paper drops
@@ -122,10 +118,8 @@ def torque(p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, inflow: Sca
       + \tfrac{B^2}{4}\mu\,\theta_{edge}\right)\right]$$
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0: collective pitch [rad], eq. 18.
-        flow: the air that the rotor meets.
         inflow: lambda R Omega [m/s], of the same flow by `thrust`.
     """
     # B^2/4 before mu here, B^2/2 in eq. 13: both are right, the quadrature gives them so.
@@ -145,7 +139,6 @@ def tail_moment(p: Helicopter, Omega: Scalar, theta0T: Scalar) -> Scalar:
       \qquad \Omega_T = K_\Omega\Omega$$
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0T: pitch of the tail rotor's blades [rad], eq. 17.
     """
@@ -167,7 +160,6 @@ def tail_thrust(
       \left[\tfrac{B^3}{3}\theta_{0T} - \tfrac{B^2}{2}\lambda_T\right]$$
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0T: pitch of the tail rotor's blades [rad], eq. 17.
         V2: square of the speed in the tail rotor's plane [m^2/s^2].
@@ -191,7 +183,6 @@ def tail_torque(p: Helicopter, Omega: Scalar, theta0T: Scalar, inflow: Scalar) -
     Its blades have the drag coefficient of the main ones.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0T: pitch of the tail rotor's blades [rad].
         inflow: lambda_T R_T Omega_T [m/s].
@@ -214,7 +205,6 @@ def inflow_rate(p: Helicopter, force: RotorForce, through: Scalar) -> Scalar:
     Source: Carpenter and Fridovich, NACA TN 3044 (1953).
 
     Args:
-        p: vehicle, SI.
         force: thrust and inflow of the main rotor.
         through: the flow sqrt(V^2 + (W + v_i)^2) through the rotor [m/s].
     """

@@ -50,7 +50,6 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     else than is expected. A model is looked at once; later calls cost a look-up.
 
     Args:
-        model: what should be a Model.
         traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
             Without it only the return values are checked: parameters that stay plain numbers may
             be branched on.
@@ -243,7 +242,6 @@ class _Function:
 
         Args:
             returned: what the function gave, of tracers.
-            record: the class that was expected.
             role: its role in the model.
         """
         fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])

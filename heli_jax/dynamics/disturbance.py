@@ -280,13 +280,7 @@ class _Disturbed(NamedTuple):
         return self.model.State(**{n: getattr(state, n) for n in states})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's derivatives with the pushes on them, and those of the pushes.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The model's derivatives with the pushes on them, and those of the pushes."""
         # It adds to the derivative, as a gust's moment over the inertia would: a disturbance of
         # the angle itself would jump, and one of the output would not act back through the flybar.
         rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
@@ -298,11 +292,6 @@ class _Disturbed(NamedTuple):
     def output(self, p: Record, s: Record, u: Record) -> Record:
         """The model's outputs: a push shows in them by the motion, and in those that are the
         derivative that it adds to.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
         """
         outputs = self.model.output(p, self.undisturbed(s), u)
         # Left out of an accelerometer's reading, a gust would be taken for noise that has a memory,
@@ -313,13 +302,7 @@ class _Disturbed(NamedTuple):
         return naming.replace(outputs, **pushed) if pushed else outputs
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The model's limits, by name.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The model's limits, by name."""
         assert self.model.limits is not None
         return self.model.limits(p, self.undisturbed(s), u)
 

@@ -19,7 +19,6 @@ def set_point(p: Helicopter, x_throttle: Scalar | None) -> Scalar:
     the nominal speed, and at zero for none.
 
     Args:
-        p: vehicle, SI.
         x_throttle: the stick [1]; None where it moves the collective pitch.
     """
     return p.Omega if x_throttle is None else p.Omega * x_throttle
@@ -31,7 +30,6 @@ def throttle(
     """The throttle, 0 to 1, and the derivative of the integral part [1/s].
 
     Args:
-        p: vehicle, SI.
         asked: the rotor speed to be held [rad/s].
         Omega: main rotor speed [rad/s].
         integral: the state i_g [1].

@@ -33,8 +33,6 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
     angles' derivatives, as the paper has it.
 
     Args:
-        corrections: the switches of the variant.
-        s: state, with the names of HelicopterState.
         u: inputs; wind_x, wind_y and wind_z [m/s] where there is wind.
     """
     at = once(Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi)))
@@ -58,11 +56,7 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
 
 
 def body_rates(s: Record) -> dict[str, Scalar]:
-    """p, q and r [rad/s] by name, as gyros on the body measure them.
-
-    Args:
-        s: state, with the names of HelicopterState.
-    """
+    """p, q and r [rad/s] by name, as gyros on the body measure them."""
     at = Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi))
     return dict(zip("pqr", _turned(s, at), strict=True))
 
@@ -95,13 +89,7 @@ class Cyclic(NamedTuple):
 
 
 def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
-    """Eq. 11 for both axes.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-    """
+    """Eq. 11 for both axes."""
     if not hasattr(s, "beta_roll"):
         # Without a bar all of the stick is Bell's path: eq. 11 with L2 = 0.
         return Cyclic((1.0 / p.L1) * u.x_roll, (1.0 / p.L1) * u.x_pitch)
@@ -112,22 +100,12 @@ def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
 
 
 def collective(p: Helicopter, u: Record) -> Scalar:
-    """theta0 [rad], eq. 18: of the collective stick where there is one, else of the throttle.
-
-    Args:
-        p: vehicle, SI.
-        u: inputs, with the names of HelicopterInputs.
-    """
+    """theta0 [rad], eq. 18: of the collective stick where there is one, else of the throttle."""
     return p.K_theta0 * (u.x_collective if hasattr(u, "x_collective") else u.x_throttle)
 
 
 def hub_speed(p: Helicopter, m: Motion) -> tuple[Scalar, Scalar]:
-    """The hub's speed through the air, forward and to the right [m/s].
-
-    Args:
-        p: vehicle, SI.
-        m: the `motion` of the body.
-    """
+    """The hub's speed through the air, forward and to the right [m/s]."""
     # omega x r at r = (-lr, 0, -hr), of which forward and right count here.
     return m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
 
@@ -144,13 +122,6 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
     behind the centre of gravity. The cyclic pitch then meets the air by direction: that of pitch
     has its largest blade angle on the right, where the blade advances in forward flight, that of
     roll at the nose, where it advances in flight to the left.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
     """
     # The hub is h_r above the centre of gravity: a nose that rises carries it backwards, a right
     # side that sinks carries it to the right.
@@ -190,14 +161,7 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
 
 
 def main_rotor(p: Helicopter, s: Record, u: Record, air: aero.Flow) -> aero.RotorForce:
-    """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        air: the `flow` at the hub.
-    """
+    """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state."""
     return once(aero.thrust(p, s.Omega, collective(p, u), air, getattr(s, "vi", None)))
 
 
@@ -219,9 +183,6 @@ def accelerations(
     $\tfrac12\rho V (S_x u, S_y v, S_z w)/m$ in body axes.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        m: the `motion` of that state.
         T: thrust of the main rotor [N].
         aside: forces of the rotors forward and to the right, beside T [N].
     """
@@ -262,13 +223,6 @@ def angular_accelerations(
     the body rates, $I\dot\omega = M - \omega\times I\omega$, and the derivative of
     $\dot\phi = p + \dot\psi s_\theta$, $\dot\theta = q c_\phi - r s_\phi$,
     $\dot\psi = (q s_\phi + r c_\phi)/c_\theta$.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        m: the `motion` of that state.
-        M: the `moments`.
     """
     # The body's axes are taken for principal ones: neither the paper nor a vehicle has Ixz. What is
     # bolted on is rigid with the body, so it adds to the inertias and nowhere else.

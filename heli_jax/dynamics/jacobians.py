@@ -31,7 +31,6 @@ def jacobians(
 
     Args:
         model: of one machine, with n states, m inputs and p outputs.
-        params: the model's Params, SI.
         state: where to differentiate; the model's initial state unless given.
         inputs: likewise; zero unless given.
 

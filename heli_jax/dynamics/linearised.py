@@ -24,9 +24,6 @@ def linearised(model: Model) -> Model:
 
     Its Params (`about`) have the model's own fields and the point's. Delays, disturbances and what
     else is named by parameters stay as they are.
-
-    Args:
-        model: any.
     """
     more = {_STATE + n: naming.fields(model.State)[n] for n in naming.names(model.State)}
     more |= {_INPUT + n: naming.fields(model.Inputs)[n] for n in naming.names(model.Inputs)}
@@ -38,23 +35,11 @@ def linearised(model: Model) -> Model:
         return model.Params(**{n: getattr(p, n) for n in naming.names(model.Params)})
 
     def vector_field(p: Record, x: Record, u: Record) -> Record:
-        """The derivatives' deviation, to first order.
-
-        Args:
-            p: of `about`.
-            x: the State less the point's.
-            u: the Inputs less the point's.
-        """
+        """The derivatives' deviation, to first order."""
         return _slope(lambda s, v: model.vector_field(own(p), s, v), point(model, p), (x, u))
 
     def output(p: Record, x: Record, u: Record) -> Record:
-        """The outputs' deviation, to first order.
-
-        Args:
-            p: of `about`.
-            x: the State less the point's.
-            u: the Inputs less the point's.
-        """
+        """The outputs' deviation, to first order."""
         return _slope(lambda s, v: model.output(own(p), s, v), point(model, p), (x, u))
 
     return dataclasses.replace(
@@ -73,26 +58,14 @@ def linearised(model: Model) -> Model:
 
 
 def about(model: Model, params: Record, state: Record, inputs: Record) -> Record:
-    """The Params of `linearised(model)` at a point.
-
-    Args:
-        model: that was linearised.
-        params: its Params, SI.
-        state: its State at the point.
-        inputs: its Inputs there.
-    """
+    """The Params of `linearised(model)` at a point."""
     values = {_STATE + n: v for n, v in naming.asdict(state).items()}
     values |= {_INPUT + n: v for n, v in naming.asdict(inputs).items()}
     return linearised(model).Params(**naming.asdict(params), **values)
 
 
 def point(model: Model, params: Record) -> tuple[Record, Record]:
-    """State and Inputs of the point that Params of `linearised(model)` hold.
-
-    Args:
-        model: that was linearised.
-        params: of `about`.
-    """
+    """State and Inputs of the point that Params of `linearised(model)` hold."""
     return (
         model.State(**{n: getattr(params, _STATE + n) for n in naming.names(model.State)}),
         model.Inputs(**{n: getattr(params, _INPUT + n) for n in naming.names(model.Inputs)}),

@@ -27,8 +27,6 @@ def motor_torque(corrections: Corrections, p: Helicopter, throttle: Scalar) -> S
     """T_m [N m], eq. 19, or as eq. 10 has the motor.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
         throttle: 0 to 1.
     """
     # Eq. 10 accelerates the rotor by K_throttle x_throttle, a torque Ir K_throttle on the fuselage.
@@ -47,16 +45,7 @@ class Rotors(NamedTuple):
 def drive(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, air: aero.Flow, rotors: Rotors
 ) -> Drive:
-    """Eqs 10 and 19, with the tail rotor's power and the governor where they are on.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        air: the `flow` at the hub.
-        rotors: what both rotors do.
-    """
+    """Eqs 10 and 19, with the tail rotor's power and the governor where they are on."""
     Q = aero.torque(p, s.Omega, collective(p, u), air, rotors.main.inflow)
     # The tail's shaft is driven by the main one: K_Omega times its torque there, which the fuselage
     # feels on the way, so that of the motor's reaction what is left turns the main rotor.
@@ -88,11 +77,7 @@ def moments(
     """The moments of eqs 5-7 and 14-17.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
         hub: those of the main rotor's hub about it, and of its in-plane forces.
-        rotors: what both rotors do.
-        shaft: motor and rotor speed.
     """
     # Trim needs M_psi = -T_m: x_yaw K_theta0T is negative in hover.
     yaw = hub.yaw + p.L_T * rotors.tail.T + shaft.reaction
@@ -110,16 +95,7 @@ def moments(
 def rigid_hub_moments(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, force: aero.RotorForce
 ) -> Moments:
-    """Eqs 14-15: the moments of blades without hinges, which follow the cyclic pitch at once.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
-        force: of the main rotor.
-    """
+    """Eqs 14-15: the moments of blades without hinges, which follow the cyclic pitch at once."""
     tilt = cyclic(p, s, u)
     if corrections.rotor_moment:
         roll = aero.hub_moment(p, s.Omega, tilt.roll, m.p)
@@ -151,16 +127,7 @@ def _tip(corrections: Corrections, p: Helicopter) -> Scalar:
 def flapping(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, force: aero.RotorForce
 ) -> Tilt:
-    """da1/dt and db1/dt [rad/s] of the tip-path plane.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
-        force: of the main rotor.
-    """
+    """da1/dt and db1/dt [rad/s] of the tip-path plane."""
     B, pitch = _tip(corrections, p), cyclic(p, s, u)
     # Only where the plane would settle: the body's rates and the hub's stiffness act on the way
     # there, in `flapping_rates`.

@@ -252,8 +252,6 @@ def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array
 
     Args:
         model: with n states.
-        params: the model's Params.
-        dtype: of the result.
     """
     # Zero where a state is not named: its first value is then known, or an unknown of the fit, and
     # not something that the filter may correct.
@@ -267,8 +265,6 @@ def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
 
     Args:
         model: with n states.
-        params: the model's Params.
-        dtype: of the result.
 
     Raises:
         ValueError: the model correlates a state that is not random there.
@@ -322,7 +318,6 @@ def require_linear(model: Model, params: Record) -> None:
     wrong without any sign of it.
 
     Args:
-        model: any.
         params: the model's Params, SI, concrete.
 
     Raises:
@@ -338,14 +333,7 @@ def require_linear(model: Model, params: Record) -> None:
 def field_and_output(
     model: Model, params: Record, state: Record, inputs: Record
 ) -> tuple[Any, Any]:
-    """The model's rates and outputs at one point.
-
-    Args:
-        model: of one machine.
-        params: the model's Params, SI.
-        state: the model's State.
-        inputs: the model's Inputs.
-    """
+    """The model's rates and outputs at one point."""
     return (
         model.vector_field(params, state, inputs),
         model.output(params, state, inputs),
@@ -383,7 +371,6 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
     """Refuse parameters that lack what the model reads.
 
     Args:
-        model: of one machine.
         params: the model's Params; concrete numbers, NaN where not given.
         given: parameters that come from elsewhere.
 
@@ -401,7 +388,6 @@ def reads(model: Model, params: Record, name: str) -> bool:
     an input is late by it.
 
     Args:
-        model: of one machine.
         params: the model's Params; concrete numbers.
         name: of the parameter.
     """

@@ -39,7 +39,6 @@ def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | Non
     Rates and outputs have to be finite there, and their derivatives by the states.
 
     Args:
-        model: of one machine.
         params: the model's Params, SI; concrete numbers.
         inputs: at the first sample; zero where not given.
     """

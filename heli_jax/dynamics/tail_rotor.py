@@ -25,10 +25,6 @@ def tail_rotor(
     """Thrust and torque of the tail rotor.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `Motion` of the body.
         Omega: main rotor speed [rad/s].
     """
     theta0T = p.K_theta0T * u.x_yaw
@@ -57,9 +53,6 @@ def tail_force(
     """Thrust and inflow of the tail rotor; a positive thrust turns the nose to the right.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        m: the `Motion` of the body.
         Omega: main rotor speed [rad/s].
         theta0T: pitch of its blades [rad].
     """

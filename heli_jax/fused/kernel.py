@@ -36,7 +36,6 @@ class Kernel:
         """Translate and compile.
 
         Args:
-            run: what is computed.
             lanes: vehicles in flight at once; their number has to be a multiple of it.
 
         Raises:

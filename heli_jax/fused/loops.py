@@ -17,7 +17,6 @@ def loop(
     """A loop that is passed at least once.
 
     Args:
-        code: where it is written.
         until: how many passes (int32), or of what is carried whether there is another.
         carry: what is carried, before the first pass.
         body: of the pass's number (int32) and what is carried, what is carried on.

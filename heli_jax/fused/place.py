@@ -9,11 +9,7 @@ _INSTALLED = re.compile(r"(?:site|dist)-packages[/\\]([^/\\.]+)")
 
 
 def place_of(equation: Any) -> str | None:
-    """As 'at model.py:12' or 'in diffrax'; None where nothing says so.
-
-    Args:
-        equation: of a jaxpr.
-    """
+    """As 'at model.py:12' or 'in diffrax'; None where nothing says so."""
     trace, library = equation.source_info.traceback, None
     # From the innermost call outwards, until somebody's own function is met. What a function of
     # JAX's is made of was traced once for all who call it, and knows no caller.

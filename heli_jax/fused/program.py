@@ -57,7 +57,6 @@ def write(run: Run, lanes: int) -> Text:
     """Write the program of a run.
 
     Args:
-        run: what is computed.
         lanes: vehicles in flight at once in one thread.
 
     Raises:

@@ -54,10 +54,7 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
     """Write what a jaxpr computes.
 
     Args:
-        code: where it is written.
         jaxpr: as `jax.make_jaxpr` gives it, closed or with its constants.
-        consts: of it.
-        operands: of its arguments.
 
     Returns:
         An operand for each result.

@@ -75,13 +75,7 @@ class _Equations:
         self.matrices, self.State, self.Outputs = matrices, State, Outputs
 
     def vector_field(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The derivatives of the states, per second.
-
-        Args:
-            params: the model's Params, scalars [SI].
-            state: the State, scalars [SI].
-            inputs: the Inputs, scalars [SI].
-        """
+        """The derivatives of the states, per second."""
         # Entry by entry: most of a matrix is zero, and a dense product would compute all of it at
         # every step.
         rates = self.rows(("A", "B"), naming.names(self.State), params, state, inputs)
@@ -92,13 +86,7 @@ class _Equations:
         return self.State(**rates)
 
     def output(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The outputs; one without a row is the state of its name.
-
-        Args:
-            params: the model's Params, scalars [SI].
-            state: the State, scalars [SI].
-            inputs: the Inputs, scalars [SI].
-        """
+        """The outputs; one without a row is the state of its name."""
         # An output with a row is what the row says, even where a state has its name.
         stated = {entry.row for name in ("C", "D") for entry in self.matrices[name]}
         names = naming.names(self.Outputs)
@@ -113,10 +101,6 @@ class _Equations:
 
         Args:
             matrices: their names, as A and B.
-            names: of the rows.
-            params: the model's Params, scalars [SI].
-            state: the State, scalars [SI].
-            inputs: the Inputs, scalars [SI].
         """
         # Zeros made of a state have its type and its batch axis.
         zero = 0.0 * state[0]

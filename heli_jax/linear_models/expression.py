@@ -226,7 +226,6 @@ def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
     """The value of an expression.
 
     Args:
-        node: the expression.
         value: value(name) of a parameter: a number or a traced scalar.
 
     Raises:
@@ -271,7 +270,6 @@ def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dime
     """The dimension of an expression.
 
     Args:
-        node: the expression.
         of: of each parameter by name.
         plain: that of a plain number.
 

@@ -50,8 +50,6 @@ def accumulate(
     """Reduce a run to a value without keeping it: for large batches.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         update: value = update(value, outputs, data at that sample), at every sample.
         start: the value before the first sample, a pytree of numbers.
@@ -82,8 +80,6 @@ def accumulated(
     """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         update: value = update(value, outputs, data at that sample), at every sample.
         start: the value before the first sample, a pytree of numbers.

@@ -24,7 +24,6 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
 
     Args:
         args: with the recurrence, in matrices, and the inputs (N,).
-        m: samples in a block.
         x0: the model's State at the first sample.
     """
     assert args.discrete is not None

@@ -43,7 +43,6 @@ def delays_of(
 
     Args:
         model: whose `delays` name the parameters that are delays of single inputs [s].
-        params: the model's Params, SI.
         common: None, or the delay of all inputs beside their own [s]; Delays are taken as they
             are, and a model's own are no longer added.
         dt: sample time [s].

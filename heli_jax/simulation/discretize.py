@@ -44,7 +44,6 @@ def discretize(
 
     Args:
         model: linear, with n states and m inputs.
-        params: the model's Params, SI.
         dt: [s].
         delays: how late the inputs are; whole samples are left to who reads the arrays. With
             `late` [s] the part of each interval before the delayed sample u[k] acts, under a
@@ -125,7 +124,6 @@ def process_noise(model: Model, params: Record, dt: Number) -> Float[Array, "n n
 
     Args:
         model: linear, with n states.
-        params: the model's Params, SI.
         dt: [s].
     """
     A = jacobians(model, params).A

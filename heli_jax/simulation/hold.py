@@ -141,7 +141,6 @@ def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...])
 
     Args:
         inputs: arrays (N,).
-        k: the sample.
         linear: of each input whether it moves between samples; () holds all.
     """
     held = at(inputs, k)
@@ -254,8 +253,6 @@ def delayed(
 
     Args:
         inputs: a pytree of arrays (N,).
-        delays: how late each of them is.
-        k: the samples.
         linear: of each input whether it moves between samples; () holds all.
     """
     before, now = at(inputs, k - 1, delays), at(inputs, k, delays)

@@ -11,7 +11,6 @@ def random_steps(
     """Pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold` [s].
 
     Args:
-        n: samples.
         dt: [s].
         rng: where levels and times come from.
         hold: the shortest and the longest time [s].
@@ -32,7 +31,6 @@ def multistep_3211(
     """3-2-1-1 steps, in either direction, with neutral between.
 
     Args:
-        n: samples.
         dt: [s].
         rng: which decides on the direction of each.
         unit: length of the shortest step [s].
@@ -56,7 +54,6 @@ def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
     """A sine whose frequency rises exponentially over the record.
 
     Args:
-        n: samples.
         dt: [s].
         low: first frequency [Hz].
         high: last frequency [Hz].

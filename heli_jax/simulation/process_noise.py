@@ -32,7 +32,6 @@ def with_process_noise(
     Args:
         model: one with a noise intensity, n states.
         args: of the run without noise.
-        method: the solver of a sample.
         options: of which dt, delay and key count.
         linear: of each input whether it moves between samples; () holds all.
 
@@ -93,8 +92,6 @@ def add_process_noise(
         args: of which the parameters and dt count.
         feedback: None, or what makes the acting inputs of the given ones.
         state: before the noise is added.
-        inputs: of the sample.
-        draws: n standard normal numbers.
     """
     params, dt = args.params, args.dt
     # The linearisation is at the inputs that acted, which the solver within keeps to itself.

@@ -176,7 +176,6 @@ def blocks(
     Args:
         reducing: what it is reduced by.
         args: the recurrence, in matrices, and the inputs (N,).
-        m: samples a step.
         x0: the model's State at the first sample.
         start: the value before it.
         data: a pytree of arrays (N,).

@@ -62,7 +62,6 @@ def simulate(
 
     Args:
         model: of one machine; `jax.vmap` over the other arguments simulates many.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         options: how; all defaults unless given.
         **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,

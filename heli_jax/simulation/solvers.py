@@ -50,7 +50,6 @@ def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bo
 
     Args:
         args: with the model's inputs, nothing beside them.
-        k: the sample.
         linear: of each input whether it is linear between samples; () holds all.
     """
     if args.delays is None:
@@ -135,11 +134,7 @@ class Exact(_Stateless):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """One sample of the recurrence.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
-        """
+        """One sample of the recurrence."""
         assert args.discrete is not None
         # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
         k, late = sample_index(t0), args.delays
@@ -213,11 +208,7 @@ class RK4(_Stateless):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """One step of the method.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in s.
-        """
+        """One step of the method."""
         h: Any = t1 - t0
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
@@ -291,11 +282,7 @@ class PerSample(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """One sample in its parts.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
-        """
+        """One sample in its parts."""
         # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):

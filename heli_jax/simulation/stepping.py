@@ -83,9 +83,7 @@ def start_state(
 
     Args:
         model: whose `initial_state` counts unless one is given.
-        params: the model's Params, SI.
         initial_state: the model's State, or None.
-        inputs: the model's Inputs.
 
     Raises:
         TypeError: `params` are none of the model's.
@@ -104,7 +102,6 @@ def check_countable(samples: int, dtype: Any) -> None:
     """Refuse a run of so many samples that their numbers are not told apart in its precision.
 
     Args:
-        samples: of the run.
         dtype: of its states, in which diffrax counts the samples.
 
     Raises:
@@ -151,8 +148,6 @@ def per_sample(
     """The solver, its arguments and the term for time counted in samples.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
         inputs: the model's Inputs, arrays (N,).
         options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
         linear: of each input whether it is linear between samples; () holds all.
@@ -224,7 +219,6 @@ def held_columns(
 
     Args:
         model: linear, with n states and m inputs.
-        params: the model's Params, SI.
         inputs: the model's Inputs, arrays (N,).
         dt: [s].
         delay: as in `SimulationOptions`.

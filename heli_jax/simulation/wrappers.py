@@ -45,12 +45,7 @@ class StateFeedback(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """A sample with the inputs that the feedback makes of the state at its begin.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
-                them; time in samples.
-        """
+        """A sample with the inputs that the feedback makes of the state at its begin."""
         # One sample, index 0, stands for all: `at` takes the last where the index is past the end.
         u = self.feedback(y0, at(args.inputs, sample_index(t0)))
         held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
@@ -77,12 +72,7 @@ class Stopping(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """A sample, or none where the run is over.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
-                them; time in samples.
-        """
+        """A sample, or none where the run is over."""
         # A batch cannot stop for one of its runs, so the step is made and its result not taken.
         state, going = y0
         new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
@@ -113,12 +103,7 @@ class WithProcessNoise(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """A sample, and the noise that comes in over it.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
-                them; time in samples.
-        """
+        """A sample, and the noise that comes in over it."""
         # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
         inputs, acting, draws = args.inputs
         held = args._replace(inputs=inputs)
@@ -149,12 +134,7 @@ class Accumulating(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        """The value at a sample, then the step from it.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
-                them; time in samples.
-        """
+        """The value at a sample, then the step from it."""
         held, data = args
         state, value = y0
         # Before the step: the outputs of a sample belong to the state at its beginning. Whoever

@@ -34,7 +34,6 @@ def with_delays(
     linear, so that matrices, modes, filters and windows have it too, and differentiable.
 
     Args:
-        model: any.
         inputs: those that act late: names, or by name the parameter (which several may share).
         outputs: those that are logged late, likewise.
         order: states of each output's delay line, 1 to 8.
@@ -69,7 +68,6 @@ def with_input_delays(model: Model, parameters: Mapping[str, str]) -> Model:
     """The model whose inputs are late by new parameters.
 
     Args:
-        model: any.
         parameters: by input the name of its delay.
 
     Raises:
@@ -162,13 +160,7 @@ class _LateOutputs(Device):
         self.late, self.order = late, order
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the lines' states, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the lines' states, per second."""
         measured = self.measured(p, s, u)
         rates = {}
         for n, parameter in self.late.items():
@@ -182,9 +174,6 @@ class _LateOutputs(Device):
         """The outputs, those that are late read from their lines.
 
         Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
             y: the outputs before the delay.
         """
         return naming.replace(
@@ -245,25 +234,13 @@ class _LateInput(Device):
         self.name, self.parameter = name, parameter
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs, the late one read from its line.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The inputs, the late one read from its line."""
         past = [getattr(s, n) for n in self.parts.states]
         late = line_value(past, getattr(u, self.name), getattr(p, self.parameter))
         return naming.replace(u, **{self.name: late})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the line's states, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the line's states, per second."""
         past = [getattr(s, n) for n in self.parts.states]
         changes = line_rates(past, getattr(u, self.name), getattr(p, self.parameter))
         return dict(zip(self.parts.states, changes, strict=True))
@@ -311,7 +288,6 @@ def require_past(model: Model, params: Record) -> None:
     """Refuse a delay line that would look ahead.
 
     Args:
-        model: any.
         params: its Params, concrete.
 
     Raises:

@@ -91,7 +91,6 @@ def gain(filters: Sequence[Filter], hz: np.ndarray) -> np.ndarray:
     """What low-passes one behind the other leave of an amplitude (K,).
 
     Args:
-        filters: low-passes.
         hz: frequencies (K,) [Hz].
     """
     size = np.ones_like(hz)
@@ -146,7 +145,6 @@ def with_filters(
     a line of states as in `with_delays`. Both are linear, with constants that are fixed.
 
     Args:
-        model: any.
         filters: by output, one after the other.
         delays: by output [s], at most `LONGEST_DELAY`; the delay stands behind the filters.
 
@@ -283,13 +281,7 @@ class _Filtered(Device):
         super().__init__(model, Parts({}, states))
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of filters and lines, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of filters and lines, per second."""
         measured, rates = self.measured(p, s, u), {}
         for n, sections in self.sections.items():
             value = getattr(measured, n)
@@ -312,9 +304,6 @@ class _Filtered(Device):
         """The outputs as they are logged.
 
         Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
             y: the outputs before the filters.
         """
         logged = {}
@@ -331,10 +320,8 @@ class _Filtered(Device):
         """The signal behind a section.
 
         Args:
-            s: the State.
             state: the section's own.
             speed: that of its rate.
-            section: its constants.
             value: the signal before it.
         """
         if section.left is None:
@@ -362,11 +349,7 @@ def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str
 
 
 def states_behind(model: Model) -> frozenset[str]:
-    """The states of a model that are filters and delay lines behind its outputs.
-
-    Args:
-        model: any.
-    """
+    """The states of a model that are filters and delay lines behind its outputs."""
     names = "|".join(map(re.escape, naming.names(model.Outputs)))
     pattern = re.compile(rf"({names})_(filter\d+(_rate)?|late\d+)")
     return frozenset(n for n in naming.names(model.State) if pattern.fullmatch(n))

@@ -84,9 +84,6 @@ def specific_force(
         model: without its IMU.
         motion: of `motion_of`.
         p: the model's Params with x_imu, y_imu, z_imu.
-        s: the model's State.
-        u: the model's Inputs.
-        rates: the derivatives of the state.
     """
     # From the model's own derivatives, so that thrust, drag and gusts are in it without being
     # named: an accelerometer shows all forces but weight.
@@ -105,9 +102,7 @@ def airspeed(
         model: without its probe.
         motion: of `motion_of`.
         p: the model's Params with x_air, y_air, z_air.
-        s: the model's State.
         u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.
-        rates: the derivatives of the state.
     """
     at = (p.x_air, p.y_air, p.z_air)
     if motion.kind == "linear":
@@ -134,7 +129,6 @@ def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
     where it has none.
 
     Args:
-        model: any.
         letter: p, q or r.
     """
     states, outputs = naming.names(model.State), naming.names(model.Outputs)
@@ -155,12 +149,7 @@ def angular_acceleration(
     """The derivative of one of the body's rates [rad/s^2].
 
     Args:
-        model: any.
         rate: of `rate_of`.
-        p: the model's Params.
-        s: the model's State.
-        u: the model's Inputs.
-        rates: the derivatives of the state.
     """
     kind, name = rate
     if kind == "state":

@@ -25,7 +25,6 @@ def with_motion_sensors(
     """The model with outputs that its sensors make of the motion; each costs only if asked for.
 
     Args:
-        model: any.
         imu: whether there is an accelerometer: outputs ax, ay, az [m/s^2], the specific force at
             the new parameters x_imu, y_imu, z_imu [m].
         angular_acceleration: whether pdot, qdot, rdot [rad/s^2] are shown, the derivatives of the
@@ -110,23 +109,11 @@ class _MotionSensors(Device):
         return {"airspeed": Quantity("m/s", "airspeed at the probe"), **speeds}
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """None: these sensors have no states.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """None: these sensors have no states."""
         return {}
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's outputs and those of the sensors beside them.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The model's outputs and those of the sensors beside them."""
         model, motion = self.model, self.motion
         s = self.inner(s)
         # Once for all sensors: it is the field that costs.

@@ -232,18 +232,11 @@ class _RateLoop(Device):
         Args:
             s: the State, with the loop's own states.
             stick: the input that the loop drives.
-            rate: its name.
         """
         return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """What the loops ask of the machine in place of their sticks; other inputs pass.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """What the loops ask of the machine in place of their sticks; other inputs pass."""
         driven = {}
         for stick, rate in self.loops:
             # From the state and not from an output: an output may be delayed or filtered by the
@@ -266,13 +259,7 @@ class _RateLoop(Device):
         return naming.replace(u, **driven)
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of integrals and lagged rates, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of integrals and lagged rates, per second."""
         rates = {}
         for stick, rate in self.loops:
             measured = self.seen(s, stick, rate)

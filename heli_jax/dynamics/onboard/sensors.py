@@ -32,7 +32,6 @@ def with_sensors(
     `tau_lowpass_OUTPUT` [s] with the state `OUTPUT_lowpass`. Delays are those of `with_delays`.
 
     Args:
-        model: any.
         lowpass: outputs that are low-passed, `ax` and its like among them.
         delay: outputs that are late, by names or by name the parameter.
         imu: whether there is an accelerometer.
@@ -80,13 +79,7 @@ class _LowPass(Device):
         self.on = on
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the low-passed outputs, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the low-passed outputs, per second."""
         y = self.measured(p, s, u)
         return {
             f"{n}_lowpass": (getattr(y, n) - getattr(s, f"{n}_lowpass"))
@@ -98,9 +91,6 @@ class _LowPass(Device):
         """The outputs, those that are low-passed read from their states.
 
         Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
             y: the outputs before the low-pass.
         """
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
