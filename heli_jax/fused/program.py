@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant, type_of
-from heli_jax.fused.loops import loop
 from heli_jax.fused.operands import INDEX, LONG, Elements, Operand, Stored, elements, flat
-from heli_jax.fused.translate import translate
+from heli_jax.fused.translate import loop, translate
 
 
 class Argument(NamedTuple):

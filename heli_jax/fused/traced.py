@@ -9,8 +9,8 @@ import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.place import place_of
 from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.translate import place_of
 from heli_jax.numerics.hoist import hoisted
 
 # `Any` below: trees of arrays, and jaxprs.

@@ -5,6 +5,7 @@ error of first order. Here the input of an interval is picked once and held whil
 one that is linear between samples is followed along its line by every stage.
 """
 
+import abc
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -90,6 +91,9 @@ def sample_index(t: Time) -> Int[Array, ""]:
 # the begin of a step within it.
 
 
+type Stepped = tuple[PyTree, dfx.RESULTS]
+
+
 class _Stateless(dfx.AbstractSolver):
     """What all solvers here share: straight lines between samples, nothing kept between steps."""
 
@@ -101,11 +105,32 @@ class _Stateless(dfx.AbstractSolver):
     def init(self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree) -> None:
         return None
 
+    def step(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> Any:
+        """One step, in the five parts that diffrax asks for."""
+        y1, result = self.stepped(terms, t0, t1, y0, args)
+        return y1, None, {"y0": y0, "y1": y1}, None, result
+
+    @abc.abstractmethod
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
+    ) -> Stepped:
+        """The state at t1 and diffrax's result."""
+
 
 class SolverWrapper(_Stateless):
-    """A solver of whole samples around another (see also `heli_jax.simulation.wrappers`)."""
+    """A solver of whole samples around another (see also `heli_jax.simulation.simulate`)."""
 
-    solver: dfx.AbstractSolver
+    solver: Any
+    """one of ours; that of `PerSample` any of diffrax's"""
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
@@ -124,16 +149,9 @@ class Exact(_Stateless):
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: ZeroOrderHoldArgs,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
         """One sample of the recurrence."""
         assert args.discrete is not None
         # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
@@ -144,7 +162,7 @@ class Exact(_Stateless):
         u = jax.tree.leaves(at(args.inputs, k, late))
         new = advance(args.discrete, jax.tree.leaves(y0), u, before, after)
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
-        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+        return y1, dfx.RESULTS.successful
 
 
 def advance(
@@ -198,16 +216,9 @@ class RK4(_Stateless):
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
+    ) -> Stepped:
         """One step of the method."""
         h: Any = t1 - t0
 
@@ -224,7 +235,7 @@ class RK4(_Stateless):
         # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
         if self.rolled:
             y1 = self._rolled(f, along, t0, h, y0)
-            return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+            return y1, dfx.RESULTS.successful
         k1 = f(t0, y0)
         k2 = f(t0 + 0.5 * h, along(y0, k1, 0.5 * h))
         k3 = f(t0 + 0.5 * h, along(y0, k2, 0.5 * h))
@@ -232,7 +243,7 @@ class RK4(_Stateless):
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + (h / 6.0) * (a + 2.0 * (b + c) + d), y0, k1, k2, k3, k4
         )
-        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+        return y1, dfx.RESULTS.successful
 
     @staticmethod
     def _rolled(
@@ -272,23 +283,16 @@ class PerSample(SolverWrapper):
             terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: ZeroOrderHoldArgs,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
         """One sample in its parts."""
         # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
-        return y, None, {"y0": y0, "y1": y}, None, result
+        return y, result
 
     def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from heli_jax import load_vehicle, models, naming
-from heli_jax.dynamics import governor
 from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.loads import throttle
 from heli_jax.dynamics.model import zeros
 from tests.dynamics import full_helicopter as oracle
 
@@ -120,13 +120,13 @@ def test_a_machine_without_a_flybar_needs_none(vehicles_folder):
 def test_the_governor_is_a_pi_with_limits():
     p = models.helicopter().Params(**oracle.FULL)
     for error, integral in ((2.0, 0.4), (-3.0, 0.5), (100.0, 0.2), (-157.1, 0.3)):
-        held, slope = governor.throttle(p, 157.1, 157.1 - error, integral)
+        held, slope = throttle(p, 157.1, 157.1 - error, integral)
         free = 0.01 * error + integral
         assert float(held) == pytest.approx(np.clip(free, 0.0, 1.0))
         if 0 < free < 1:
             assert float(slope) == pytest.approx(0.02 * error)
     # Switched off it comes to rest at no throttle and an empty integral.
-    held, slope = governor.throttle(p, 0.0, 157.1, 0.0)
+    held, slope = throttle(p, 0.0, 157.1, 0.0)
     assert float(held) == 0.0
     assert float(slope) == pytest.approx(0.0, abs=1e-12)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from heli_jax.dynamics.inflow import induced_velocity, mass_flow
+from heli_jax.dynamics.aerodynamics import induced_velocity, mass_flow
 from tests.dynamics import whole_helicopter as oracle
 
 solve = jax.jit(jax.vmap(induced_velocity))
