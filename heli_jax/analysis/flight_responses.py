@@ -155,7 +155,6 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     Args:
         flights: of one rate, with the same inputs; an output's parts without a missing sample
             that are at least a window long are used.
-        settings: band, window and transfer functions.
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
@@ -400,8 +399,6 @@ def steady_sd(
 
     Args:
         omega: (k,) [rad/s]
-        output: of flights.
-        seconds: length of a window.
     """
     pair = output.pairs[input]
     noise = np.where(np.isfinite(pair.H), output.noise, np.nan)
@@ -468,7 +465,6 @@ def groups(
     them.
 
     Args:
-        flights: of one rate.
         window: samples of one, the least of a part.
         without: why an output has no part is added to them.
     """
@@ -487,7 +483,6 @@ def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str
     """The parts without a missing sample, or in words why there is none.
 
     Args:
-        flights: of one rate.
         window: samples of one, the least of a part.
     """
     parts, longest = [], 0
@@ -509,13 +504,7 @@ def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str
 def records_of(
     flights: Sequence[Flight], names: Names, outputs: list[str], parts: Parts
 ) -> list[np.ndarray]:
-    """Inputs, instruments and outputs (signals, N) of each part.
-
-    Args:
-        flights: of one rate.
-        names: inputs and instruments.
-        parts: as outputs share them.
-    """
+    """Inputs, instruments and outputs (signals, N) of each part."""
     inputs, instruments = names
     return [
         np.stack(
@@ -541,8 +530,6 @@ def coherence_where_moving(
     nothing that they could be coherent with.
 
     Args:
-        coherence: of l outputs with m inputs, partial.
-        records: signals of each part.
         moving: the inputs, or their instruments, by their place among the signals.
         window: samples of one.
     """
@@ -568,9 +555,7 @@ def several_windows(
     Args:
         records: signals (c, N) of each part.
         dt: between two samples [s].
-        one: those of one window.
         window: its length [s].
-        m: how many of the signals are inputs.
     """
     longest = max(r.shape[1] for r in records) * dt
     several: list[CrossSpectra] = []
@@ -593,7 +578,6 @@ def pictures_of(
     """H (k, l, m) of several windows together; NaN where the record has no two of them.
 
     Args:
-        several: spectra of each.
         omega: (k,) [rad/s]
         which: places of the m inputs, of the l outputs and of the instruments.
     """
@@ -620,9 +604,6 @@ _BLOCK = 4096
 def forgets(fitted: TransferFit, seconds: float) -> bool:
     """Whether a transfer function forgets within a window, so that what it does is known from the
     record: its slowest mode falls to 1/e.
-
-    Args:
-        seconds: length of a window.
     """
     poles = fitted.poles
     return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
@@ -635,8 +616,6 @@ def window_error(
     a window, so that what it does is not known from the record.
 
     Args:
-        windows: how the response was taken.
-        input: the place of its input among the inputs.
         hold: what that does between samples.
     """
     if not forgets(fitted, windows.seconds):

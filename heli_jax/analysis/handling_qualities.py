@@ -173,7 +173,6 @@ class _Response:
         Args:
             quantity: log_gain or phase.
             below: [rad/s]
-            first: whether the lowest one is meant.
         """
         values = (self.gain if quantity == "log_gain" else self.phase) - level
         end = self.grid.size if below is None else int(np.searchsorted(self.grid, below))
@@ -223,7 +222,6 @@ class _Response:
             omega: where the curve has the level [rad/s].
             off: (k,) of the curve from the level, on the grid.
             reach: (k,) of the curve's interval.
-            start: the same at omega.
         """
         if not np.isfinite(reach).all():
             return np.nan, np.nan

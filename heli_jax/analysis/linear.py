@@ -217,7 +217,6 @@ def frequency_response(
     An input that acts late by d [s] (`Model.delays`) has the factor exp(-i omega d).
 
     Args:
-        model: any, with p outputs and m inputs.
         omega: (k,) [rad/s].
     """
     A, B, C, D = jacobians(model, params)

@@ -57,7 +57,6 @@ def operating_point(
         inputs: as they act (N,), by name, SI: as logged, times a gain where one was estimated.
         outputs: as measured (N,), by name, SI; NaN where missing.
         dt: sample time [s].
-        substeps: of the simulation.
     """
     if model.linear:
         return EVERYWHERE
@@ -80,7 +79,6 @@ def modes_of_flight(
 
     Args:
         params: its parameters, SI; what is known of the flight replaces them.
-        substeps: of the simulation.
     """
     here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # What is known of this flight first: an added mass moves the trim.

@@ -112,12 +112,7 @@ def size_of(x: np.ndarray) -> float:
 
 
 def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """x (k, segments) less its projection on the others (k, segments, inputs).
-
-    Args:
-        others: Fourier transforms of segments at k frequencies.
-        x: the same of one signal.
-    """
+    """x (k, segments) less its projection on the others (k, segments, inputs)."""
     if not others.shape[2]:
         return x
     # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.

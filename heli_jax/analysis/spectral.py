@@ -282,7 +282,6 @@ def responses(
 
     Args:
         inputs: the m inputs, by their place among the signals.
-        outputs: the l outputs likewise.
         instruments: as many excitations, outside of every feedback; without them the inputs are
             taken for ones that do not follow the outputs.
 
@@ -382,9 +381,6 @@ def weights_by_output(
 def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"]) -> CrossSpectra:
     """One picture of several lengths of segments, their mean. It is for looking: no intervals are
     to be taken from it, since the lengths share the record.
-
-    Args:
-        several: of the same signals and frequencies.
     """
     omega, total = several[0].omega, np.sum(weights, axis=0)
     # Inputs that move as one have no response that could decide.

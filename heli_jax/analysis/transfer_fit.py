@@ -175,7 +175,6 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
         measured: the response; frequencies whose numbers are not finite are left out.
         zeros: order m of the numerator, at most n.
         poles: order n of the denominator, from 1 to 8.
-        delay: whether a delay is fitted too.
 
     Raises:
         ValueError: orders out of range, or too few frequencies for so many coefficients.
@@ -305,9 +304,6 @@ def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
     In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, the more so
     the farther p lies beyond: without a lot of evidence a machine has the pole that does not grow.
     A slow one is another matter: it stands in the band, or an interval about zero holds it.
-
-    Args:
-        best: the optimum, its delay free.
     """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)

@@ -127,7 +127,6 @@ def trim(
     Concrete parameters only: `equilibrium` is what can be differentiated and batched.
 
     Args:
-        model: the full nonlinear model of a helicopter.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         sticks: the ends of the sticks' travel by name; those of `STICKS` unless given.
         power_off: autorotation: the throttle is zero, and the climb, which is then negative, is
@@ -179,7 +178,6 @@ def equilibrium(
     """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
 
     Args:
-        model: the full nonlinear model of a helicopter.
         params: its constants, concrete or traced.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         power_off: as in `trim`.
@@ -404,7 +402,6 @@ def first_guess(
     """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight.
 
     Args:
-        model: the full nonlinear model of a helicopter.
         climb: [m/s].
         power_off: whether the climb is found with the motor off.
     """

@@ -47,7 +47,6 @@ def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[
 
     Args:
         omega: (k,) [rad/s], rising.
-        seconds: length of the windows.
     """
     # Half of the way to each neighbour.
     width = np.gradient(omega) if omega.size > 1 else np.ones(1)
@@ -62,7 +61,6 @@ def averaged(
     Args:
         noise: density (k,); NaN where it is not known.
         shares: (k,) how much of an independent frequency each is.
-        averages: independent ones at each, less the inputs.
     """
     known = np.isfinite(noise) & (shares > 0)
     each = 2.0 * averages
@@ -120,9 +118,7 @@ def without_ends(
     Args:
         omega: frequencies [rad/s], rising.
         H: l outputs over m inputs; NaN where they are not known.
-        sd: of their real and imaginary parts.
         ends: what of each input in the window's slope counts as each input in the window [1/s].
-        seconds: length of a window.
     """
     known = np.isfinite(H) & np.isfinite(sd) & (sd > 0)
     # Where an input has no response of its own it has none to take off.
@@ -183,11 +179,9 @@ def _line(
     """How derivatives are taken from l responses to one input.
 
     Args:
-        omega: where they are asked for.
         at: (k,) where the responses were measured.
         measured: these, zero where they are not known, and the standard deviations of their real
             and imaginary parts, NaN there.
-        seconds: length of a window.
     """
     H, variance = measured[0], measured[1] ** 2
     known = np.isfinite(variance)

@@ -154,7 +154,6 @@ def windowed(
 
     Args:
         flights: of one rate, with the same inputs; samples of outputs may be missing.
-        options: band, window and points.
         by: inputs that are taken by their instrument (`Flight.instruments`); all that have one in
             every flight unless given.
 
@@ -225,7 +224,6 @@ def _complete(
     """The outputs that have windows enough, which windows (W, p), and why others have not.
 
     Args:
-        flights: of one rate.
         length: samples of a window.
         asked: the same in seconds, and how many inputs move.
     """

@@ -223,7 +223,6 @@ def inflow_rate(p: Helicopter, force: RotorForce, through: Scalar) -> Scalar:
     Source: Carpenter and Fridovich, NACA TN 3044 (1953).
 
     Args:
-        force: thrust and inflow of the main rotor.
         through: the flow sqrt(V^2 + (W + v_i)^2) through the rotor [m/s].
     """
     # 0.637 is theirs: the share of a sphere of air with the rotor's radius that takes part.

@@ -30,10 +30,6 @@ _RECORDS = ("Params", "State", "Inputs", "Outputs")
 def check_params(params: type, vehicle: Any) -> None:
     """Refuse what has not the parameters of a model.
 
-    Args:
-        params: the model's class of parameters.
-        vehicle: should be one of these.
-
     Raises:
         TypeError: saying what to pass.
     """
@@ -86,11 +82,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
 
 
 def what_instead(value: Any) -> str:
-    """What stands where a Model was expected, for the end of a sentence.
-
-    Args:
-        value: anything but a Model.
-    """
+    """What stands where a Model was expected, for the end of a sentence."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     function = _bare(value)
@@ -241,12 +233,7 @@ class _Function:
         self.traced(check)
 
     def check_fields(self, returned: Any, record: type, role: str) -> None:
-        """Refuse a return value that is no such record.
-
-        Args:
-            returned: what the function gave, of tracers.
-            role: its role in the model.
-        """
+        """Refuse a return value that is no such record."""
         fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])
         more = ", ..." if len(naming.names(record)) > 4 else ""
         expected = f"expected the model's {role}, as `return {record.__name__}({fields}{more})`"

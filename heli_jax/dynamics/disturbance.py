@@ -63,7 +63,6 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
     process noise stays as it is.
 
     Args:
-        model: without a disturbance on those states.
         on: what is disturbed: axes (`disturbable`: the push is an acceleration) or states
             (`disturbable_states`), by name.
         poles: 1 or 2, the order of the filter that colours the noise.

@@ -248,11 +248,7 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
 
 
 def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array, " n"]:
-    """The standard deviations (n,) of all states at the first sample; zero where not random.
-
-    Args:
-        model: with n states.
-    """
+    """The standard deviations (n,) of all states at the first sample; zero where not random."""
     # Zero where a state is not named: its first value is then known, or an unknown of the fit, and
     # not something that the filter may correct.
     random = model.initial_sd(params) if model.initial_sd is not None else {}
@@ -262,9 +258,6 @@ def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array
 
 def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
     """The correlation matrix (n, n) of all states at the first sample.
-
-    Args:
-        model: with n states.
 
     Raises:
         ValueError: the model correlates a state that is not random there.
@@ -389,7 +382,6 @@ def reads(model: Model, params: Record, name: str) -> bool:
 
     Args:
         params: the model's Params; concrete numbers.
-        name: of the parameter.
     """
     if name in dict(model.delays).values():
         return True

@@ -104,7 +104,6 @@ def flapping_rates(
 
     Args:
         Omega: main rotor speed [rad/s].
-        driven: where cyclic pitch and speed would hold it.
         m: the `Motion` of the body, of which p and q [rad/s] count.
         B: tip loss factor, 1 for lift up to the tip.
     """

@@ -18,7 +18,6 @@ def lanes_for(dtype: np.dtype, linear: bool = False) -> int:
     """How many vehicles are in flight at once in one thread.
 
     Args:
-        dtype: of their numbers.
         linear: whether a step is a product of matrices, whose sums wait for each other little.
     """
     # Two of the widest vectors there are: each operation waits for the one before it, and a second
@@ -62,7 +61,6 @@ class Kernel:
                 dimension.
             stored: arrays (N, ...), or (N, vehicles) where each vehicle has its own.
             carry: before the first sample, with the vehicles as the last dimension.
-            threads: how many share the vehicles.
 
         Returns:
             The results, with the vehicles as the last dimension.

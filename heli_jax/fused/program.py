@@ -55,9 +55,6 @@ class Text(NamedTuple):
 def write(run: Run, lanes: int) -> Text:
     """Write the program of a run.
 
-    Args:
-        lanes: vehicles in flight at once in one thread.
-
     Raises:
         UnsupportedError: an operation that has no translation.
     """

@@ -66,8 +66,6 @@ def traced(
     """Trace a run.
 
     Args:
-        making: the steps of an element.
-        shared: what all elements share, but for records.
         records: arrays (N, ...) that are read by the sample.
         element: an example of what an element has of its own.
         own_records: of each leaf of the records whether every element has another; none unless

@@ -365,7 +365,6 @@ def loop(
 
     Args:
         until: how many passes (int32), or of what is carried whether there is another.
-        carry: what is carried, before the first pass.
         body: of the pass's number (int32) and what is carried, what is carried on.
     """
     starts = [elements(code, v) for v in carry]

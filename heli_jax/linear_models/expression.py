@@ -80,7 +80,6 @@ def parse(text: str, known: Mapping[str, Any]) -> Node:
 
     Args:
         text: the expression, of at most `LONGEST` characters.
-        known: the parameters by name.
 
     Raises:
         ExpressionError: it is none, or names a parameter that is not known.
@@ -268,10 +267,6 @@ def parameters_of(node: Node) -> frozenset[str]:
 
 def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dimension:
     """The dimension of an expression.
-
-    Args:
-        of: of each parameter by name.
-        plain: that of a plain number.
 
     Raises:
         ExpressionError: it adds what cannot be added.

@@ -38,7 +38,6 @@ def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple
     """The entries of A, B, C, D and E.
 
     Args:
-        mapping: what the YAML holds.
         content: what `content_of` makes of it.
 
     Raises:
@@ -62,7 +61,6 @@ def not_possible(
     inverse.
 
     Args:
-        content: what the parameters are.
         matrices: of `matrices_of`.
         values: of all parameters, by name [SI].
     """
@@ -143,11 +141,6 @@ class _Matrices:
     def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
         """A matrix as it is written: by row, by column.
 
-        Args:
-            matrix: its name, as A.
-            known: names that its rows may have.
-            columns: names that its columns may have.
-
         Raises:
             InputError: a row or a column has another name.
         """
@@ -171,11 +164,6 @@ class _Matrices:
         self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
     ) -> tuple[Entry, ...]:
         """All entries of a matrix but E.
-
-        Args:
-            name: of the matrix, as A.
-            rows: what each row is in, by name.
-            columns: names that its columns may have.
 
         Raises:
             InputError: a name or an entry is wrong.
@@ -238,9 +226,6 @@ class _Matrices:
         Args:
             place: where it stands, as A.p.b.
             source: a number or an expression, as the YAML has it.
-            row: name of its row.
-            column: name of its column.
-            of: what the row is in.
             per: what the column is in; the state or the input itself unless given.
 
         Raises:

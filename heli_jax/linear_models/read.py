@@ -82,7 +82,6 @@ def linear_model(file: str | Path, folder: str | Path = ".") -> LinearModel:
 
     Args:
         file: the path of a YAML file (docs/linear-models.md), or the name of a shipped one.
-        folder: where a relative path begins.
 
     Raises:
         InputError: there is none, or something in it is wrong.
@@ -141,7 +140,6 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
     """The Model of a file; its Params have the file's values as defaults.
 
     Args:
-        content: the file without its matrices.
         matrices: the entries of A, B, C, D and E.
     """
     State = _record("State", content.states)
@@ -221,9 +219,6 @@ class _Equations:
     ) -> dict[str, Any]:
         """The sums of two matrices' rows, the first times the states, the second times the
         inputs.
-
-        Args:
-            matrices: their names, as A and B.
         """
         # Zeros made of a state have its type and its batch axis.
         zero = 0.0 * state[0]

@@ -34,7 +34,6 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
 
     Args:
         args: with the recurrence, in matrices, and the inputs (N,).
-        x0: the model's State at the first sample.
     """
     assert args.discrete is not None
     if args.discrete.Bn is not None:
@@ -267,10 +266,7 @@ def blocks(
     """A run in steps of m samples.
 
     Args:
-        reducing: what it is reduced by.
         args: the recurrence, in matrices, and the inputs (N,).
-        x0: the model's State at the first sample.
-        start: the value before it.
         data: a pytree of arrays (N,).
     """
     block, discrete = _block_of(reducing.model, args, m)

@@ -83,7 +83,6 @@ def at(
 
     Args:
         inputs: a pytree of arrays (N,).
-        k: an integer or an array of them.
         delays: where given, each input is read its whole samples before k.
     """
 

@@ -43,7 +43,6 @@ def discretize(
     """The exact equivalent of a linear model for steps of `dt` [s], in matrices.
 
     Args:
-        model: linear, with n states and m inputs.
         dt: [s].
         delays: how late the inputs are; whole samples are left to who reads the arrays. With
             `late` [s] the part of each interval before the delayed sample u[k] acts, under a
@@ -97,7 +96,6 @@ def _late(
     Args:
         whole: what they would add over the whole sample at once.
         after: over what is left of it when the sample u[k] arrives.
-        late: the part of the sample before that.
         linear: of each whether it is linear between samples; () holds all.
     """
     # What is added before, at the end of the sample: all of it less what is added after. A ramp
@@ -123,7 +121,6 @@ def process_noise(model: Model, params: Record, dt: Number) -> Float[Array, "n n
     """Covariance of the noise that a linear model's white-noise drive adds in one step.
 
     Args:
-        model: linear, with n states.
         dt: [s].
     """
     A = jacobians(model, params).A

@@ -34,11 +34,7 @@ def rotor_speed(lowest: Scalar, highest: Scalar) -> Event:
 def any_over(
     events: Mapping[str, Event], params: Record, state: Record, inputs: Record
 ) -> Bool[Array, ""]:
-    """Whether one of the events has come.
-
-    Args:
-        inputs: the model's Inputs that act.
-    """
+    """Whether one of the events has come."""
     return jnp.any(jnp.stack([event(params, state, inputs) <= 0 for event in events.values()]))
 
 
@@ -54,8 +50,6 @@ def stopped(
     """The states (N,) with the moment of the first event in place of all that follow it.
 
     Args:
-        model: of which the rates count.
-        events: by name, one or more.
         times: of the samples [s], (N,).
         states: the model's State, arrays (N,), constant from the first sample past an event.
         inputs: the model's Inputs that acted, arrays (N,).

@@ -57,7 +57,6 @@ def between_samples(
     linear. What takes inputs of either hold takes a mixed one as two.
 
     Args:
-        model: of which the names of the inputs count.
         flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
         inputs: the model's Inputs, arrays (N,).
         hold: as `simulate` takes it.

@@ -12,7 +12,6 @@ def random_steps(
 
     Args:
         dt: [s].
-        rng: where levels and times come from.
         hold: the shortest and the longest time [s].
     """
     # Uneven times, since steps at a fixed interval leave gaps in the spectrum.
@@ -32,7 +31,6 @@ def multistep_3211(
 
     Args:
         dt: [s].
-        rng: which decides on the direction of each.
         unit: length of the shortest step [s].
         pause: of neutral between two of them [s].
     """

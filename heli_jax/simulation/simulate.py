@@ -251,9 +251,6 @@ def with_process_noise(
     """Standard normal numbers as further inputs, multiplied by a root of the process noise.
 
     Args:
-        model: one with a noise intensity, n states.
-        args: of the run without noise.
-        options: of which dt, delay and key count.
         linear: of each input whether it moves between samples; () holds all.
 
     Raises:
@@ -309,10 +306,7 @@ def add_process_noise(
     """The state after a sample with the noise of that sample, of the model linearised there.
 
     Args:
-        model: one with a noise intensity, n states.
-        args: of which the parameters and dt count.
         feedback: None, or what makes the acting inputs of the given ones.
-        state: before the noise is added.
     """
     params, dt = args.params, args.dt
     # The linearisation is at the inputs that acted, which the solver within keeps to itself.

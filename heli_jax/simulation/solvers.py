@@ -50,7 +50,6 @@ def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bo
     """The inputs as they act at sample k.
 
     Args:
-        args: with the model's inputs, nothing beside them.
         linear: of each input whether it is linear between samples; () holds all.
     """
     if args.delays is None:
@@ -175,9 +174,6 @@ def advance(
     """x[k+1] from x[k] and the inputs.
 
     Args:
-        discrete: the recurrence, in scalars.
-        x: the n states at sample k.
-        u: the m inputs at sample k.
         before: those of the sample before, where the recurrence has a Bp.
         after: those of the next sample, where it has a Bn.
     """

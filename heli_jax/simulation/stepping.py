@@ -35,7 +35,6 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
     """The model's Inputs as arrays (N,) and the sample time, from a Flight or from Inputs with dt.
 
     Args:
-        model: of which the names of the inputs count.
         flight: a Flight, or Inputs with arrays (N,).
         dt: [s]; that of the Flight unless given.
 
@@ -218,7 +217,6 @@ def held_columns(
     """x[k+1] = Ad x[k] + B U[k] for a linear model: Ad, B, U, and the inputs that act at k.
 
     Args:
-        model: linear, with n states and m inputs.
         inputs: the model's Inputs, arrays (N,).
         dt: [s].
         delay: as in `SimulationOptions`.

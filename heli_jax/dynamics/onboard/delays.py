@@ -35,7 +35,6 @@ def with_delays(
 
     Args:
         inputs: those that act late: names, or by name the parameter (which several may share).
-        outputs: those that are logged late, likewise.
         order: states of each output's delay line, 1 to 8.
 
     Raises:
@@ -171,11 +170,7 @@ class _LateOutputs(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are late read from their lines.
-
-        Args:
-            y: the outputs before the delay.
-        """
+        """The outputs, those that are late read from their lines."""
         return naming.replace(
             y,
             **{
@@ -203,8 +198,6 @@ def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
     loop the input is no record that could be read further back.
 
     Args:
-        model: one of whose inputs is late.
-        name: that input.
         order: states of the line.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
@@ -256,7 +249,6 @@ def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
 
     Args:
         past: the states of the line, in the signal's unit.
-        value: the signal now.
         delay: [s].
     """
     return jnp.where(delay == 0, value, line_end(past))
@@ -311,7 +303,6 @@ def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
 
     Args:
         past: the states m, in the signal's unit.
-        value: the signal u now.
         delay: tau [s].
     """
     rates, delay = [], _possible(delay)

@@ -119,9 +119,7 @@ class Device(abc.ABC):
         """The Model with its device.
 
         Args:
-            suffix: of its name.
             again: puts the same device around another model: that without the stand.
-            **changes: further fields of the Model.
         """
         model, states = self.model, tuple(self.parts.states)
         steady = model.steady_flight
@@ -184,11 +182,6 @@ def _check_new(model: Model, parts: Parts) -> None:
 def require(names: Iterable[str], record: type, kind: str, model: Model) -> None:
     """Refuse names that a model's record does not have, none at all, and one twice.
 
-    Args:
-        record: Inputs, Outputs or State of the model.
-        kind: what they are, as 'input'.
-        model: named in the sentence.
-
     Raises:
         ValueError: naming the first that is wrong.
     """
@@ -209,7 +202,6 @@ def quotient(above: str | None, below: str | None) -> str | None:
 
     Args:
         above: unit of the first, as `rad/s`.
-        below: unit of the second.
     """
     if above is None or below is None:
         return None

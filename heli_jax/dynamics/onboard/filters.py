@@ -75,11 +75,7 @@ class Filter(NamedTuple):
 
 
 def cutoff(filters: Sequence[Filter]) -> float:
-    """Where low-passes one behind the other are 3 dB down together [Hz].
-
-    Args:
-        filters: low-passes, at least one.
-    """
+    """Where low-passes one behind the other are 3 dB down together [Hz]."""
     # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
     # quality rises before it falls, so the last crossing counts.
     hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
@@ -145,7 +141,6 @@ def with_filters(
     a line of states as in `with_delays`. Both are linear, with constants that are fixed.
 
     Args:
-        filters: by output, one after the other.
         delays: by output [s], at most `LONGEST_DELAY`; the delay stands behind the filters.
 
     Raises:
@@ -181,7 +176,6 @@ def check_delay(delay: float, where: str) -> None:
 
     Args:
         delay: [s].
-        where: what the sentence begins with.
 
     Raises:
         ValueError: it is negative, too long or no number.
@@ -301,11 +295,7 @@ class _Filtered(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs as they are logged.
-
-        Args:
-            y: the outputs before the filters.
-        """
+        """The outputs as they are logged."""
         logged = {}
         for n, sections in self.sections.items():
             value = getattr(y, n)
@@ -317,13 +307,7 @@ class _Filtered(Device):
         return naming.replace(y, **logged)
 
     def _behind(self, s: Record, state: str, speed: str, section: _Section, value: Any) -> Any:
-        """The signal behind a section.
-
-        Args:
-            state: the section's own.
-            speed: that of its rate.
-            value: the signal before it.
-        """
+        """The signal behind a section."""
         if section.left is None:
             return getattr(s, state)
         # The low-passed signal's rate over omega Q is the band that a notch takes away.

@@ -49,7 +49,6 @@ def with_sensors(
     Args:
         lowpass: outputs that are low-passed, `ax` and its like among them.
         delay: outputs that are late, by names or by name the parameter.
-        imu: whether there is an accelerometer.
         angular_acceleration: whether `pdot`, `qdot`, `rdot` [rad/s^2] are outputs.
         airspeed: whether `airspeed` and `u_air`, `v_air`, `w_air` [m/s] are outputs, at (`x_air`,
             `y_air`, `z_air`) [m] from the centre of gravity.
@@ -103,11 +102,7 @@ class _LowPass(Device):
         }
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are low-passed read from their states.
-
-        Args:
-            y: the outputs before the low-pass.
-        """
+        """The outputs, those that are low-passed read from their states."""
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
@@ -302,7 +297,6 @@ def specific_force(
     """The specific force at the IMU [m/s^2], by output.
 
     Args:
-        model: without its IMU.
         motion: of `motion_of`.
         p: the model's Params with x_imu, y_imu, z_imu.
     """
@@ -320,7 +314,6 @@ def airspeed(
     forward, right, down, and airspeed, their norm [m/s].
 
     Args:
-        model: without its probe.
         motion: of `motion_of`.
         p: the model's Params with x_air, y_air, z_air.
         u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.

@@ -35,8 +35,6 @@ def with_servos(
     [s]. New states: the servo's position and speed, `INPUT_NAME` and `INPUT_NAME_rate`.
 
     Args:
-        model: whose inputs are moved by servos.
-        on: those inputs.
         rate_limit: whether they are limited in rate; the model is then no longer linear.
         delay: whether they act late by a pure delay, exact (`Model.delays`).
         name: ends the names of parameters and states, for a second kind of servo.
