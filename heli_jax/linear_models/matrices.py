@@ -1,5 +1,6 @@
 """The matrices of a file, entry by entry: names, units and expressions checked."""
 
+import ast
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -210,7 +211,7 @@ class _Matrices:
         value = float(source)
         if not math.isfinite(value):
             raise InputError(f"{place}: expected a finite number, got {source!r:.40}")
-        return expression.Number(value)
+        return ast.Constant(value)
 
     def entry(
         self,
