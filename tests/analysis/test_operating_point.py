@@ -11,7 +11,6 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.analysis.operating_point import operating_point
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.excitation import sampling
 from heli_jax.report import frequency
@@ -60,19 +59,6 @@ def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering)
     assert abs(hovering(1.0)) > 10.0
     for w in (0.5, 1.0, 5.0):
         assert H(np.array([w]))[0] == pytest.approx(hovering(w), rel=1e-4)
-
-
-@pytest.mark.slow
-def test_a_disturbed_helicopter_is_trimmed_without_its_disturbance(xcell):
-    plain = models.helicopter("consistent")
-    model = with_disturbance(plain, "roll", 2)
-    params = model.Params(**{n: getattr(xcell, n) for n in type(xcell).__dataclass_fields__})
-    at = operating_point(model, params, STILL, {"z": np.zeros(N)}, DT)
-    assert at.words == "the trim in hover"
-    assert (float(at.state.w1_roll), float(at.state.w2_roll)) == (0.0, 0.0)
-    state, inputs = oracle.hover(oracle.XCELL)["consistent"]
-    assert float(at.state.Omega) == pytest.approx(state["Omega"], rel=1e-6)
-    assert float(at.inputs.x_throttle) == pytest.approx(inputs["x_throttle"], rel=1e-6)
 
 
 def test_a_record_of_forward_flight_is_linearised_there(xcell):

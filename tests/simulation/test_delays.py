@@ -67,7 +67,6 @@ def model(linear):
 
 
 LINEAR, NONLINEAR = model(True), model(False)
-PLAIN = Model("plain", field, output, Params, State, Inputs, Outputs, linear=True)
 
 
 def sticks(seed=0):
@@ -190,23 +189,6 @@ def test_derivatives_by_each_delay(machine, hold):
         np.testing.assert_allclose(J[:, i], central, rtol=0, atol=1e-6 * np.abs(central).max())
 
 
-@pytest.mark.slow
-def test_one_delay_of_all_and_one_of_its_own_add_up(run):
-    u = sticks(4)
-    own = run(LINEAR, u, (0.031, 0.116), "linear", delay=0.02)
-    p = Params(late=jnp.asarray(0.051), later=jnp.asarray(0.136))
-    shifted = simulate(
-        LINEAR, p, Inputs(*jnp.asarray(u)), dt=DT, hold={"elevator": "linear", "flap": "linear"}
-    ).outputs
-    # The thrust has no delay of its own and is late by the common one.
-    late = simulate(
-        PLAIN, p, Inputs(0.0 * u[2], 0.0 * u[2], u[2]), dt=DT, hold="linear", delay=0.02
-    ).outputs
-    at_once = simulate(PLAIN, p, Inputs(0.0 * u[2], 0.0 * u[2], u[2]), dt=DT).outputs
-    together = np.asarray(shifted.theta) - np.asarray(at_once.theta) + np.asarray(late.theta)
-    np.testing.assert_allclose(own[0], together, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
 def test_the_filter_without_noise_predicts_the_simulation(run, machine):
     """With nothing random in it a filter corrects nothing: its innovations are y - simulation."""
@@ -268,20 +250,3 @@ def test_delays_are_found_beside_the_parameters(run, window):
         estimate = found.estimates[name]
         assert abs(estimate.value - true) < 4 * estimate.sd, name
     assert found.estimates["late"].sd < 2e-3
-
-
-@pytest.mark.slow
-def test_a_shift_of_all_inputs_in_windows(run):
-    u = sticks(10)
-    # The thrust stays at its neutral, so that all that moves is late by 0.1 s more.
-    u[2] = 0.0
-    machine = Params(late=jnp.asarray(0.031), later=jnp.asarray(0.116))
-    y = run(LINEAR, u, (0.131, 0.216), "linear")[0]
-    flight = Flight(
-        dt=DT, inputs=dict(zip(Inputs._fields, u, strict=True)), outputs={"theta": y},
-        hold=dict.fromkeys(Inputs._fields, "linear"),
-    )  # fmt: skip
-    nuisance = Nuisance(bias=False, time_shift=True)
-    found = fit(Problem(LINEAR, machine, [flight], {"k": Free(3.5)}, nuisance, window=1.0))
-    assert found.nuisance["time_shift"].value == pytest.approx(0.1, abs=1e-5)
-    assert found.estimates["k"].value == pytest.approx(4.0, rel=1e-5)

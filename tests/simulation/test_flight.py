@@ -11,7 +11,6 @@ import pytest
 import scipy.integrate
 
 from heli_jax import Model, load_vehicle, models, naming, simulate, trim
-from heli_jax.dynamics import helicopter as whole
 from heli_jax.simulation.events import ground, rotor_speed, stopped
 from heli_jax.simulation.trajectory import STATUS
 from tests.dynamics import whole_helicopter as oracle
@@ -61,99 +60,6 @@ def test_free_fall_is_a_parabola(xcell):
     np.testing.assert_allclose(run.states.z, 5.0 * t - 0.5 * 9.80665 * t**2, rtol=1e-9, atol=1e-12)
     assert STATUS[int(run.status)] == "outside the model's range"  # the rotor stands still
     assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(60))
-
-
-@pytest.mark.slow
-def test_turning_the_problem_turns_the_trajectory(xcell, hover):
-    model, angle, n = models.helicopter("consistent"), 2.2, 150
-    u = sticks(hover, n)
-
-    @jax.jit
-    def flown(s):
-        return simulate(model, xcell, u, dt=DT, initial_state=s).states
-
-    start = naming.replace(hover.state, dx=2.0, dy=1.0, dphi=0.1)
-    c, d = np.cos(angle), np.sin(angle)
-    turned = naming.replace(start, dx=2.0 * c - 1.0 * d, dy=2.0 * d + 1.0 * c, psi=angle)
-    one, other = flown(start), flown(turned)
-    np.testing.assert_allclose(other.x, c * one.x - d * one.y, atol=1e-9)
-    np.testing.assert_allclose(other.y, d * one.x + c * one.y, atol=1e-9)
-    np.testing.assert_allclose(other.psi, one.psi + angle, atol=1e-9)
-    for name in ("z", "phi", "theta", "Omega", "beta_roll"):
-        np.testing.assert_allclose(getattr(other, name), getattr(one, name), atol=1e-9)
-
-
-def energetic(p):
-    """The consistent helicopter with the work done on it as one more state, and its energy."""
-    base = models.helicopter("consistent")
-    how = whole.Corrections(*[True] * 11)
-    State = naming.extended(base.State, "Working", {"work": (float, None)})
-
-    def inner(s):
-        return base.State(**{n: getattr(s, n) for n in naming.names(base.State)})
-
-    def field(p, s, u):
-        m = whole.motion(how, s, u)
-        air = whole.flow(how, p, s, u, m)
-        force = whole.main_rotor(how, p, s, u, air)
-        tail = whole.tail_rotor(how, p, u, m, s.Omega, whole.inflow_of(how))
-        rotors = whole.Rotors(force, tail)
-        a = whole.accelerations(how, p, m, force.T)
-        hub = whole.rigid_hub_moments(how, p, s, u, m, force)
-        M = whole.moments(how, p, hub, rotors, whole.drive(how, p, s, u, air, rotors))
-        power = p.m * (a[0] * s.dx + a[1] * s.dy + (a[2] + p.g) * s.dz)
-        power = power + M.roll * m.p + M.pitch * m.q + M.yaw * m.r
-        return State(**naming.asdict(base.vector_field(p, inner(s), u)), work=power)
-
-    def energy(s):
-        m = whole.motion(how, s, None)
-        spin = p.Ixx * m.p**2 + p.Iyy * m.q**2 + p.Izz * m.r**2
-        return 0.5 * p.m * (s.dx**2 + s.dy**2 + s.dz**2) + 0.5 * spin + p.m * p.g * s.z
-
-    model = Model("working", field, lambda p, s, u: base.output(p, inner(s), u), base.Params, State,
-                  base.Inputs, base.Outputs)  # fmt: skip
-    return model, energy
-
-
-@pytest.mark.slow
-def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
-    model, energy = energetic(xcell)
-    start = model.State(**naming.asdict(hover.state), work=jnp.zeros(()))
-    u = sticks(hover, 100, roll=2e-3, pitch=2e-3, yaw=0.2, throttle=0.05)
-    left = []
-    for substeps in (4, 8):
-        run = jax.jit(
-            lambda s, k=substeps: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=k)
-        )(start)
-        E = np.asarray(jax.vmap(energy)(run.states))
-        assert np.ptp(E) > 10.0  # something happens
-        left.append(np.max(np.abs(E - E[0] - np.asarray(run.states.work))) / np.ptp(E))
-    assert left[1] < 1e-6
-    assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
-def test_rk4_is_dopri8(variant, substeps, xcell):
-    model = models.helicopter(variant)
-    found = trim(model, xcell)
-    u = sticks(found, 250, roll=1e-6, pitch=1e-6, yaw=0.01, throttle=2e-3)
-    if variant == "consistent":
-        u = sticks(found, 250)
-    run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=substeps))(
-        found.state
-    )
-    exact = jax.jit(
-        lambda s: simulate(
-            model, xcell, u, dt=DT, initial_state=s,
-            controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
-        )
-    )(found.state)  # fmt: skip
-    assert int(run.status) == int(exact.status) == 0
-    for name in ("x", "y", "z", "phi", "theta", "psi", "Omega"):
-        np.testing.assert_allclose(
-            getattr(run.states, name), getattr(exact.states, name), atol=1e-6, err_msg=name
-        )
 
 
 def test_two_seconds_are_scipys(xcell, hover):
