@@ -207,26 +207,34 @@ def test_a_flight_says_how_its_inputs_move():
     flight = Flight(dt=DT, inputs={"de": DE, "dr": DR}, outputs={}, hold={"de": "linear"})
     assert flight.hold == MIXED
     start = State(*jnp.asarray(X0))
-    found = simulate(LINEAR, Params(), flight, initial_state=start)
-    close(states(found), integrated(), 1e-9)
-    other = simulate(LINEAR, Params(), flight, initial_state=start, hold={"de": "zero-order"})
-    plain = compiled(hold="none")(inputs(), jnp.asarray(0.0))
-    close(states(other), states(plain), 1e-12)
+
+    def flown(p, **how):
+        return simulate(LINEAR, p, flight, initial_state=start, **how)
+
+    close(states(jax.jit(flown)(Params())), integrated(), 1e-9)
+    other = jax.jit(lambda p: flown(p, hold={"de": "zero-order"}))(Params())
+    close(states(other), integrated(holds=("zero-order", "zero-order")), 1e-9)
 
 
 @pytest.mark.parametrize(("block", "n"), [(1, N), (4, N), (4, N - 2)])
 def test_accumulated_is_what_simulate_gives(block, n):
     u = inputs(DE[:n], DR[:n])
-    found = accumulated(
-        LINEAR, Params(), u, lambda s, y, d: s + d * (y.az + y.q**2), jnp.asarray(0.0),
-        data=jnp.arange(1.0, n + 1), dt=DT, initial_state=State(*jnp.asarray(X0)), block=block,
-        hold=MIXED,
-    )  # fmt: skip
+
+    @jax.jit
+    def reduced(u):
+        found = accumulated(
+            LINEAR, Params(), u, lambda s, y, d: s + d * (y.az + y.q**2), jnp.asarray(0.0),
+            data=jnp.arange(1.0, n + 1), dt=DT, initial_state=State(*jnp.asarray(X0)),
+            block=block, hold=MIXED,
+        )  # fmt: skip
+        return found.value, found.state
+
+    value, state = reduced(u)
     run = compiled()(inputs(), jnp.asarray(0.0))
     total = np.sum(np.arange(1, n + 1) * np.asarray(run.outputs.az + run.outputs.q**2)[:n])
-    assert float(found.value) == pytest.approx(total, rel=1e-10)
-    np.testing.assert_allclose(found.state.w, run.states.w[n - 1], rtol=1e-9)
-    np.testing.assert_allclose(found.state.q, run.states.q[n - 1], rtol=1e-9)
+    assert float(value) == pytest.approx(total, rel=1e-10)
+    np.testing.assert_allclose(state.w, run.states.w[n - 1], rtol=1e-9)
+    np.testing.assert_allclose(state.q, run.states.q[n - 1], rtol=1e-9)
 
 
 def test_accumulate_with_other_solvers():
@@ -244,11 +252,16 @@ def test_accumulate_with_other_solvers():
 def test_filters_predict_with_mixed_and_linear_inputs(model):
     """Without noise of the process the innovations are the simulation's error."""
     measured, delay = {"q": jnp.zeros(N), "az": jnp.zeros(N)}, jnp.asarray(0.083)
-    error = innovations(
-        model, Params(), inputs(de=STICK), measured, {"q": 0.1, "az": 0.2}, dt=DT,
-        initial_state=State(*jnp.asarray(X0)), delay=delay,
-        hold={"de": "mixed", "dr": "zero-order"},
-    ).error  # fmt: skip
+
+    @jax.jit
+    def filtered(u, delay):
+        return innovations(
+            model, Params(), u, measured, {"q": 0.1, "az": 0.2}, dt=DT,
+            initial_state=State(*jnp.asarray(X0)), delay=delay,
+            hold={"de": "mixed", "dr": "zero-order"},
+        ).error  # fmt: skip
+
+    error = filtered(inputs(de=STICK), delay)
     found = compiled("exact", True, 1, 8, "jumps", 0.0)(inputs(de=STICK), delay)
     np.testing.assert_allclose(error["q"], -found.states.q, atol=1e-9)
     np.testing.assert_allclose(error["az"], -found.outputs.az, atol=1e-9)
@@ -257,10 +270,8 @@ def test_filters_predict_with_mixed_and_linear_inputs(model):
 def test_an_event_is_found_where_the_moving_input_brings_it():
     """u rises through 0.55 in the middle of a sample: a held one shows that later."""
     u = Inputs(jnp.arange(10.0) / 10, jnp.zeros(10))
-    found = simulate(
-        OTHER, Params(), u, dt=DT, hold="linear",
-        events={"full": lambda p, s, u: 0.55 - u.de},
-    )  # fmt: skip
+    events = {"full": lambda p, s, u: 0.55 - u.de}
+    found = jax.jit(lambda u: simulate(OTHER, Params(), u, dt=DT, hold="linear", events=events))(u)
     assert float(found.ended) == pytest.approx(5.5 * DT, abs=1e-9)
 
 
