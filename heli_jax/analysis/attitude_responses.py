@@ -54,7 +54,7 @@ class Handling(NamedTuple):
 
 
 def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair, ...]:
-    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, among the outputs."""
+    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, of the outputs."""
     pairs = []
     for axis in axes_of(model):
         stick = _stick(model, axis)

@@ -16,14 +16,16 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from heli_jax.analysis.response_curves import octave_mean
-from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import (
     OVERLAP,
+    OWN,
     CrossSpectra,
     TooFewAveragesError,
     combined,
     cross_spectra,
+    leakage,
     responses,
+    segment_transforms,
     weights_by_output,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
@@ -160,7 +162,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has a part that is long enough.
     """
-    dt = _one_rate(flights)
+    dt = one_rate(flights)
     flights = [without_jumps(f) for f in flights]
     longest = max(f.duration for f in flights)
     window = settings.window or min(longest / 5.0, _LONGEST)
@@ -223,12 +225,17 @@ def require_window(window: float, longest: float) -> None:
         )
 
 
-def _one_rate(flights: Sequence[Flight]) -> float:
+def one_rate(flights: Sequence[Flight]) -> float:
+    """The sample time [s] of flights that share it.
+
+    Raises:
+        ValueError: they do not.
+    """
     rates = sorted({round(1.0 / f.dt, 6) for f in flights})
     if len(rates) > 1:
         listed = ", ".join(f"{r:g}" for r in rates)
         raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return flights[0].dt
+    return float(flights[0].dt)
 
 
 def _frequencies(settings: Settings, window: float, dt: float, step: float) -> np.ndarray:

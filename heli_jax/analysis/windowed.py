@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.analysis.flight_responses import require_window
+from heli_jax.analysis.flight_responses import one_rate, require_window
 from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.spectra import OWN, leakage
-from heli_jax.analysis.spectral import OVERLAP
+from heli_jax.analysis.spectral import OVERLAP, OWN, leakage
 from heli_jax.flights.flight import Flight
 
 _LONGEST = 30.0
@@ -161,7 +160,7 @@ def windowed(
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has windows enough.
     """
-    dt = _one_rate(flights)
+    dt = one_rate(flights)
     longest = max(f.duration for f in flights) + dt
     seconds = options.window or min(longest / 5.0, _LONGEST)
     require_window(seconds, longest)
@@ -245,14 +244,6 @@ def _complete(
     each = list(zip(outputs, averages, kept, strict=True))
     left_out = {n: f"{need} {count:.2g} {windows}" for n, count, fine in each if not fine}
     return tuple(n for n, _, fine in each if fine), seen[:, kept], left_out
-
-
-def _one_rate(flights: Sequence[Flight]) -> float:
-    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
-    if len(rates) > 1:
-        listed = ", ".join(f"{r:g}" for r in rates)
-        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return float(flights[0].dt)
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:

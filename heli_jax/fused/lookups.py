@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.fused.code import Code, UnsupportedError, Value, constant
-from heli_jax.fused.operands import (
+from heli_jax.fused.code import (
     INDEX,
     LONG,
     MOST,
+    Code,
     Elements,
     Operand,
     Stored,
+    UnsupportedError,
+    Value,
     at_place,
+    constant,
     dtype_of,
     elements,
     scalar,

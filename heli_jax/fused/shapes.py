@@ -9,20 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.fused.code import Code, UnsupportedError, Value, constant
-from heli_jax.fused.lookups import gathered, padded, searched, updated
-from heli_jax.fused.operands import (
+from heli_jax.fused.code import (
     INDEX,
     LONG,
     MOST,
+    Code,
     Elements,
     Operand,
     Stored,
+    UnsupportedError,
+    Value,
     at_place,
+    constant,
     dtype_of,
     elements,
     scalar,
 )
+from heli_jax.fused.lookups import gathered, padded, searched, updated
 from heli_jax.fused.operations import OPERATIONS, converted, in_type, within
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.kernel import Argument, Run
 from heli_jax.fused.translate import place_of
 from heli_jax.numerics.hoist import hoisted
 

@@ -17,19 +17,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from heli_jax.fused.code import Code, UnsupportedError, Value, constant, said
-from heli_jax.fused.lookups import COMBINED, Combined, in_order, scattered
-from heli_jax.fused.operands import (
+from heli_jax.fused.code import (
     INDEX,
     MOST,
+    Code,
     Elements,
     Operand,
     Stored,
+    UnsupportedError,
+    Value,
     at_place,
+    constant,
     dtype_of,
     elements,
+    said,
     scalar,
 )
+from heli_jax.fused.lookups import COMBINED, Combined, in_order, scattered
 from heli_jax.fused.operations import OPERATIONS
 from heli_jax.fused.shapes import SHAPED
 

@@ -14,8 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
 from heli_jax.simulation.blocks import Reducing, blocks, of_whole_run
-from heli_jax.simulation.delays import at
-from heli_jax.simulation.hold import FlightOrInputs, between_samples
+from heli_jax.simulation.hold import FlightOrInputs, at, between_samples
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import (
     SolverWrapper,

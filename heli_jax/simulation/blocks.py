@@ -21,8 +21,8 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.matrix_exponential import product
-from heli_jax.simulation.delays import at
 from heli_jax.simulation.discretize import Discrete, scalars
+from heli_jax.simulation.hold import at
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, dot
 
 

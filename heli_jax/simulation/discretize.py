@@ -12,7 +12,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.numerics.matrix_exponential import expm, van_loan
-from heli_jax.simulation.delays import Delays
+from heli_jax.simulation.hold import Delays
 
 
 class Discrete(NamedTuple):

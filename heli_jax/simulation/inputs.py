@@ -1,7 +1,5 @@
 """Stick inputs to excite a machine with; each function gives (N,) samples of unit amplitude."""
 
-import warnings
-
 import numpy as np
 
 
@@ -61,16 +59,3 @@ def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
     t = np.arange(n) * dt
     growth = np.log(high / low) / max(t[-1], dt)
     return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
-
-
-def sweep(n: int, dt: float, low: float, high: float) -> np.ndarray:
-    """Deprecated: the name that `chirp` had.
-
-    Args:
-        n: as all others those of `chirp`.
-        dt: [s].
-        low: [Hz].
-        high: [Hz].
-    """
-    warnings.warn("sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
-    return chirp(n, dt, low, high)

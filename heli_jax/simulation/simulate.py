@@ -22,10 +22,9 @@ from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record, Scalar
 from heli_jax.numerics.matrix_exponential import van_loan
 from heli_jax.simulation.blocks import blockwise
-from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.discretize import Discrete, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
-from heli_jax.simulation.hold import FlightOrInputs, at_end, between_samples, delayed
+from heli_jax.simulation.hold import Delays, FlightOrInputs, at, at_end, between_samples, delayed
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import (
     Adaptive,

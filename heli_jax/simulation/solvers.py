@@ -18,9 +18,8 @@ from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from heli_jax.errors import nearest
 from heli_jax.naming import Record, Scalar
-from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import delayed, segments
+from heli_jax.simulation.hold import Delays, at, delayed, segments
 
 type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
 """as diffrax takes it, which has no NumPy scalars among its types"""

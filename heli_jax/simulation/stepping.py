@@ -16,9 +16,8 @@ from heli_jax.dynamics.check_model import check_params
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import columns
-from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import discretize
-from heli_jax.simulation.hold import FlightOrInputs, delayed
+from heli_jax.simulation.hold import FlightOrInputs, delayed, delays_of
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.solvers import (
     RK4,

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.kernel import Kernel
-from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.kernel import Argument, Kernel, Run
 from heli_jax.fused.traced import traced
 from heli_jax.simulation.accumulate import Steps
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from heli_jax import Helicopter, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.numerics.matrix_exponential import expm, van_loan
-from heli_jax.simulation.delays import Delays
 from heli_jax.simulation.discretize import (
     discretize,
     process_noise,
     square_root,
 )
+from heli_jax.simulation.hold import Delays
 from tests.dynamics.paper import BENCH, matrices, scattered
 
 fast = jax.jit(expm)
