@@ -562,7 +562,6 @@ def several_windows(
     Args:
         records: signals (c, N) of each part.
         dt: between two samples [s].
-        window: its length [s].
     """
     longest = max(r.shape[1] for r in records) * dt
     several: list[CrossSpectra] = []
@@ -621,9 +620,6 @@ def window_error(
 ) -> Complex[np.ndarray, " k"] | None:
     """What windows add to the response of a transfer function; None where it does not forget within
     a window, so that what it does is not known from the record.
-
-    Args:
-        hold: what that does between samples.
     """
     if not forgets(fitted, windows.seconds):
         return None

@@ -110,7 +110,6 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
             unity feedback. The sign of an attitude's response does not matter: it is taken for
             that of a machine whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
             is taken as it is.
-        kind: rate, attitude-command or open-loop.
     """
     grid = np.geomspace(*curve.band, _POINTS)
     points = curve.at(grid)

@@ -320,7 +320,6 @@ def modelled_curve(
     Args:
         root: (q, r) R with R R' the covariance of the parameters; NaN where it is not known.
         band: [rad/s]
-        acting: gain and delay of the input that were estimated.
     """
     j = naming.names(of.model.Inputs).index(pair[0])
     i = naming.names(of.model.Outputs).index(pair[1])

@@ -98,7 +98,6 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 
     Args:
         g: windows times the turning of each line (k, samples), less their means.
-        d: lines.
         step: from a window to the next, in samples.
     """
     a, b = g[: len(g) - d], np.conj(g[d:])

@@ -64,8 +64,6 @@ def spectra(
     """Averages over half-overlapping segments, each less its straight line, in a Hann window.
 
     Args:
-        u: the input (N,).
-        y: the output (N,).
         dt: time between samples [s].
         length: samples of a segment, at most N.
 
@@ -234,7 +232,6 @@ def chirp_z(
     """The sums over n of x[n] exp(-i omega n dt), by Bluestein's (1970) convolution.
 
     Args:
-        x: signals (..., N).
         dt: between two samples [s].
         omega: (k,) [rad/s], equally spaced.
 
@@ -463,7 +460,6 @@ def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Of matrices (k, m, m); NaN where one is singular but for rounding.
 
     Args:
-        M: cross-spectra.
         rows: densities (k, m) of the signals of the rows.
     """
     with np.errstate(all="ignore"):

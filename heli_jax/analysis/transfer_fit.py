@@ -377,9 +377,6 @@ def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
     """Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted by
     coherence; NaN where nothing is measured.
 
-    Args:
-        model: at the same frequencies (k,).
-
     Source: Tischler and Remple (2012), section 11.2.
     """
     seen = np.isfinite(measured.H) & (np.abs(measured.H) > 0) & np.isfinite(measured.coherence)

@@ -3,7 +3,6 @@
 The search begins at momentum theory in hover.
 """
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -37,7 +36,9 @@ _UPRIGHT = 1.5
 """roll and pitch [rad] below which a machine is not on its back"""
 
 
-class _Condition(NamedTuple):
+class Condition(NamedTuple):
+    """A steady flight; speeds over the ground in m/s, along the heading and across it."""
+
     forward_speed: Any = 0.0
     """over the ground along the heading [m/s]"""
     lateral_speed: Any = 0.0
@@ -46,55 +47,6 @@ class _Condition(NamedTuple):
     """[m/s]"""
     heading: Any = 0.0
     """psi [rad]"""
-
-
-class Condition(_Condition):
-    """A steady flight; speeds over the ground in m/s, along the heading and across it.
-
-    The keywords `ahead` and `aside` are deprecated: `forward_speed` and `lateral_speed`.
-    """
-
-    # A named tuple takes no keyword beside its fields: the old ones need a subclass with a __new__.
-    __slots__ = ()
-
-    def __new__(
-        cls,
-        forward_speed: Any = 0.0,
-        lateral_speed: Any = 0.0,
-        climb: Any = 0.0,
-        heading: Any = 0.0,
-        **deprecated: Any,
-    ) -> "Condition":
-        speeds = {"forward_speed": forward_speed, "lateral_speed": lateral_speed}
-        for old, value in deprecated.items():
-            if old not in _RENAMED:
-                raise TypeError(f"Condition: expected {', '.join(cls._fields)}, got {old!r}")
-            _warn_renamed(old)
-            speeds[_RENAMED[old]] = value
-        return super().__new__(cls, **speeds, climb=climb, heading=heading)
-
-    @property
-    def ahead(self) -> Any:
-        """Deprecated: the name that `forward_speed` had."""
-        _warn_renamed("ahead")
-        return self.forward_speed
-
-    @property
-    def aside(self) -> Any:
-        """Deprecated: the name that `lateral_speed` had."""
-        _warn_renamed("aside")
-        return self.lateral_speed
-
-
-_RENAMED = {"ahead": "forward_speed", "aside": "lateral_speed"}
-
-
-def _warn_renamed(old: str) -> None:
-    warnings.warn(
-        f"Condition: {old} is deprecated, expected {_RENAMED[old]}",
-        DeprecationWarning,
-        stacklevel=3,
-    )
 
 
 class Trim(NamedTuple):
@@ -180,7 +132,6 @@ def equilibrium(
     Args:
         params: its constants, concrete or traced.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
-        power_off: as in `trim`.
 
     Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
     """
@@ -403,7 +354,6 @@ def first_guess(
 
     Args:
         climb: [m/s].
-        power_off: whether the climb is found with the motor off.
     """
     # Momentum theory in hover, then blade-element theory solved for the collective pitch.
     area = jnp.pi * p.R**2

@@ -124,7 +124,6 @@ def window_transforms(
     """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
 
     Args:
-        x: signals (c, N).
         starts: first samples of the W windows.
         length: samples of each.
         lines: the k lines of the window that are kept.

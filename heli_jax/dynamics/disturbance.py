@@ -380,7 +380,6 @@ def with_sensor_noise(model: Model, outputs: tuple[str, ...]) -> Model:
 
     Args:
         model: with `Model.low_passes` for these outputs.
-        outputs: names; none: the model itself.
     """
     if not outputs:
         return model

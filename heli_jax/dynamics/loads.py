@@ -53,11 +53,7 @@ class Drive(NamedTuple):
 
 
 def motor_torque(corrections: Corrections, p: Helicopter, throttle: Scalar) -> Scalar:
-    """T_m [N m], eq. 19, or as eq. 10 has the motor.
-
-    Args:
-        throttle: 0 to 1.
-    """
+    """T_m [N m], eq. 19, or as eq. 10 has the motor."""
     # Eq. 10 accelerates the rotor by K_throttle x_throttle, a torque Ir K_throttle on the fuselage.
     # K_Tm says the same thing once more: only where the two agree is the motor's torque one number.
     gain = p.Ir * p.K_throttle if corrections.tied_torque else p.K_Tm

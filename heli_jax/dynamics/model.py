@@ -1,7 +1,6 @@
 """Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
 
 import copy
-import warnings
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
@@ -153,24 +152,6 @@ class Model(eqx.Module):
     )
     """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
     are derivatives of Euler angles; None: the axes' rates are those of the body"""
-    noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
-    """deprecated: the name that `noise_intensity` had"""
-    spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
-    """deprecated: the name that `initial_sd` had"""
-
-    def __post_init__(self) -> None:
-        # The old keywords are emptied, so that dataclasses.replace does not give them again.
-        for old, new in (("noise", "noise_intensity"), ("spread", "initial_sd")):
-            if (function := getattr(self, old)) is not None:
-                warnings.warn(
-                    f"Model: the keyword {old} is deprecated, expected {new}",
-                    DeprecationWarning,
-                    stacklevel=3,
-                )
-                setattr(self, new, function)
-                setattr(self, old, None)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return by_value(self)
@@ -365,7 +346,6 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
 
     Args:
         params: the model's Params; concrete numbers, NaN where not given.
-        given: parameters that come from elsewhere.
 
     Raises:
         VehicleError: one is missing.

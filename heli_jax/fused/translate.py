@@ -58,9 +58,6 @@ _NESTED = {
 def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[Operand]) -> list:
     """Write what a jaxpr computes.
 
-    Args:
-        jaxpr: as `jax.make_jaxpr` gives it, closed or with its constants.
-
     Returns:
         An operand for each result.
 

@@ -38,9 +38,6 @@ class _Unit(NamedTuple):
 def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
     """The entries of A, B, C, D and E.
 
-    Args:
-        content: what `content_of` makes of it.
-
     Raises:
         InputError: an entry is wrong, or the parameters' values make one infinite.
     """
@@ -62,7 +59,6 @@ def not_possible(
     inverse.
 
     Args:
-        matrices: of `matrices_of`.
         values: of all parameters, by name [SI].
     """
     # A sentence is returned and nothing is raised, since who calls knows whether the values are the
@@ -225,7 +221,6 @@ class _Matrices:
         """One entry, checked.
 
         Args:
-            place: where it stands, as A.p.b.
             source: a number or an expression, as the YAML has it.
             per: what the column is in; the state or the input itself unless given.
 

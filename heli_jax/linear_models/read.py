@@ -137,11 +137,7 @@ def _text(file: str | Path, folder: Path) -> tuple[str, str]:
 
 
 def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Model:
-    """The Model of a file; its Params have the file's values as defaults.
-
-    Args:
-        matrices: the entries of A, B, C, D and E.
-    """
+    """The Model of a file; its Params have the file's values as defaults."""
     State = _record("State", content.states)
     Outputs = _record("Outputs", content.outputs)
     # The records are made once and used for both the functions and the Model: two classes of the

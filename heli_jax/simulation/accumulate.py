@@ -59,7 +59,6 @@ def accumulate(
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         update: value = update(value, outputs, data at that sample), at every sample.
         start: the value before the first sample, a pytree of numbers.
-        **keywords: those of `accumulated`.
 
     Returns:
         The final value and diffrax's result.

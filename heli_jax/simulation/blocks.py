@@ -31,9 +31,6 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
 
     From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
-
-    Args:
-        args: with the recurrence, in matrices, and the inputs (N,).
     """
     assert args.discrete is not None
     if args.discrete.Bn is not None:
@@ -263,12 +260,7 @@ class Blocks(NamedTuple):
 def blocks(
     reducing: Reducing, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
 ) -> Blocks:
-    """A run in steps of m samples.
-
-    Args:
-        args: the recurrence, in matrices, and the inputs (N,).
-        data: a pytree of arrays (N,).
-    """
+    """A run in steps of m samples."""
     block, discrete = _block_of(reducing.model, args, m)
     x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
     carry = jax.tree.leaves(x0), start

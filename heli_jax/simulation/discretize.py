@@ -47,7 +47,6 @@ def discretize(
         delays: how late the inputs are; whole samples are left to who reads the arrays. With
             `late` [s] the part of each interval before the delayed sample u[k] acts, under a
             zero-order hold x[k+1] = Ad x[k] + (G(dt) - G(dt-late)) u[k-1] + G(dt-late) u[k].
-        linear: of each input whether it is linear between samples; () holds all.
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)

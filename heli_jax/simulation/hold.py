@@ -93,7 +93,6 @@ def at(
     """The inputs of sample k; before the first the first, after the last the last.
 
     Args:
-        inputs: a pytree of arrays (N,).
         delays: where given, each input is read its whole samples before k.
     """
 
@@ -148,8 +147,6 @@ def between_samples(
 
     Args:
         flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
-        inputs: the model's Inputs, arrays (N,).
-        hold: as `simulate` takes it.
 
     Raises:
         ValueError: an unknown name of an input or of a hold.
@@ -226,12 +223,7 @@ def check_hold(value: PyTree, where: str = "hold") -> None:
 
 
 def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs at the end of the interval from sample k on, before any of them jumps.
-
-    Args:
-        inputs: arrays (N,).
-        linear: of each input whether it moves between samples; () holds all.
-    """
+    """The inputs at the end of the interval from sample k on, before any of them jumps."""
     held = at(inputs, k)
     return _chosen(linear, at(inputs, k + 1), held) if linear else held
 
@@ -257,11 +249,9 @@ def segments(
     """The parts of the interval from sample k (an integer or a whole array of them) to the next.
 
     Args:
-        inputs: arrays (N,).
         dt: [s].
         delays: None, or how late the inputs are: the interval then has a part more for each group
             of them, divided where its sample falls into it.
-        linear: of each input whether it moves between samples; () holds all.
     """
     linear = linear or (False,) * len(jax.tree.leaves(inputs))
     if delays is None:
@@ -338,12 +328,7 @@ def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) 
 def delayed(
     inputs: Record, delays: Delays, k: Int[Array, "..."] | int, linear: tuple[bool, ...]
 ) -> Record:
-    """The inputs that act at sample k (an integer or an array of them) when they are late.
-
-    Args:
-        inputs: a pytree of arrays (N,).
-        linear: of each input whether it moves between samples; () holds all.
-    """
+    """The inputs that act at sample k (an integer or an array of them) when they are late."""
     before, now = at(inputs, k - 1, delays), at(inputs, k, delays)
     acting = []
     leaves = zip(jax.tree.leaves(before), jax.tree.leaves(now), strict=True)

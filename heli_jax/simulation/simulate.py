@@ -73,7 +73,6 @@ def simulate(
     Args:
         model: of one machine; `jax.vmap` over the other arguments simulates many.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        options: how; all defaults unless given.
         **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,
             `initial_state`, `delay`, `key`, `hold`, ...
 
@@ -248,9 +247,6 @@ def with_process_noise(
     linear: tuple[bool, ...],
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise.
-
-    Args:
-        linear: of each input whether it moves between samples; () holds all.
 
     Raises:
         ValueError: the model has no noise, or the options a delay.

@@ -46,11 +46,7 @@ class ZeroOrderHoldArgs(NamedTuple):
 
 
 def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs as they act at sample k.
-
-    Args:
-        linear: of each input whether it is linear between samples; () holds all.
-    """
+    """The inputs as they act at sample k."""
     if args.delays is None:
         return at(args.inputs, k)
     return delayed(args.inputs, args.delays, k, linear)

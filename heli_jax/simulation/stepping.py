@@ -79,10 +79,6 @@ def start_state(
 ) -> Record:
     """The initial state in the dtype that the parameters and inputs give together.
 
-    Args:
-        model: whose `initial_state` counts unless one is given.
-        initial_state: the model's State, or None.
-
     Raises:
         TypeError: `params` are none of the model's.
     """
@@ -146,9 +142,7 @@ def per_sample(
     """The solver, its arguments and the term for time counted in samples.
 
     Args:
-        inputs: the model's Inputs, arrays (N,).
         options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
-        linear: of each input whether it is linear between samples; () holds all.
     """
     # "exact" and "rk4" have no error estimate to adapt to; a controller alone means Dopri8.
     controller, solver = options.controller, options.solver
@@ -216,10 +210,7 @@ def held_columns(
     """x[k+1] = Ad x[k] + B U[k] for a linear model: Ad, B, U, and the inputs that act at k.
 
     Args:
-        inputs: the model's Inputs, arrays (N,).
         dt: [s].
-        delay: as in `SimulationOptions`.
-        linear: of each input whether it is linear between samples; () holds all.
     """
     options = SimulationOptions(dt=dt, solver="exact", delay=delay)
     _, args, _ = per_sample(model, params, inputs, options, linear)

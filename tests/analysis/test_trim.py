@@ -123,11 +123,7 @@ def test_steady_flights_are_steady(condition, xcell):
         assert s["theta"] < 0  # nose down against the drag
 
 
-def test_the_old_names_of_the_speeds_are_accepted_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="forward_speed"):
-        assert Condition(ahead=8.0) == Condition(forward_speed=8.0)
-    with pytest.warns(DeprecationWarning, match="lateral_speed"):
-        assert Condition(8.0, aside=-3.0).lateral_speed == -3.0
+def test_the_old_names_of_the_speeds_are_read_with_a_warning():
     with pytest.warns(DeprecationWarning, match="forward_speed"):
         assert StartConfig.model_validate({"ahead": 8.0}).forward_speed == 8.0
     with pytest.raises(ValueError, match="forward_speed"):

@@ -205,15 +205,3 @@ def test_what_the_helicopter_states_is_what_its_names_say(variant, more):
     assert axes_of(silent) == axes_of(model)
     assert steady_flight(silent) == steady_flight(model)
     assert len(model.steady_flight.unknowns) == len(model.steady_flight.equations)
-
-
-@pytest.mark.parametrize(("old", "new"), [("noise", "noise_intensity"), ("spread", "initial_sd")])
-def test_the_old_keyword_of_a_model_is_told_its_new_name(old, new):
-    def function(p):
-        return {"p": 1.0}
-
-    with pytest.warns(DeprecationWarning, match=new):
-        model = turning(**{old: function})
-    assert getattr(model, new) is function
-    # Taken over once: what is made of the model says nothing more.
-    assert getattr(dataclasses.replace(model, name="other"), new) is function

@@ -10,7 +10,7 @@ import yaml
 
 from heli_jax import Flight, Free, Model, Problem
 from heli_jax.cli import main
-from heli_jax.dynamics.start import cannot_start, starting_at
+from heli_jax.dynamics.check_model import cannot_start, starting_at
 
 N, DT = 120, 0.05
 

@@ -66,9 +66,6 @@ def _by_name(late: Late) -> dict[str, str]:
 def with_input_delays(model: Model, parameters: Mapping[str, str]) -> Model:
     """The model whose inputs are late by new parameters.
 
-    Args:
-        parameters: by input the name of its delay.
-
     Raises:
         ValueError: an input is late already, or the model has a parameter of that name.
     """
@@ -196,9 +193,6 @@ class _LateOutputs(Device):
 def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
     """The model with the delay of one input as a delay line among its states: within a feedback
     loop the input is no record that could be read further back.
-
-    Args:
-        order: states of the line.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
     # The delay of this input is no longer one of the record: left in both places it would act

@@ -362,7 +362,6 @@ def line_rate(order: int, delay: float) -> float:
     """The fastest rate of a delay line [rad/s].
 
     Args:
-        order: its states.
         delay: [s].
     """
     return float(np.max(np.abs(np.linalg.eigvals(_line(order)[0])))) / delay

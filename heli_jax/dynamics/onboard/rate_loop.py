@@ -219,11 +219,7 @@ class _RateLoop(Device):
         return getattr(s, name)
 
     def seen(self, s: Record, stick: str, rate: str) -> Any:
-        """The rate as the loop has it.
-
-        Args:
-            stick: the input that the loop drives.
-        """
+        """The rate as the loop has it."""
         return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:

@@ -297,7 +297,6 @@ def specific_force(
     """The specific force at the IMU [m/s^2], by output.
 
     Args:
-        motion: of `motion_of`.
         p: the model's Params with x_imu, y_imu, z_imu.
     """
     # From the model's own derivatives, so that thrust, drag and gusts are in it without being
@@ -314,7 +313,6 @@ def airspeed(
     forward, right, down, and airspeed, their norm [m/s].
 
     Args:
-        motion: of `motion_of`.
         p: the model's Params with x_air, y_air, z_air.
         u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.
     """
@@ -341,9 +339,6 @@ def airspeed(
 def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
     """Where a model has the rate p, q or r of the body: ('state', name) or ('output', name); None
     where it has none.
-
-    Args:
-        letter: p, q or r.
     """
     states, outputs = naming.names(model.State), naming.names(model.Outputs)
     if letter in states:
@@ -360,11 +355,7 @@ def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
 def angular_acceleration(
     model: Model, rate: tuple[str, str], p: Record, s: Record, u: Record, rates: Record
 ) -> Any:
-    """The derivative of one of the body's rates [rad/s^2].
-
-    Args:
-        rate: of `rate_of`.
-    """
+    """The derivative of one of the body's rates [rad/s^2]."""
     kind, name = rate
     if kind == "state":
         return getattr(rates, name)
