@@ -6,10 +6,8 @@ import yaml
 
 from heli_jax import config as configuration
 from heli_jax import models
-from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
-from heli_jax.sweep_workflow import run_sweep
 from heli_jax.workflow import run_check
 
 ONBOARD = {
@@ -75,28 +73,6 @@ def test_devices_stand_around_a_linear_model(written, tmp_path):
     same = configuration.load(again)
     assert same.model is found.model
     assert same.vehicle.params == found.vehicle.params
-
-
-@pytest.mark.slow
-def test_they_are_simulated_checked_and_swept(written, tmp_path):
-    path = written(
-        onboard={"servos": {"on": ["lat"]}},
-        vehicle={"omega_servo": 50.0, "zeta_servo": 0.7},
-        fit={"free": {"omega_servo": {"start": 40.0}}},
-        sweep={
-            "design": "grid",
-            "axes": {"omega_servo": {"values": [4.0, 8.0], "unit": "Hz"}},
-            "reduce": {"p": {"how": "rms", "signal": "p"}},
-            "inputs": "simulate",
-        },
-    )
-    assert main(["simulate", str(path), "--out", str(tmp_path / "roll.csv")]) == 0
-    check = run_check(path)
-    assert check.verdict.identifiable
-    swept = run_sweep(path, figures=False)
-    # A slower servo in the loop, and the machine moves otherwise.
-    assert len(set(swept["p"].values.tolist())) == 2
-    assert np.isfinite(swept["p"].values).all()
 
 
 def test_a_helicopter_has_them_too(written, vehicles_folder):

@@ -484,7 +484,7 @@ def expressions(draw, depth=4):
     }[how]
 
 
-@settings(max_examples=5 if os.environ.get("CI") == "true" else 15, deadline=None)
+@settings(max_examples=3 if os.environ.get("CI") == "true" else 15, deadline=None)
 @given(expressions())
 def test_a_random_expression(expression):
     def once(stays, u, x):

@@ -148,9 +148,8 @@ def test_two_delays_of_a_model_that_is_not_linear(run, hold):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("hold", HOLDS)
-def test_in_blocks_and_reduced_it_is_the_same_run(run, hold):
-    u, delays = sticks(2), (0.03, 0.11)
+def test_in_blocks_and_reduced_it_is_the_same_run(run):
+    u, delays, hold = sticks(2), (0.03, 0.11), "mixed"
     stepwise = run(LINEAR, u, delays, HOLDS[hold])
     blocks = run(LINEAR, u, delays, HOLDS[hold], block=16)
     np.testing.assert_allclose(blocks, stepwise, rtol=0, atol=1e-12)
@@ -159,12 +158,13 @@ def test_in_blocks_and_reduced_it_is_the_same_run(run, hold):
     def update(value, outputs, _):
         return value + outputs.theta * outputs.felt
 
-    for block in (1, 4):
-        value, _ = accumulate(
-            LINEAR, p, Inputs(*jnp.asarray(u)), update, jnp.zeros(()), dt=DT, hold=HOLDS[hold],
-            block=block,
-        )  # fmt: skip
-        assert float(value) == pytest.approx(np.sum(stepwise[0] * stepwise[1]), rel=1e-10)
+    @jax.jit
+    def reduced(p):
+        u_ = Inputs(*jnp.asarray(u))
+        how = {"dt": DT, "hold": HOLDS[hold], "block": 4}
+        return accumulate(LINEAR, p, u_, update, jnp.zeros(()), **how)[0]
+
+    assert float(reduced(p)) == pytest.approx(np.sum(stepwise[0] * stepwise[1]), rel=1e-10)
 
 
 @pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
@@ -195,10 +195,12 @@ def test_the_filter_without_noise_predicts_the_simulation(run, machine):
         late=jnp.asarray(0.031), later=jnp.asarray(0.116), sigma_w=jnp.asarray(1e-9)
     )
     y = np.random.default_rng(6).standard_normal(N)
-    found = innovations(
-        disturbed, p, Inputs(*jnp.asarray(u)), {"theta": jnp.asarray(y)}, {"theta": 1.0}, dt=DT,
-        hold="linear", substeps=8,
-    )  # fmt: skip
+    found = jax.jit(
+        lambda p: innovations(
+            disturbed, p, Inputs(*jnp.asarray(u)), {"theta": jnp.asarray(y)}, {"theta": 1.0},
+            dt=DT, hold="linear", substeps=8,
+        )
+    )(p)  # fmt: skip
     expected = y - run(machine, u, delays, "linear", substeps=8)[0]
     atol = 1e-9 if machine.linear else 1e-5  # two ways to integrate
     np.testing.assert_allclose(found.error["theta"], expected, rtol=0, atol=atol)
@@ -212,11 +214,15 @@ def test_noise_is_drawn_beside_delays():
     )
     u, key = sticks(7), jax.random.key(1)
 
-    def theta(u, key=None):
-        found = simulate(disturbed, p, Inputs(*jnp.asarray(u)), dt=DT, hold="linear", key=key)
-        return np.asarray(found.outputs.theta)
+    @jax.jit
+    def runs(u):
+        def theta(u, key=None):
+            found = simulate(disturbed, p, Inputs(*u), dt=DT, hold="linear", key=key)
+            return found.outputs.theta
 
-    moved, still = theta(u, key) - theta(u), theta(0.0 * u, key)
+        return theta(u, key) - theta(u), theta(0.0 * u, key)
+
+    moved, still = runs(jnp.asarray(u))
     assert np.std(still) > 0.01
     np.testing.assert_allclose(moved, still, rtol=0, atol=1e-12)
 
