@@ -110,7 +110,7 @@ def test_what_is_wrong_is_said_in_one_line(case, tmp_path):
     path = tmp_path / "f.yaml"
     path.write_text(text, encoding="utf-8")
     begin = time.process_time()
-    with pytest.raises(InputError, match=said) as e:
+    with pytest.raises(InputError, match=said or None) as e:
         read_mapping(path)
     assert time.process_time() - begin < 5.0
     assert str(e.value).startswith(str(path))

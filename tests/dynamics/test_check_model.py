@@ -12,7 +12,6 @@ import yaml
 
 from heli_jax import Flight, Free, Model, Problem, linearize, simulate, sweep, trim
 from heli_jax.cli import main
-from heli_jax.dynamics import check_model as checks
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Axis
 from heli_jax.models import helicopter, on_stand
@@ -224,15 +223,6 @@ def test_parameters_that_stay_numbers_may_be_branched_on_in_a_simulation():
     found = simulate(model, Params(-3.0, 20.0), flight())
     assert bool(found.finite)
     assert said_by(Problem, model, Params(-3.0, 1.0), [flight()], {"Lp": Free(-2.0)})
-
-
-def test_a_model_is_looked_at_once(monkeypatch):
-    looked = []
-    monkeypatch.setattr(checks, "_check", lambda *a: looked.append(a))
-    model = made(vector_field=lambda p, s, u: rates(p, s, u))
-    for _ in range(5):
-        check_model(model)
-    assert len(looked) == 1
 
 
 MODULE = """

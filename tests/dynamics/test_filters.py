@@ -113,12 +113,6 @@ def test_fixed_steps_follow_a_fast_filter():
     assert with_filters(model, {}, {"roll": 0.003}).fastest == model.fastest
 
 
-def test_what_does_nothing_adds_nothing():
-    assert with_filters(ROLL.model, {"p": []}, {"phi": 0.0}) is ROLL.model
-    filters = {"p": [Filter("pt1", 30.0)]}
-    assert with_filters(ROLL.model, filters) is with_filters(ROLL.model, filters)
-
-
 @pytest.mark.parametrize(
     ("filters", "delays"),
     [

@@ -9,7 +9,6 @@ import pytest
 
 from heli_jax import linear_model, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.dynamics.model import Model
 from tests.dynamics.test_full_helicopter import scattered
 
 STEP = 1e-3
@@ -88,30 +87,6 @@ def test_the_helicopters_sensors_are_where_a_rigid_body_carries_them(variant):
     if variant == "paper":
         alpha = SECOND @ np.array([columns[n] for n in ("phi", "theta", "psi")]).T / STEP**2
     np.testing.assert_allclose([shown.pdot, shown.qdot, shown.rdot], alpha, rtol=1e-6, atol=1e-5)
-
-
-def test_all_of_them_cost_one_field():
-    calls = []
-    bare = linear_model("r50-hover").model
-
-    def counted(p, s, u):
-        calls.append(1)
-        return bare.vector_field(p, s, u)
-
-    model = Model(
-        "counted", counted, bare.output, bare.Params, bare.State, bare.Inputs, bare.Outputs,
-        linear=True,
-    )  # fmt: skip
-    every = models.with_sensors(model, imu=True, angular_acceleration=True, airspeed=True)
-    zeros = dict.fromkeys(naming.names(every.State), 0.0)
-    args = (
-        every.Params(**naming.asdict(linear_model("r50-hover").vehicle().params)),
-        every.State(**zeros),
-        every.Inputs(**dict.fromkeys(naming.names(every.Inputs), 0.0)),
-    )
-    calls.clear()
-    every.output(*args)
-    assert len(calls) == 1
 
 
 def test_a_linear_model_shows_what_it_knows():

@@ -10,9 +10,8 @@ import pytest
 import scipy.signal
 
 from heli_jax import linear_model, models, naming, simulate
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
+from heli_jax.dynamics.model import Model, linear_misfit
 from heli_jax.naming import Scalar
 
 ROLL = linear_model("roll-flybarless")
@@ -102,17 +101,6 @@ def test_a_servo_is_limited_in_rate_as_simulated_by_hand():
     linear = models.with_servos(INTEGRATOR, ["u"])
     same = simulate(linear, linear.Params(k=1.0, **SERVO), linear.Inputs(u=1e-3 * u), dt=0.01)
     np.testing.assert_allclose(faint, same.states.x, atol=1e-8)
-    assert np.isfinite(
-        jax.grad(
-            lambda rate: jnp.sum(
-                model.vector_field(
-                    p._replace(rate_servo=rate),
-                    model.State(x=0.0, u_servo=0.0, u_servo_rate=0.0),
-                    model.Inputs(u=1.0),
-                ).u_servo_rate
-            )
-        )(2.0)
-    )
 
 
 def test_a_rate_loop_is_a_pi_controller_with_feedforward():
@@ -244,25 +232,6 @@ def test_sensors_lag_and_feel():
     assert naming.unit(model.Outputs, "ax") == "m/s^2"
 
 
-def test_devices_keep_what_a_model_knows():
-    stand = models.with_servos(models.roll_on_stand, ["x_roll"])
-    assert stand.without_stand is models.with_servos(models.roll, ["x_roll"])
-    assert stand is models.with_servos(models.roll_on_stand, ("x_roll",))
-    disturbed = with_disturbance(models.with_delays(ROLL.model, outputs=["p"]), "roll")
-    assert disturbed.delay_parameters == ("delay_p",)
-    onboard = models.with_servos(with_disturbance(ROLL.model, "roll"), ["lat"])
-    p = params(onboard, sigma_w=0.5, tau_w=2.0, **SERVO)
-    assert onboard.random_states == ("w1_roll",)
-    assert onboard.noise_intensity is not None
-    intensity = onboard.noise_intensity(p)
-    assert float(intensity.w1_roll) == pytest.approx(0.5)
-    assert float(intensity.lat_servo) == 0.0
-    assert needed_but_missing(
-        models.with_servos(ROLL.model, ["lat"], delay=True),
-        params(models.with_servos(ROLL.model, ["lat"], delay=True)),
-    ) == ["omega_servo", "zeta_servo", "delay_servo"]
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -329,8 +298,3 @@ def test_an_accelerometer_in_a_body_that_turns():
     omega = np.array([0.5, -1.5, 2.0])
     expected = force + np.cross(turning, at) + np.cross(omega, np.cross(omega, at))
     np.testing.assert_allclose([y.ax, y.ay, y.az], expected, rtol=1e-12)
-
-
-def test_a_helicopter_with_servos_and_gusts_can_be_trimmed():
-    servos = models.with_servos(models.helicopter("consistent"), ["x_roll"])
-    assert with_disturbance(servos, "dphi").steady_flight == servos.steady_flight

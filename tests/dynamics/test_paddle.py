@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -52,26 +51,6 @@ def test_either_may_be_given_alone(given, factor):
     v = vehicle(BENCH)
     found = float(flapping_rate_gain(naming.replace(v, **given)))
     assert found == pytest.approx(factor * float(flapping_rate_gain(v)), rel=1e-14)
-
-
-def test_without_them_no_number_changes():
-    """The blade's own values written out are the same to the last digit, derivatives too."""
-    v = vehicle(BENCH)
-    same = naming.replace(v, c_paddle=v.c, a_paddle=v.a)
-    for model in (models.roll, models.helicopter("consistent")):
-        x = model.State(*(jnp.asarray(0.1 + 0.01 * i) for i in range(len(model.State._fields))))
-        u = model.Inputs(*(jnp.asarray(0.01) for _ in model.Inputs._fields))
-        if model is not models.roll:
-            x = x._replace(Omega=jnp.asarray(150.0))
-        bar = "beta_roll" if model is not models.roll else "dbeta_roll"
-        one, other = (getattr(model.vector_field(p, x, u), bar) for p in (v, same))
-        assert float(one) == float(other)
-    slope = jax.grad(flapping_rate_gain)(v)
-    assert float(slope.a) == pytest.approx(float(flapping_rate_gain(v)) / BENCH["a"], rel=1e-14)
-    assert float(slope.c) == pytest.approx(float(flapping_rate_gain(v)) / BENCH["c"], rel=1e-14)
-    given = jax.grad(flapping_rate_gain)(with_paddle())
-    assert float(given.a) == 0.0
-    assert float(given.a_paddle) == pytest.approx(float(flapping_rate_gain(with_paddle())) / A)
 
 
 def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
