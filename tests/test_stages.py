@@ -76,18 +76,3 @@ def test_what_lasts_is_said_now_and_then_where_there_is_no_terminal(monkeypatch)
         while not said and time.perf_counter() - waited < 10.0:
             time.sleep(0.05)
     assert said[0].startswith("a long fit: ")
-
-
-LINE = "fitting b_p, b_q and lambda_r: step 12, start 3 of 5, cost 1234.5, 11 a second, 14 s"
-
-
-@pytest.mark.parametrize("width", [120, 80, 70, 50, 30])
-def test_a_line_that_is_too_long_loses_words_and_no_digit(width):
-    shown = stage_display.fitted(LINE, width)
-    assert len(shown) < width
-    assert shown.startswith("fitting b_p")
-    # What is left of the numbers is whole, in its order, and the time is among it.
-    parts = shown.rpartition(": ")[2].split(", ")
-    all_parts = LINE.rpartition(": ")[2].split(", ")
-    assert [p for p in all_parts if p in parts] == parts
-    assert parts[-1] == "14 s"

@@ -12,7 +12,6 @@ from heli_jax import Flight, Free, Prior, Problem, fit, load_vehicle, models, si
 from heli_jax.finding import note
 from heli_jax.flights.flight import Source
 from heli_jax.identification.uncertainty.nuts import Posterior
-from heli_jax.naming import replace
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SCRIPT = "<script>alert(1)</script>"
@@ -69,21 +68,6 @@ def test_objects_say_what_they_hold(bench, run, flight, problem, fitted):
     page = flight._repr_html_()
     assert "<script>" not in page
     assert page.count("&lt;script&gt;") == 2
-
-
-def test_what_is_traced_or_batched_shows_its_shape(bench, run):
-    seen = []
-
-    @jax.jit
-    def traced(vehicle):
-        seen.append(repr(vehicle))
-        return vehicle.Ixx
-
-    traced(bench)
-    assert "shape ()" in seen[0]
-    many = jax.tree.map(lambda v: jnp.stack([v, v]), run)
-    assert repr(many).startswith("Trajectory, times of shape (2, 1000)")
-    assert "shape (3,)" in repr(replace(bench, Ixx=jnp.arange(3.0)))
 
 
 def test_estimates_as_a_data_frame(fitted):

@@ -169,16 +169,6 @@ def test_factor_is_positive_and_inverts(unit):
     assert units.factor(unit, si) * units.factor(si, unit) == pytest.approx(1.0, rel=1e-12)
 
 
-@given(
-    st.sampled_from(["mm", "m", "ft", "in", "km"]),
-    st.sampled_from(["s", "ms", "min", "h"]),
-    st.integers(1, 3),
-)
-def test_a_quotient_is_the_quotient_of_its_factors(length, time_unit, power):
-    wanted = units.factor(length, "m") / units.factor(time_unit, "s") ** power
-    assert units.factor(f"{length}/{time_unit}^{power}", f"m/s^{power}") == pytest.approx(wanted)
-
-
 @pytest.mark.parametrize(
     ("unit", "si"),
     [("deg", "rad"), ("rpm", "rad/s"), ("Hz", "rad/s"), ("mm", "m"), ("%", "1"), ("g", "kg")],

@@ -196,24 +196,6 @@ def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
     assert u["x_throttle"] == pytest.approx(1.0)
 
 
-def test_hover_has_the_modes_of_a_helicopter(full, xcell):
-    """Between the R-50 and what models.md has of the X-Cell, and named."""
-    model, found = full
-    by_name = {m.name: m for m in eigenmodes(model, xcell, found.state, found.inputs)}
-    phugoid = by_name["phugoid"]
-    # -0.03 +- 0.69j with speed stability added by hand, 0.3 +- 0.1j of the R-50.
-    assert -0.03 < phugoid.eigenvalue.real < 0.4
-    assert 0.1 < phugoid.eigenvalue.imag < 0.7
-    roll = next(m for n, m in by_name.items() if n.startswith("roll flapping"))
-    pitch = next(m for n, m in by_name.items() if n.startswith("pitch flapping"))
-    # The R-50's are at 11.9 and 8.4 rad/s, the X-Cell's roll at about 20.
-    assert 11.9 < roll.frequency < 23.0
-    assert 8.4 < pitch.frequency < roll.frequency
-    assert 0.2 < roll.damping < 0.7
-    assert {"yaw", "heave", "lateral phugoid"} <= set(by_name)
-    assert any("flybar" in name for name in by_name)
-
-
 def test_the_roll_mode_of_the_published_machine(full, xcell):
     """The shipped file has a simulator's inertias; with those that go with k_beta (Gavrilets, 2003)
     the roll mode is the published one of about 20 rad/s."""

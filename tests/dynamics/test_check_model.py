@@ -1,7 +1,6 @@
 """Mistakes in a model of one's own end in a sentence that names the function and the remedy."""
 
 import dataclasses
-import math
 from typing import Annotated, NamedTuple
 
 import jax
@@ -53,10 +52,6 @@ class Outputs(NamedTuple):
     roll_rate: float
 
 
-class Other(NamedTuple):
-    phi: float
-
-
 def rates(p, s, u):
     return State(phi=s.p, p=p.Lp * s.p + p.La * u.aileron)
 
@@ -73,10 +68,6 @@ def numpy_function(p, s, u):
     return State(phi=s.p, p=p.Lp * np.sin(s.p) + p.La * u.aileron)
 
 
-def of_math(p, s, u):
-    return State(phi=s.p, p=p.Lp * math.sin(s.p))
-
-
 def branch(p, s, u):
     return State(phi=s.p, p=p.Lp * s.p if s.p > 0 else -p.Lp)
 
@@ -85,49 +76,33 @@ def raising(p, s, u):
     raise RuntimeError("the table has no such entry")
 
 
-def of_two(p, s):
-    return State(phi=s.p, p=s.p)
-
-
 BROKEN = {
     "NumPy": {"vector_field": numpy_function},
-    "math": {"vector_field": of_math},
     "a branch": {"vector_field": branch},
     "its own exception": {"vector_field": raising},
-    "two arguments": {"vector_field": of_two},
     "a tuple": {"vector_field": lambda p, s, u: (s.p, p.Lp * s.p)},
-    "a dictionary": {"vector_field": lambda p, s, u: {"phi": s.p, "p": s.p}},
     "nothing": {"vector_field": lambda p, s, u: None},
-    "another class": {"vector_field": lambda p, s, u: Other(phi=s.p)},
     "a missing field": {"vector_field": lambda p, s, u: State(phi=s.p)},
-    "an unknown field": {"vector_field": lambda p, s, u: s.roll},
     "an array in a field": {"vector_field": lambda p, s, u: State(phi=s.p, p=jnp.ones(3) * s.p)},
-    "None in a field": {"vector_field": lambda p, s, u: State(phi=s.p, p=None)},
     "text in a field": {"vector_field": lambda p, s, u: State(phi=s.p, p="fast")},
     "a complex number": {
         "vector_field": lambda p, s, u: State(phi=s.p, p=jax.lax.complex(s.p, s.p))
     },
     "no function": {"vector_field": 3},
-    "output with NumPy": {"output": lambda p, s, u: Outputs(roll_rate=np.cos(s.p))},
     "output with a tuple": {"output": lambda p, s, u: (s.p,)},
-    "output with a dictionary": {"output": lambda p, s, u: {"roll_rate": s.p}},
-    "output with an array": {"output": lambda p, s, u: Outputs(jnp.stack([s.p, s.p]))},
     "start with a branch": {"start": lambda p: State(0.0, 1.0 if p.Lp > 0 else 2.0)},
-    "start with a list": {"start": lambda p: [0.0, 0.0]},
     "noise without a state": {"noise_intensity": lambda p: p.Lp},
     "sd of a stranger": {"initial_sd": lambda p: {"q": p.Lp}},
     "limits that are none": {"limits": lambda p, s, u: s.p > 1.0},
     "parameters that are no class": {"Params": {"Lp": 1.0}},
     "a delay of a stranger": {"delays": (("ail", "Lp"),)},
     "a delay by a stranger": {"delays": (("aileron", "tau"),)},
-    "delays in a dictionary": {"delays": {"aileron": "Lp"}},
     "delays that are no pairs": {"delays": ("aileron", "Lp")},
     "two delays": {"delays": (("aileron", "Lp"), ("aileron", "La"))},
     "a delay in metres": {"Params": Timed, "delays": (("aileron", "La"),)},
     "an axis of no state": {"axes": (Axis("roll", rate="q"),)},
     "an axis of no stick": {"axes": (Axis("roll", rate="p", stick="lat"),)},
     "an axis alone": {"axes": Axis("roll", rate="p")},
-    "axes by name": {"axes": ("p",)},
     "positive strangers": {"positive": ("Lq",)},
     "parameters in a plain dataclass": {"Params": Plain},
     "states that are an object": {"State": State(0.0, 0.0)},
@@ -164,7 +139,7 @@ def test_a_broken_model_is_refused_with_a_sentence(case):
     said = said_by(check_model, made(**BROKEN[case]))
     assert said.startswith("model 'mine': ")
     # What is wrong is named.
-    assert next(iter(BROKEN[case])) in said or case == "sd of a stranger"
+    assert list(BROKEN[case])[-1] in said
 
 
 def test_every_way_in_says_it():

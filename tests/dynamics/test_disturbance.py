@@ -11,8 +11,6 @@ import scipy.linalg
 from heli_jax import linear_model, models, naming, simulate
 from heli_jax.dynamics.disturbance import disturbable_states, with_disturbance
 from heli_jax.dynamics.model import correlation_of, initial_sd_of
-from heli_jax.dynamics.roll import on_stand
-from heli_jax.simulation.discretize import process_noise
 from tests.dynamics.paper import BENCH, matrices
 
 DT, N, SIGMA, TAU = 0.02, 60_000, 1.04, 0.1
@@ -129,18 +127,6 @@ def test_a_force_with_its_coefficients_in_numbers_is_no_kinematics(tmp_path):
     for name in ("phi", "y", "z"):
         with pytest.raises(ValueError, match=name):
             with_disturbance(model, name)
-
-
-def test_a_stand_keeps_the_disturbance(bench30):
-    one = on_stand(with_disturbance(models.roll, "roll"))
-    other = with_disturbance(models.roll_on_stand, "roll")
-    params = one.Params(
-        **naming.asdict(bench30), sigma_w=jnp.asarray(SIGMA), tau_w=jnp.asarray(TAU)
-    )
-    np.testing.assert_allclose(
-        process_noise(one, params, DT), process_noise(other, params, DT), rtol=1e-12
-    )
-    assert one.random_states == other.random_states == ("w1_roll",)
 
 
 HEAVE = """

@@ -148,16 +148,6 @@ def test_what_is_no_model(name, meant):
         models.by_name(name, "f.yaml: model")
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [("broken_syntax", "def broken(:\n"), ("broken_import", "import heli_jax.nothing_here\n")],
-)
-def test_a_module_that_cannot_be_imported_is_an_input_error(tmp_path, name, text):
-    (tmp_path / f"{name}.py").write_text(text)
-    with pytest.raises(InputError, match=f"f.yaml.*{name}"):
-        models.by_name(f"{name}:model", "f.yaml", folder=tmp_path)
-
-
 class TurnState(NamedTuple):
     angle: float
     p: float

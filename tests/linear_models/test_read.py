@@ -12,7 +12,7 @@ from heli_jax import naming
 from heli_jax.analysis.linear import eigenmodes, linearize
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.errors import InputError
-from heli_jax.linear_models.read import linear_model, shipped
+from heli_jax.linear_models.read import linear_model
 from heli_jax.simulation.simulate import simulate
 
 SMALL = {
@@ -262,11 +262,6 @@ def test_the_example_of_the_page_reads(tmp_path):
     np.testing.assert_allclose(A, expected, rtol=1e-14)
     np.testing.assert_allclose(B, [[0], [0], [0.14 / 0.046]], rtol=1e-14)
     np.testing.assert_allclose(C, [[1, 0, 0], [0, 0, 9.81]], rtol=1e-14)
-
-
-def test_the_files_are_in_the_package():
-    home = Path(__file__).parents[2] / "heli_jax" / "linear_models" / "files"
-    assert {p.stem for p in home.iterdir()} == set(shipped())
 
 
 def test_the_modes_of_the_r50_have_the_fields_names():

@@ -138,19 +138,6 @@ def test_part_of_a_sample_of_delay(delay):
     close(table(run(BENCH, delay=delay, solver="rk4", substeps=16)), wanted, 1e-4)
 
 
-def test_outputs_feel_the_input_that_acts():
-    """An output with direct feed-through shows the delayed stick, not the logged one."""
-    through = Model(
-        "through", STAND.vector_field, lambda p, s, u: models.roll.Outputs(u.x_roll, s.dphi),
-        Helicopter, models.roll.State, models.roll.Inputs, models.roll.Outputs, linear=True,
-    )  # fmt: skip
-    u, p = np.arange(10.0), Helicopter(**BENCH)
-    go = jax.jit(lambda d: simulate(through, p, models.roll.Inputs(u), dt=DT, delay=d).outputs)
-    for delay, shift in ((0.0, 0), (0.02, 1), (0.03, 2), (-0.02, -1), (-0.01, 0)):
-        found = go(jnp.asarray(delay))
-        np.testing.assert_array_equal(found.roll, np.clip(u - shift, 0, 9))
-
-
 NAMES = ("Ixx", "If", "a", "kappa", "L3", "Omega")
 
 
