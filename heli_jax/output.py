@@ -17,7 +17,6 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
-from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
@@ -115,8 +114,7 @@ def _print_outcome(fit: Fit) -> None:
         text = "the optimiser stopped before an optimum, and these numbers are no result."
     converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
     tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
-    note = files.whiteness_note(fit)
-    for line in ([note] if note else []) + list(fit.notes):
+    for line in fit.notes:
         tell(f"! {line}")
 
 
