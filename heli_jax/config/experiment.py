@@ -16,8 +16,8 @@ from heli_jax.config.onboard import with_onboard
 from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.quantities import in_si, initial_state
 from heli_jax.config.schema import Config, LinearConfig
+from heli_jax.dynamics.check_model import starting_at
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, VehicleError, nearest, require_kind
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
