@@ -22,7 +22,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 _HOLDS = {
@@ -97,12 +97,7 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """What inputs were taken to do between samples where a log decided it, and what hangs on it.
-
-    Args:
-        flights: of one rate.
-        inputs: by name.
-    """
+    """What inputs were taken to do between samples where a log decided it, and what hangs on it."""
     mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:
@@ -198,12 +193,6 @@ def run_responses(
 ) -> list[str]:
     """Write the responses into a new directory, and print them; returns the statuses of the
     transfer functions, those of fits.
-
-    Args:
-        experiment: the configuration.
-        out: the directory.
-        log: in place of the configuration's.
-        say: called with notes, and where the page is.
     """
     from heli_jax.report.responses import transfer_status, write_responses
     from heli_jax.report.tables.handling import handling_lines, handling_sentences
@@ -237,11 +226,7 @@ def run_responses(
 
 
 def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
-    """That no response is coherent with its input, where none is.
-
-    Args:
-        responses: the responses.
-    """
+    """That no response is coherent with its input, where none is."""
     pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()

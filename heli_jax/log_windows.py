@@ -19,7 +19,7 @@ from heli_jax.identification.validation.expected_accuracy import GUESSED, too_go
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""

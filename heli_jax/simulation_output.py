@@ -1,12 +1,8 @@
 """What `simulate` and `sweep` print and write: without the estimation, which they need not load."""
 
-import contextlib
 import json
-import math
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,12 +13,11 @@ from heli_jax import run_directory
 from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import terse
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
-    from heli_jax.sweeps.run import Progress
 
 
 def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
@@ -46,12 +41,6 @@ def write_view(
 ) -> None:
     """The page of what was simulated at `out`, which appears whole or not at all.
 
-    Args:
-        out: the HTML file to write.
-        experiment: the configuration, of which the page shows the vehicle.
-        simulated: the runs.
-        table: the file with its samples, where one was written; the page links to it.
-
     Raises:
         InputError: the place cannot be written to.
     """
@@ -66,77 +55,6 @@ def write_view(
     notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
         write(temporary, simulated.runs, simulated.model, params, title, notes, made)
-
-
-@contextlib.contextmanager
-def sweep_progress(
-    what: str = "sweep", of: str = "elements", *, quiet: bool = False
-) -> Iterator["Callable[[Progress], None]"]:
-    """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
-    line.
-
-    Args:
-        what: what goes on.
-        of: what it has many of.
-        quiet: show nothing.
-    """
-    if quiet:
-        yield lambda _: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    # A bar in a log file is a line of carriage returns.
-    if not sys.stderr.isatty():
-        yield _Lines(what, of)
-        return
-    columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"))
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("compiling", total=1.0)
-        yield lambda p: bar.update(
-            task,
-            completed=p.done / p.total,
-            # Beside the bar's name and the spaces between; rich would cut what is longer.
-            description=_fitting_words(p, of, console.width - len(what) - 3),
-        )
-
-
-class _Lines:
-    """A line at the first chunk, the last, and every ten seconds between."""
-
-    def __init__(self, what: str, of: str) -> None:
-        self.what, self.of, self.last = what, of, -math.inf
-
-    def __call__(self, p: "Progress") -> None:
-        now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
-        if p.done == p.total or now - self.last > 10.0:
-            self.last = now
-            words = f"heli-jax: {self.what}: {_progress_words(p, self.of)}"
-            print(words, file=sys.stderr, flush=True)
-
-
-def _progress_words(p: "Progress", of: str) -> str:
-    return ", ".join(_progress(p, of))
-
-
-def _progress(p: "Progress", of: str) -> list[str]:
-    words = [f"{p.done} of {p.total} {of}"]
-    # The first chunk compiles: a rate that contained it would foretell hours.
-    if not math.isnan(p.rate):
-        words.append(f"{terse(p.rate, 3)} a second")
-        if p.done != p.total:
-            left = max(0, round(p.remaining))
-            words.append(f"{left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left")
-    return words
-
-
-def _fitting_words(p: "Progress", of: str, room: int) -> str:
-    """What of it there is room for: the time left before the rate."""
-    words = _progress(p, of)
-    while len(words) > 1 and len(", ".join(words)) > room:
-        words.pop(1)
-    return ", ".join(words)
 
 
 def _counted(elements: int) -> str:

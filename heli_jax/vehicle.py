@@ -6,7 +6,7 @@ damping negative).
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -141,46 +141,39 @@ def of_helicopter(record: type) -> bool:
     return set(naming.names(Helicopter)) <= set(naming.names(record))
 
 
-def impossible(params: Mapping[str, float]) -> str | None:
-    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
-
-    `params` are numbers by name; a name that is missing is not checked.
-    """
+def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, ...]]]:
+    """What could be wrong with a helicopter's constants: whether it is, and the end of a sentence
+    with the numbers for it. From numbers or arrays (k,) by name; a name that is missing is not
+    checked, and a value that is not a number passes."""
     for name, value in params.items():
-        if _too_small(name, value):
-            bound = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
-            return f"{name} must be {bound}, got {value:g}"
+        if name in naming.names(Helicopter) and name not in _MAY_BE_NEGATIVE:
+            zero = name in _MAY_BE_ZERO
+            bound, low = ("zero or more", value < 0) if zero else ("more than zero", value <= 0)
+            yield low, f"{name} must be {bound}, got {{:g}}", (value,)
     # Exchanged ends would make the flybar's damping negative, and a fit would end in an If below 0.
-    r1, r2 = params.get("R1"), params.get("R2")
-    if r1 is not None and r2 is not None and r1 >= r2:
-        return (
-            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the "
+    if {"R1", "R2"} <= params.keys():
+        words = (
+            "R1 must be less than R2, got R1 = {:g} and R2 = {:g}: R1 is the inner and R2 the "
             "outer end of the flybar paddle (the paper's nomenclature exchanges them)"
         )
-    if (b := params.get("B")) is not None and b > 1:
-        return f"B must be a tip loss factor of at most 1, got {b:g}"
-    return None
+        yield params["R1"] >= params["R2"], words, (params["R1"], params["R2"])
+    if "B" in params:
+        yield params["B"] > 1, "B must be a tip loss factor of at most 1, got {:g}", (params["B"],)
+
+
+def impossible(params: Mapping[str, float]) -> str | None:
+    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can."""
+    return next((words.format(*of) for is_so, words, of in _reasons(params) if is_so), None)
 
 
 def possible(params: Mapping[str, Any]) -> np.ndarray:
-    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name, as `impossible`
-    checks one; a value that is not a number is not checked."""
-    # The same rules for a batch of a sweep: what cannot be is a status there, not an error.
+    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name."""
+    # For a batch of a sweep: what cannot be is a status there, not an error.
+    values = {n: np.asarray(v) for n, v in params.items()}
     fine = np.asarray(True)
-    for name, value in params.items():
-        fine = fine & ~_too_small(name, np.asarray(value))
-    if "R1" in params and "R2" in params:
-        fine = fine & ~(np.asarray(params["R1"]) >= np.asarray(params["R2"]))
-    if "B" in params:
-        fine = fine & ~(np.asarray(params["B"]) > 1)
+    for is_so, *_ in _reasons(values):
+        fine = fine & ~is_so
     return np.asarray(fine)
-
-
-def _too_small(name: str, value: float | int | np.ndarray) -> Any:
-    """Whether values [SI] of a constant are below what it can be."""
-    if name not in naming.names(Helicopter) or name in _MAY_BE_NEGATIVE:
-        return np.zeros(np.shape(value), bool)
-    return value < 0 if name in _MAY_BE_ZERO else value <= 0
 
 
 class Constant(NamedTuple):
@@ -250,10 +243,9 @@ def vehicle_from_mapping(
     if missing:
         raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
     # Of a class of one's own nobody knows what is possible.
-    if of_helicopter(params):
-        wrong = impossible({n: c.value for n, c in constants.items()})
-        if wrong:
-            raise InputError(f"{where}: {wrong}")
+    values = {n: c.value for n, c in constants.items()}
+    if of_helicopter(params) and (wrong := impossible(values)):
+        raise InputError(f"{where}: {wrong}")
     # Defaults too: a class that devices extend has them as plain numbers.
     values = {n: _scalar(v) for n, v in naming.defaults(params).items()}
     values |= {n: _scalar(c.value) for n, c in constants.items()}

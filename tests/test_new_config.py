@@ -27,9 +27,9 @@ from heli_jax.new_config.guess import (
     words_of,
 )
 from heli_jax.new_config.model_choice import other_vehicle
-from heli_jax.new_config.places import is_place
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.new_config.scales import scaled
+from heli_jax.new_config.signals import is_place
 
 T = np.arange(0.0, 20.0, 0.02)
 STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))

@@ -27,13 +27,7 @@ class LoggedFilters(NamedTuple):
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
-    """How a channel was filtered; None where the log does not say.
-
-    Args:
-        firmware: as the log names it.
-        settings: of the firmware, by name.
-        channel: of the log.
-    """
+    """How a channel was filtered; None where the log does not say."""
     for pattern, reader in _CHANNELS:
         if re.fullmatch(pattern, channel):
             return reader(_Reading(firmware, settings))

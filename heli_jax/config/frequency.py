@@ -16,10 +16,6 @@ def asked_handling(
     """Responses whose handling qualities are shown: those that the configuration names, or else
     those of the model's axes.
 
-    Args:
-        experiment: the configuration.
-        logged: outputs of the flights.
-
     Raises:
         InputError: the model has no such input or output, or the output is no angle and no rate.
     """
@@ -57,12 +53,7 @@ def _is(unit: str, si: str) -> bool:
 
 
 def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[Finding, ...]:
-    """Why axes that were logged have no handling qualities, where none are asked for by name.
-
-    Args:
-        experiment: the configuration.
-        logged: outputs of the flights.
-    """
+    """Why axes that were logged have no handling qualities, where none are asked for by name."""
     config = experiment.config.frequency or FrequencyConfig()
     gaps = handling_gaps(experiment.model, logged) if config.handling is None else ()
     return tuple(note("responses.no-handling", words) for words in gaps)

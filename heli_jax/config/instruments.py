@@ -15,11 +15,6 @@ _PREFIX = "instrument of "
 def instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict[str, Signal]:
     """The instruments as further inputs of the log, by a name that says which input they excite.
 
-    Args:
-        model: whose inputs they are of.
-        config: the signals that are stated.
-        where: what a sentence about a wrong one begins with.
-
     Raises:
         InputError: an input that the model lacks, a constant, or a unit that is unknown.
     """

@@ -3,7 +3,7 @@
 import itertools
 import math
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
@@ -50,15 +50,29 @@ def keys() -> list[Key]:
 
 
 def matching(pattern: str) -> list[Key]:
-    """The keys whose path holds a text, in any case; else those whose meaning does.
-
-    Args:
-        pattern: the text, blanks at its ends left out.
-    """
+    """The keys whose path holds a text, in any case; else those whose meaning does."""
     text, every = pattern.strip().lower(), keys()
     by_path = [k for k in every if text in k.path.lower()]
     # A word of the meaning finds a key whose name the reader does not know.
     return by_path or [k for k in every if text in k.meaning.lower()]
+
+
+def expected(place: Sequence[str | int]) -> str:
+    """What may stand at a place of a configuration, in words: `number or list of number`."""
+    schema = json_schema()
+    at: Any = schema
+    for part in place:
+        options = [
+            schema["$defs"].get(o.get("$ref", "").rsplit("/", 1)[-1], o) for o in _options(at)
+        ]
+        inner = [
+            o.get("items")
+            if isinstance(part, int)
+            else o.get("properties", {}).get(part, o.get("additionalProperties"))
+            for o in options
+        ]
+        at = next((i for i in inner if isinstance(i, dict)), {})
+    return _kind(schema, at)
 
 
 def _walk(

@@ -102,10 +102,6 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
 def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Signal]:
     """The inputs of a kinematic model, moving between samples where the configuration says nothing
     of it: a rate is measured, nobody commands it in steps.
-
-    Args:
-        model: any; the inputs of another than a kinematic one stay as they are.
-        inputs: by the model's name.
     """
     if not is_kinematic(model):
         return dict(inputs)

@@ -4,14 +4,19 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
+
 from heli_jax import naming, units
 from heli_jax.config.corrections import read_corrections, with_corrections
-from heli_jax.config.doubts import OFFSET_AND_SCALE, pulse_width_doubts
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
 from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
-from heli_jax.config.measurement import coloured_noise_cautions, filter_cautions
+from heli_jax.config.measurement import (
+    coloured_noise_cautions,
+    filter_cautions,
+    unfiltered_cautions,
+)
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
     AlsoConfig,
@@ -20,7 +25,6 @@ from heli_jax.config.schema import (
     OutputConfig,
     TimeConfig,
 )
-from heli_jax.config.unfiltered_noise import unfiltered_cautions
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -35,6 +39,10 @@ from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.row_clock import by_rate
 from heli_jax.flights.table import Table
 from heli_jax.identification.methods import estimator_of
+
+_PULSE = (800.0, 2200.0)
+"""us; what receivers and servos know"""
+_OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
 
 
 def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight, ...]:
@@ -109,7 +117,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
         *filter_cautions(first.source, everything.outputs),
         *unfiltered_cautions(first, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
-        *pulse_width_doubts(first),
+        *_pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),
     )
     return (_with_notes(first, notes, cautions), *others)
@@ -432,7 +440,7 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
         # A receiver's pulse width is a time, and no stick of any model is one.
         if role == "inputs" and si is not None and units.is_time(unit):
-            example = f'{OFFSET_AND_SCALE}, unit: "1"'
+            example = f'{_OFFSET_AND_SCALE}, unit: "1"'
             if not units.is_plain(si):
                 example = f"such as offset: 1500, scale in {si} per {unit.strip()}, unit: {si}"
             hint = (
@@ -440,3 +448,27 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
             )
         raise InputError(f"{place}: {e}{hint}") from e
     return si
+
+
+def _pulse_width_doubts(flight: Flight) -> tuple[Finding, ...]:
+    """A doubt for each input whose numbers look like pulse widths and are taken as something
+    else.
+    """
+    doubts = []
+    for name, signal in (flight.source.inputs if flight.source else {}).items():
+        # A rotor's speed in rpm has such numbers too.
+        if signal.constant is not None or signal.offset or signal.si in ("rad/s", "1/s", "Hz"):
+            continue
+        numbers = signal.from_si(flight.inputs[name])
+        low, high = float(np.min(numbers)), float(np.max(numbers))
+        if low < _PULSE[0] or high > _PULSE[1]:
+            continue
+        taken = "plain numbers" if units.is_plain(signal.unit) else signal.unit
+        if signal.scale != 1.0:
+            taken = f"{signal.scale:g} {taken} each"
+        words = (
+            f"{name}: {low:.4g} to {high:.4g} in the log look like pulse widths in us, and are "
+            f"taken as {taken}, with no offset: state offset and scale, {_OFFSET_AND_SCALE}"
+        )
+        doubts.append(Finding("units.unlikely", "doubt", words, high, "largest number", (name,)))
+    return tuple(doubts)

@@ -19,8 +19,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.open_log import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
-from heli_jax.sweeps.axes import Range, whole_seeds
-from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.design import Design, Range, whole_seeds
 from heli_jax.sweeps.reducers import LINEAR, REDUCERS, Reduce, Streaming
 from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_unit, job
 

@@ -13,8 +13,7 @@ from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log
-from heli_jax.new_config.places import is_place
-from heli_jax.new_config.signals import outputs_called, that_move
+from heli_jax.new_config.signals import is_place, outputs_called, that_move
 
 _AXES = {
     "roll": ("roll-flybarless", ("roll_rate", "roll")),

@@ -150,12 +150,7 @@ def _of_stick(channel: str, low: float, high: float, full: float | None) -> Gues
 
 
 def rotor_speed(channel: str, series: Series) -> float:
-    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s.
-
-    Args:
-        channel: its name.
-        series: its samples.
-    """
+    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s."""
     mean = float(np.nanmean(series.values))
     unit = series.unit or without_unit(channel)[1]
     if unit and fits(unit, "rad/s"):

@@ -7,11 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from heli_jax import naming
+from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
 from heli_jax.flights.describe import TimeInfo
+from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
 from heli_jax.flights.row_clock import ROWS
-from heli_jax.new_config.filtered import Filtered
 from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.logs import Log
 from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
 
@@ -33,6 +35,42 @@ _SMOOTH = (
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
 _ROWS_OF_TOPICS = "# Hz; the rows are those of several topics, the outputs slower"
+
+
+class Filtered(NamedTuple):
+    """The channel of an output, and the settings of its filters in words."""
+
+    signal: Alternative
+    settings: str
+
+
+def filter_settings(log: Log, channel: str) -> str:
+    """The settings of constant filters that a channel went through, empty without one."""
+    if log.autopilot is None:
+        return ""
+    logged = logged_filters(log.autopilot.firmware, log.autopilot.parameters, channel)
+    return ", ".join(logged.settings) if logged is not None and logged.filters else ""
+
+
+def filtered_outputs(
+    name: str, model: Any, log: Log, asked: Collection[str]
+) -> dict[str, Filtered]:
+    """The filtered ones of the outputs that a preset supplies.
+
+    Args:
+        name: of the preset.
+        model: whose outputs they are.
+        log: of the autopilot.
+        asked: the outputs to take from the preset; all unless given.
+    """
+    table, known = preset(name).signals, model_outputs()
+    result: dict[str, Filtered] = {}
+    for output in asked or naming.names(model.Outputs):
+        signals = table.get(known.get(output, ""), ())
+        chosen = choose(log.autopilot, signals) if log.autopilot is not None else None
+        if chosen is not None and (settings := filter_settings(log, chosen.channel)):
+            result[output] = Filtered(chosen, settings)
+    return result
 
 
 class Chosen(NamedTuple):
@@ -156,12 +194,7 @@ def _held(name: str, value: float) -> str:
 
 
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
-    """A vehicle file to fill in.
-
-    Args:
-        model: whose parameters it has.
-        means: those that the log tells, with the channel that they are the mean of.
-    """
+    """A vehicle file to fill in."""
     lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number stands for one that has to be there: it only shows what the model reads.

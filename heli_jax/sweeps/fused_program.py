@@ -12,12 +12,14 @@ from heli_jax.fused.code import UnsupportedError, translating
 from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.traced import Traced, traced
 from heli_jax.simulation.accumulate import Steps
-from heli_jax.sweeps.design_point import ElementResults, of_steps, steps_of
-from heli_jax.sweeps.flight_numbers import (
+from heli_jax.sweeps.design_point import (
+    ElementResults,
     FlightNumbers,
     Scalars,
     flight_numbers,
+    of_steps,
     steady,
+    steps_of,
 )
 from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
@@ -44,13 +46,7 @@ class _Parts(NamedTuple):
 
 
 def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
-    """Why the job's runs cannot be one program each; None where they can.
-
-    Args:
-        job: the sweep.
-        devices: of JAX, that would compute it.
-        lanes: as a program takes it.
-    """
+    """Why the job's runs cannot be one program each; None where they can."""
     if devices[0].platform != "cpu":
         return "it is for CPUs alone"
     if not job.streamed or not job.simulated:

@@ -8,7 +8,6 @@ place; the runs of one block are then held while it works.
 # `Any` below: the running values of a Streaming of the user's are any pytree, and without a signal
 # it gets the model's Outputs. Those here have scalars, ().
 
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -31,13 +30,6 @@ class Measured(NamedTuple):
     """sum of squares about the mean, as R^2 has it"""
     power: Any
     """sum of squares"""
-
-    @property
-    def spread(self) -> Any:
-        """Deprecated: the name that `total_squares` had."""
-        # A Streaming of the user's may read it.
-        warnings.warn("spread is deprecated, expected total_squares", DeprecationWarning, 2)
-        return self.total_squares
 
 
 class Streaming(NamedTuple):

@@ -17,8 +17,7 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.axes import whole_seeds
-from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.design import Design, whole_seeds
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]

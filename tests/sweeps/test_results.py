@@ -23,7 +23,6 @@ from heli_jax.sweeps import (
     grid,
     paired,
     product,
-    reducers,
     sobol,
 )
 from heli_jax.sweeps.design_point import DIVERGED, OK, OUT_OF_RANGE
@@ -379,10 +378,3 @@ def test_the_pilot_holds_each_element_in_its_own_trim(xcell):
     assert not found["status"].any()
     for name in reduce:
         np.testing.assert_allclose(found[name], 0.0, atol=1e-9)
-
-
-def test_the_old_name_of_a_measured_signal_s_squares_warns():
-    signal = reducers.measured(np.array([1.0, 3.0, np.nan]), np.dtype(float))
-    assert signal.total_squares == 2.0
-    with pytest.warns(DeprecationWarning, match="total_squares"):
-        assert signal.spread == 2.0

@@ -1,21 +1,13 @@
-"""`heli-jax fit` over several values: a study, in the terminal."""
+"""The fits of a study, in the terminal."""
 
-import argparse
-import contextlib
 import math
 from collections import Counter
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heli_jax import cli_options, run_directory
-from heli_jax.config.study import Study, read_study
-from heli_jax.errors import InputError
-from heli_jax.interrupts import resumable
 from heli_jax.numbers import rounded, terse
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,57 +21,7 @@ _NAMED = 3
 """runs that are named of many"""
 
 
-def asked(options: argparse.Namespace) -> Study | None:
-    """The study that a `heli-jax fit` asks for; None where it asks for one fit.
-
-    Raises:
-        InputError: the configuration or an option is wrong, or an option is for a study alone.
-    """
-    study = read_study(options.config, options.set, options.over)
-    if study is None:
-        for option in ("resume", "workers", "scheduler", "reports"):
-            if getattr(options, option):
-                raise InputError(
-                    f"--{option}: is for a study of fits, expected --over KEY=VALUE,VALUE, or "
-                    f"study in {options.config}"
-                )
-    elif options.resume and not options.out:
-        raise InputError("--resume: expected --out DIR too, the directory of the study")
-    return study
-
-
-def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -> int:
-    """Carry out a study and print it; returns the exit code, that of the worst fit.
-
-    Args:
-        options: of `heli-jax fit`.
-        study: of `asked`.
-        say: for words as the work goes on.
-    """
-    from heli_jax import simulation_output
-    from heli_jax.studies import directory
-    from heli_jax.studies import run as studies
-
-    out = Path(options.out) if options.out else run_directory.default_directory(study.path)
-
-    options.interrupts.words = lambda: resumable(out, directory.FINISHED)
-    # Workers of dask have to be told; our own processes end with this one.
-    options.interrupts.unwinds = bool(options.scheduler)
-    shown = simulation_output.sweep_progress("study", "fits", quiet=options.quiet)
-    with shown as progress, contextlib.ExitStack() as s:
-        workers = options.workers
-        # Without a scheduler --workers are processes of our own, for which dask is not needed.
-        dask = None
-        if options.scheduler:
-            dask = s.enter_context(cli_options.dask_client(options))
-        carrying = studies.Options(options.resume, workers, dask, options.reports, progress, say)
-        result = studies.run(study, out, carrying)
-    print_study(result)
-    tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
-    return _code(result)
-
-
-def _code(result: "xr.Dataset") -> int:
+def exit_code(result: "xr.Dataset") -> int:
     """The exit code of the worst fit."""
     status, adequate, untrusted = (
         set(map(str, result[n].to_numpy().ravel())) for n in ("status", "adequate", "untrusted")
