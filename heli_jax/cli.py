@@ -66,63 +66,44 @@ def _arg(*names: str, **keywords: Any) -> tuple[tuple[str, ...], dict[str, Any]]
     return names, keywords
 
 
+# fmt: off
 _CONFIG = (
     _arg("config", metavar="CONFIG", help="experiment configuration (YAML)"),
-    _arg(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50",
-    ),
+    _arg("--set", action="append", default=[], metavar="KEY=VALUE",
+         help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50"),
 )
 _OUT = _arg("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 _JSON = _arg("--json", help="everything, for other programs")
 _LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
-_OTHER_LOG = _arg(
-    "log", nargs="?", metavar="LOG", help="read as the configuration's first (default: its own)"
-)
+_OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
+                  help="read as the configuration's first (default: its own)")
 _CLOCK = (
     _arg("--time", metavar="NAME", help="of a table: the column of time stamps"),
     _arg("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns"),
 )
-_TIME_RATE = _arg(
-    "--time-rate", type=float, metavar="HZ", help="of a table without times: samples a second"
-)
+_TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
+                  help="of a table without times: samples a second")
 _FLIGHT = _arg("--flight", type=_count, metavar="N", help="of a log of several (from 1)")
 _RESUME = _arg("--resume", help="go on where the study or sweep in --out was ended")
 _WORKERS = (
-    _arg(
-        "--workers",
-        type=_count,
-        metavar="N",
-        either=True,
-        help="processes of this machine (of a study: as many as cores unless given)",
-    ),
-    _arg(
-        "--scheduler",
-        metavar="tcp://HOST:8786",
-        either=True,
-        help="compute on the workers of this dask scheduler",
-    ),
+    _arg("--workers", type=_count, metavar="N", either=True,
+         help="processes of this machine (of a study: as many as cores unless given)"),
+    _arg("--scheduler", metavar="tcp://HOST:8786", either=True,
+         help="compute on the workers of this dask scheduler"),
 )
 _COMMANDS = {
     "fit": ("estimate parameters; write a run directory with a report", (
         *_CONFIG, _OUT, _JSON, _RESUME, *_WORKERS,
-        _arg(
-            "--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
-            help="a study (docs/studies.md): fit with each value, with several keys each "
-            "combination; as --set repeated with one KEY, or study in CONFIG",
-        ),
+        _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
+             help="a study (docs/studies.md): fit with each value, with several keys each "
+             "combination; as --set repeated with one KEY, or study in CONFIG"),
         _arg("--reports", help="of a study: write each fit's page too, which takes seconds"),
     )),
     "compatibility": ("do a log's sensors agree? their errors", (*_CONFIG, _OUT)),
     "check": ("identifiability, sampling and excitation before any fit", (*_CONFIG, _JSON)),
     "windows": ("which parts of a log say most, before any fit", (
         _OTHER_LOG, *_CONFIG,
-        _arg(
-            "--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"
-        ),
+        _arg("--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"),
     )),
     "frf": ("frequency responses of a log, with coherence and intervals", (
         _OTHER_LOG, *_CONFIG, _OUT,
@@ -130,17 +111,13 @@ _COMMANDS = {
     "simulate": ("simulate the configuration's run, or its flights", (
         *_CONFIG,
         _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
-        _arg(
-            "--view", nargs="?", const="", metavar="HTML",
-            help="also a page with figures and the flight in 3D (default: beside --out)",
-        ),
+        _arg("--view", nargs="?", const="", metavar="HTML",
+             help="also a page with figures and the flight in 3D (default: beside --out)"),
     )),
     "sweep": ("run a design of many vehicles; results in a Zarr store", (
         *_CONFIG, _OUT, _RESUME, *_WORKERS,
-        _arg(
-            "--devices", type=_count, metavar="N",
-            help="processor cores or GPUs to use (default: all)",
-        ),
+        _arg("--devices", type=_count, metavar="N",
+             help="processor cores or GPUs to use (default: all)"),
         _arg("--no-figures", help="draw none: it takes seconds"),
     )),
     "info": ("signals, rates, duration and gaps of a log", (
@@ -150,21 +127,15 @@ _COMMANDS = {
     "convert": ("signals of a log on one clock, as a table", (
         _LOG, _arg("out", metavar="OUT", help=".csv, .parquet or .nc"),
         *_CLOCK, _TIME_RATE, _FLIGHT,
-        _arg(
-            "--signals", nargs="+", default=[], metavar="NAME",
-            help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)",
-        ),
+        _arg("--signals", nargs="+", default=[], metavar="NAME",
+             help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)"),
         _arg("--preset", metavar="NAME", help="its signals, by its names and in SI"),
-        _arg(
-            "--config", metavar="CONFIG",
-            help="the signals of its first flight, by the model's names and in SI; or its "
-            "swashplate, for --signals ccpm.roll",
-        ),
+        _arg("--config", metavar="CONFIG",
+             help="the signals of its first flight, by the model's names and in SI; or its "
+             "swashplate, for --signals ccpm.roll"),
         _arg("--rate", type=float, metavar="HZ", help="resample to this rate"),
-        _arg(
-            "--window", nargs=2, type=float, metavar=("FROM", "TO"),
-            help="[s] from the log's beginning",
-        ),
+        _arg("--window", nargs=2, type=float, metavar=("FROM", "TO"),
+             help="[s] from the log's beginning"),
     )),
     "runs": ("the fits that a folder holds", (
         _arg("directory", nargs="?", default="runs", metavar="DIR", help="default: runs"), _JSON,
@@ -175,31 +146,26 @@ _COMMANDS = {
     )),
     "new": ("a configuration that begins with what a log holds", (
         _LOG, _TIME_RATE, _FLIGHT,
-        _arg(
-            "--model", metavar="NAME",
-            help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
-            "(default: the linear model of the axis whose stick moves most)",
-        ),
+        _arg("--model", metavar="NAME",
+             help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
+             "(default: the linear model of the axis whose stick moves most)"),
         _arg("--vehicle", metavar="FILE", help="a vehicle file that is there already"),
         _arg("--out", metavar="FILE", help="configuration (default: the log's name)"),
     )),
     "keys": ("what may stand in a configuration", (
-        _arg(
-            "pattern", nargs="?", metavar="TEXT",
-            help="of keys or their meaning (default: all keys)",
-        ),
+        _arg("pattern", nargs="?", metavar="TEXT",
+             help="of keys or their meaning (default: all keys)"),
         _JSON,
-        _arg(
-            "--schema", metavar="FILE",
-            help="write the JSON schema, by which editors complete YAML",
-        ),
+        _arg("--schema", metavar="FILE",
+             help="write the JSON schema, by which editors complete YAML"),
         _arg("--fit", help="what stands in fit.json instead"),
     )),
     "new-model": ("write the files that a model of one's own needs", (
         _arg("name", metavar="NAME", help="of the model and its module"),
         _arg("--out", metavar="DIR", help="new folder (default: NAME)"),
     )),
-}  # fmt: skip
+}
+# fmt: on
 """by name: its help and its arguments; the function of `new-model` is `_new_model`"""
 
 
@@ -305,9 +271,6 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
     Args:
         cpu_devices: so many processors are devices; JAX decides unless given.
-
-    Raises:
-        InputError: JAX_PLATFORMS asks for a device that is not there.
     """
     # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
     # option, --help and `info` need none of them.
@@ -404,7 +367,7 @@ def _fit(options: argparse.Namespace) -> int:
 
 def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     """Carry out a study and print it; returns the exit code of the worst fit."""
-    from heli_jax import study_output
+    from heli_jax import simulation_output
     from heli_jax.studies import directory
     from heli_jax.studies import run as studies
 
@@ -419,9 +382,9 @@ def _fit_study(options: argparse.Namespace, study: "Study") -> int:
     with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
         how = {"workers": options.workers, "client": client, "reports": options.reports}
         result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
-    study_output.print_study(result)
+    simulation_output.print_study(result)
     tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
-    return study_output.exit_code(result)
+    return simulation_output.study_exit_code(result)
 
 
 def _require_out(options: argparse.Namespace) -> None:
@@ -431,11 +394,7 @@ def _require_out(options: argparse.Namespace) -> None:
 
 # Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
 def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
-    """A dask client where --scheduler or --workers asks for one.
-
-    Raises:
-        InputError: dask is not installed, or nothing answers.
-    """
+    """A dask client where --scheduler or --workers asks for one."""
     if options.scheduler is None and options.workers is None:
         return contextlib.nullcontext()
     try:
@@ -453,10 +412,6 @@ def _discard_output() -> None:
     """Send what is still to be printed nowhere."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _status_code(status: str) -> int:
-    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(status, NOT_CONVERGED)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -507,7 +462,8 @@ def _frf(options: argparse.Namespace) -> int:
     statuses = log_responses.run_responses(experiment, out, options.log, options.say)
     # The responses are written whatever comes of a transfer function; a script that looks at the
     # code alone must not take numbers that are not there.
-    return max(map(_status_code, statuses), default=DONE)
+    codes = {"converged": DONE, "not-identifiable": NOT_DETERMINED}
+    return max((codes.get(status, NOT_CONVERGED) for status in statuses), default=DONE)
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -616,11 +572,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def _selection(options: argparse.Namespace) -> "Selection":
-    """What `convert` takes of a log.
-
-    Raises:
-        InputError: options that exclude one another, or no such preset.
-    """
+    """What `convert` takes of a log."""
     from heli_jax.flights import convert, named
 
     if options.preset is not None and (options.signals or options.config is not None):

@@ -61,14 +61,7 @@ def _stick_inputs(
     """Every input of the model in SI; one that is not named stays at neutral.
 
     Args:
-        experiment: of which the model's inputs count.
         settings: the configuration's `simulate`.
-        n: samples.
-        rng: what is random is drawn from it.
-        where: what errors begin with.
-
-    Raises:
-        InputError: an input that the model lacks, or a unit of the wrong kind.
     """
     record = experiment.model.Inputs
     for name in settings.inputs:
@@ -107,12 +100,7 @@ def _factor_to_si(unit: str, si: str, where: str) -> float:
     """As `units.factor`, with a place.
 
     Args:
-        unit: what a configuration says.
         si: the SI unit of what it is for.
-        where: what errors begin with.
-
-    Raises:
-        InputError: the unit is unknown, or of another kind than `si`.
     """
     try:
         return units.factor(unit, si)
@@ -146,7 +134,12 @@ def generate(experiment: Experiment) -> Simulated:
         needed = " and ".join(drawn.parameters)
         raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
     # What can be refused is refused before the run, which takes longest.
-    _check_outputs(experiment, settings, where)
+    for name in settings.noise:
+        if name not in (known := naming.names(experiment.model.Outputs)):
+            raise InputError(
+                f"{where}.noise: model {experiment.model.name} has no output {name!r}"
+                f"{nearest(name, known)}"
+            )
     driven = _stick_inputs(experiment, settings, n, rng, where)
     _check_full_nonlinear(experiment, settings, where)
     flown = in_wind(experiment) if settings.wind is not None else experiment
@@ -212,16 +205,6 @@ def drive(experiment: Experiment) -> Made:
     if settings.hold_attitude:
         pilot = _pilot(flown, _begin(flown, settings, where), where)
     return Made(flown, flight, trimmed, pilot)
-
-
-def _check_outputs(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
-    known = naming.names(experiment.model.Outputs)
-    for name in settings.noise:
-        if name not in known:
-            raise InputError(
-                f"{where}.noise: model {experiment.model.name} has no output {name!r}"
-                f"{nearest(name, known)}"
-            )
 
 
 def _run(

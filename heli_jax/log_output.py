@@ -206,7 +206,7 @@ def _print_topics(topics: Sequence[TopicInfo]) -> None:
             cells = ("no times, only an order", "", "", "")
         elif clock.problem:
             cells = (_cut(clock.problem), "", "", "")
-        elif _is_burst(clock, topic.n_rows):
+        elif topic.n_rows <= _MOST_OF_BURST and clock.duration < _BURST:
             cells = (f"all within {_short_time(clock.duration)}", "", "", "")
         else:
             # The longest says whether a rate can bridge them; the number alone does not.
@@ -215,11 +215,6 @@ def _print_topics(topics: Sequence[TopicInfo]) -> None:
             cells = (f"{clock.rate:.4g}", _percent(clock.jitter), *gaps)
         rows.append((_squeezed(topic.name), str(len(topic.columns)), str(topic.n_rows), *cells))
     print_table(("topic", "channels", "rows", "rate Hz", "jitter", "gaps", "longest"), rows)
-
-
-def _is_burst(clock: TimeInfo, rows: int) -> bool:
-    """Whether a few messages were written at once, as those of a mission: they have no rate."""
-    return rows <= _MOST_OF_BURST and clock.duration < _BURST
 
 
 def _short_time(seconds: float) -> str:

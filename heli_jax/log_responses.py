@@ -15,7 +15,7 @@ from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.logs import read_flights
+from heli_jax.config.logs import read_flights, with_log
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
@@ -42,13 +42,11 @@ def responses_of_log(
     Args:
         experiment: the configuration; its section `frequency` says band, window and transfer
             functions, its model only how signals are called.
-        log: in place of the configuration's, read as its first flight's is.
-        progress: called with what the log's reader assumed, in words.
 
     Raises:
         InputError: the log or something of the configuration is wrong, or no response is to be had.
     """
-    experiment = _of_log(experiment, log)
+    experiment = experiment if log is None else with_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
     requests = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
     points = config.points or Settings().points
@@ -129,7 +127,6 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[Finding]:
     """In one sentence that inputs were taken to move in straight lines, which is a guess.
 
     Args:
-        guessed: by input the reason.
         half: of the longest step between samples [ms].
     """
     if not guessed:
@@ -168,17 +165,6 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     )
 
 
-def _of_log(experiment: Experiment, log: str | None) -> Experiment:
-    """The configuration with a log in place of its own."""
-    if log is None:
-        return experiment
-    if not experiment.config.flights:
-        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
-    whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
-    first = experiment.config.flights[0].model_copy(update=whole)
-    return experiment._replace(config=experiment.config.model_copy(update={"flights": [first]}))
-
-
 def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
     for name in dict.fromkeys(n for f in flights for n in f.outputs):
         if not any(np.isfinite(f.outputs[name]).any() for f in flights if name in f.outputs):
@@ -212,7 +198,7 @@ def run_responses(
         title = Path(experiment.path).stem
         written = responses._replace(notes=(*responses.notes, *gaps))
         units, png = units_of(experiment), experiment.config.report.png
-        config = as_yaml(resolved(_of_log(experiment, log)))
+        config = as_yaml(resolved(experiment if log is None else with_log(experiment, log)))
         write_responses(temporary, written, units, title, handling, config=config, png=png)
     for found in responses.notes:
         say(Note(found.sentence))

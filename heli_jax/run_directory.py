@@ -93,8 +93,6 @@ def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Ite
     """A temporary directory beside `path`, renamed to it at the end, removed where that fails.
 
     Args:
-        path: the directory.
-        replaces: whether it stands for an earlier one of this process, which goes then.
         or_beside: whether it becomes `path-2` and so on where another process has made `path`
             meanwhile; `written` says which.
 

@@ -105,10 +105,7 @@ def stage(
     """A part of the work goes on meanwhile.
 
     Args:
-        words: of an observer's line.
-        total: steps that it has, where that is known.
         name: under which its time is kept; `words` unless given.
-        shown: whether an observer hears of it.
     """
     work = _work.get()
     if work is None:

@@ -64,8 +64,9 @@ def of_flight(flight: Any) -> Summary:
             rows.append((role[:-1], name, *_range(values), hold))
     used = ", held out" if flight.hold_out else ""
     known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
+    name = f" {flight.name!r}" if flight.name else ""
     return Summary(
-        f"Flight{_quoted(flight.name)}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
+        f"Flight{name}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
         f"{flight.duration:.6g} s{used}",
         ("", "signal", "lowest", "highest", "hold"),
         tuple(rows),
@@ -98,7 +99,6 @@ def of_estimates(
     """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate.
 
     Args:
-        estimates: by name.
         stopped: whether the optimiser did not converge, and no number is a result.
     """
     # prior share: of the estimate's variance, what the priors and not the data explain.
@@ -220,7 +220,3 @@ def _range(values: np.ndarray) -> tuple[str, str]:
     if not finite.size:
         return NOTHING, NOTHING
     return number(float(finite.min())), number(float(finite.max()))
-
-
-def _quoted(name: str) -> str:
-    return f" {name!r}" if name else ""

@@ -5,6 +5,7 @@ terminal with what it would obey.
 """
 
 import contextlib
+import io
 import shutil
 import sys
 import textwrap
@@ -92,10 +93,12 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
     for row in rows:
         table.add_row(*row)
     # '[deg]' in a unit or a signal's name is markup to rich and would vanish, ':m:' an emoji.
-    console = Console(
-        file=sys.stdout, highlight=False, markup=False, emoji=False, width=width + _BETWEEN
-    )
-    console.print(table)
+    # Printed here: rich ends the program where nobody reads any more.
+    text = io.StringIO()
+    plain = {"highlight": False, "markup": False, "emoji": False}
+    terminal = sys.stdout.isatty()
+    Console(file=text, force_terminal=terminal, width=width + _BETWEEN, **plain).print(table)
+    print(text.getvalue(), end="")
 
 
 def say(text: str) -> None:

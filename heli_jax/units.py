@@ -191,7 +191,7 @@ def factor(unit: str, si: str) -> float:
         return float((have / want).to_base_units().magnitude)
     # Only where the file leaves the angle out: '1/s' may stand for rad/s. The other way round, Hz
     # or rad/s for 1/s, is refused, since a factor of 2 pi would go unseen.
-    if _angle_free(have) and _without_angle(have) == _without_angle(want):
+    if "[angle]" not in dict(have.dimensionality) and _without_angle(have) == _without_angle(want):
         base = have.to_base_units()
         # Nobody logs radians a minute: 1/min is how many write turns, 2 pi times as many.
         if dict(have.dimensionality) == {"[time]": -1.0} and float(base.magnitude) != 1.0:
@@ -204,12 +204,18 @@ def factor(unit: str, si: str) -> float:
     raise ValueError(f"unit {unit!r} is {_kind(have)}, expected {_kind(want)} such as {si!r}")
 
 
+def fits(unit: str, si: str) -> bool:
+    """Whether `factor` turns one into the other."""
+    try:
+        factor(unit, si)
+    except ValueError:
+        return False
+    return True
+
+
 def turn(si: str) -> float | None:
     """A full turn in an SI unit; None where that is no angle."""
-    try:
-        return factor("turn", si)
-    except ValueError:
-        return None
+    return factor("turn", si) if fits("turn", si) else None
 
 
 _SI = (
@@ -295,10 +301,6 @@ def is_time(unit: str) -> bool:
 
 def _without_angle(quantity: Any) -> dict[str, float]:
     return {k: v for k, v in dict(quantity.dimensionality).items() if k != "[angle]"}
-
-
-def _angle_free(quantity: Any) -> bool:
-    return "[angle]" not in dict(quantity.dimensionality)
 
 
 _KINDS = {

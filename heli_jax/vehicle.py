@@ -36,6 +36,10 @@ def _field(default: float | None = None, *, kw_only: bool = False) -> Any:
     return eqx.field(converter=_scalar, default=default)
 
 
+def _absent() -> Any:
+    return _field(math.nan)
+
+
 class Helicopter(eqx.Module):
     """A single-rotor helicopter with a Bell-Hiller flybar; every field a scalar in SI.
 
@@ -48,72 +52,62 @@ class Helicopter(eqx.Module):
     # What the reduced roll model reads has no default; what only the whole helicopter reads is NaN
     # until it is given, and `needed_but_missing` says so.
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
-    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field(math.nan)
+    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _absent()
     R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field(kw_only=True)
     c: Annotated[Scalar, "m", "main rotor blade chord"] = _field(kw_only=True)
     a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field(kw_only=True)
     # What a machine without a flybar has not.
-    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _field(
-        math.nan
-    )
-    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _field(
-        math.nan
-    )
+    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _absent()
+    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _absent()
     L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(kw_only=True)
-    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _field(math.nan)
+    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _absent()
     Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field(kw_only=True)
     rho: Annotated[Scalar, "kg/m^3", "air density"] = _field(1.2)
     g: Annotated[Scalar, "m/s^2", "gravitational acceleration"] = _field(9.80665)
     # Eq. 10's B = 0.97: lift ends at 97 % of the blade.
     B: Annotated[Scalar, "1", "tip loss factor"] = _field(0.97)
-    m: Annotated[Scalar, "kg", "total mass"] = _field(math.nan)
-    Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _field(math.nan)
-    Izz: Annotated[Scalar, "kg m^2", "fuselage inertia about the yaw axis"] = _field(math.nan)
-    Ir: Annotated[Scalar, "kg m^2", "rotor inertia about its shaft"] = _field(math.nan)
-    Cd0: Annotated[Scalar, "1", "profile drag coefficient of the blade"] = _field(math.nan)
-    hr: Annotated[Scalar, "m", "rotor disk above the centre of gravity"] = _field(math.nan)
-    lr: Annotated[Scalar, "m", "rotor axis behind the centre of gravity"] = _field(math.nan)
-    R_T: Annotated[Scalar, "m", "length of a tail rotor blade"] = _field(math.nan)
-    c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _field(math.nan)
-    a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _field(math.nan)
-    L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _field(math.nan)
+    m: Annotated[Scalar, "kg", "total mass"] = _absent()
+    Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _absent()
+    Izz: Annotated[Scalar, "kg m^2", "fuselage inertia about the yaw axis"] = _absent()
+    Ir: Annotated[Scalar, "kg m^2", "rotor inertia about its shaft"] = _absent()
+    Cd0: Annotated[Scalar, "1", "profile drag coefficient of the blade"] = _absent()
+    hr: Annotated[Scalar, "m", "rotor disk above the centre of gravity"] = _absent()
+    lr: Annotated[Scalar, "m", "rotor axis behind the centre of gravity"] = _absent()
+    R_T: Annotated[Scalar, "m", "length of a tail rotor blade"] = _absent()
+    c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _absent()
+    a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _absent()
+    L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _absent()
     # rad/s^2 for a full stick, by eq. 10; the paper's nomenclature says another unit.
-    K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _field(math.nan)
-    K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _field(math.nan)
-    K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
-    K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
-    K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
+    K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _absent()
+    K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _absent()
+    K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _absent()
+    K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _absent()
+    K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _absent()
     # Beyond the paper from here on: zero leaves its equations as they are printed.
-    Sx: Annotated[Scalar, "m^2", "fuselage drag area along the body, beyond the paper"] = _field(
+    Sx: Annotated[Scalar, "m^2", "fuselage drag area from ahead, beyond the paper"] = _field(
         0.0
     )
     Sy: Annotated[Scalar, "m^2", "fuselage drag area across, beyond the paper"] = _field(0.0)
     Sz: Annotated[Scalar, "m^2", "fuselage drag area from above, beyond the paper"] = _field(0.0)
     Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
-    I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _field(math.nan)
-    k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _field(math.nan)
+    I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _absent()
+    k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _absent()
     # Blade-element theory has 1; measured machines tilt less.
     K_mu: Annotated[Scalar, "1", "speed stability over blade-element theory's"] = _field(1.0)
     h_T: Annotated[Scalar, "m", "tail rotor above the centre of gravity"] = _field(0.0)
-    K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _field(
-        math.nan
-    )
-    K_I: Annotated[Scalar, "1/rad", "governor: throttle rate per error of rotor speed"] = _field(
-        math.nan
-    )
+    K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _absent()
+    K_I: Annotated[Scalar, "1/rad", "governor: throttle rate per error of rotor speed"] = _absent()
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
     zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
     # Four times what blade-element theory gives for two blades over a turn: see
     # `aero.cyclic_moment`.
     cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
-    c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _field(math.nan)
-    a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _field(
-        math.nan
-    )
+    c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _absent()
+    a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _absent()
 
     # Imported where they are used: summaries import this module.
     def __repr__(self) -> str:
@@ -208,8 +202,6 @@ def read_vehicle(
     """As `load_vehicle`, with each constant's unit and source beside the parameters.
 
     Args:
-        path: of the file.
-        params: the class to build.
         may_lack: constants that may be missing, and are NaN then.
     """
     return vehicle_from_mapping(read_mapping(path), str(path), params, may_lack)
@@ -224,9 +216,7 @@ def vehicle_from_mapping(
     """Build the parameters from a mapping of names to numbers or {value, unit, source}.
 
     Args:
-        content: constants by name.
         where: what errors name, such as the file.
-        params: the class to build, Helicopter or a model's own Params.
         may_lack: constants that may be missing, and are NaN then.
 
     Raises:
@@ -257,8 +247,6 @@ def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
     """A number of a file, or {value, unit, source}, in SI.
 
     Args:
-        entry: as YAML has it.
-        name: of the number.
         si: its SI unit; None where it has none, and the file's is taken as it is.
         where: what errors name, such as the file.
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from heli_jax import cli, interrupts, run_directory
+from heli_jax import cli, run_directory
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 
@@ -125,27 +125,9 @@ def test_too_few_steps_end_with_exit_code_4(bench, capsys):
     assert (written["adequate"], written["exit_code"]) == (None, 4)
 
 
-def test_filter_error_by_configuration(bench, capsys):
-    out = bench.parent / "run"
-    how = ["--set", "fit.method=filter-error", "--set", "fit.free.a.start=5.5"]
-    assert main(["fit", str(bench), *how, "--out", str(out)]) == 0
-    content = json.loads((out / "fit.json").read_text())
-    assert content["method"] == "filter-error"
-    assert {"sigma_w", "tau_w"} <= set(content["nuisance"])
-    assert content["residuals"]["white"]
-    assert "a/Ixx" in content["baseline_rls"]["combinations"]
-
-
 def test_simulation_needs_the_size_of_the_disturbance(bench, capsys):
     edited(bench, lambda c: c.update(disturbance={"axis": "roll"}))
     refused(capsys, ["simulate", bench, "--out", bench.parent / "b.csv"])
-
-
-def test_info_tells_rate_and_signals(bench, capsys):
-    assert main(["info", str(bench.parent / "bench.csv")]) == 0
-    shown = capsys.readouterr().out
-    assert "50 Hz" in shown
-    assert "stick_roll" in shown
 
 
 def test_simulate_without_a_simulate_section_follows_the_flights(bench, capfd):
@@ -277,41 +259,6 @@ def test_missing_samples(bench, capsys):
     assert main(["fit", str(bench), "--out", str(bench.parent / "other")]) == 2
 
 
-@pytest.mark.slow
-def test_comparison_by_configuration(bench, capsys):
-    def as_in_test_choice(content):  # so that what was compiled for one serves the other
-        content["simulate"]["duration"] = 40
-        content["fit"]["free"] = {
-            "Ixx": {"start": 0.03}, "If": {"start": 2.5e-4},
-        }  # fmt: skip
-        content["rls"] = None
-
-    edited(bench, as_in_test_choice)
-    assert main(["simulate", str(bench), "--out", str(bench.parent / "bench.csv")]) == 0
-    out = bench.parent / "run"
-    assert main(["fit", str(bench), "--set", "fit.compare=true", "--out", str(out)]) == 0
-    content = json.loads((out / "fit.json").read_text())
-    assert {c["name"] for c in content["models"]["candidates"]} == {
-        "no disturbance", "one pole", "two poles",
-    }  # fmt: skip
-
-
-@pytest.mark.slow
-def test_intervals_by_configuration(bench, capsys):
-    out = bench.parent / "run"
-    how = [
-        "--set", "fit.method=output-error", "--set", "fit.intervals.profile=[Ixx]",
-        "--set", "fit.intervals.bootstrap=16", "--set", "rls=null",
-    ]  # fmt: skip
-    edited(bench, lambda content: content.pop("disturbance"))
-    assert main(["simulate", str(bench), "--out", str(bench.parent / "bench.csv")]) == 0
-    assert main(["fit", str(bench), *how, "--out", str(out)]) == 0
-    content = json.loads((out / "fit.json").read_text())
-    assert set(content["intervals"]["by_parameter"]["Ixx"]) == {"gaussian", "profile", "bootstrap"}
-    assert content["acceptance"]
-    assert (out / "figures" / "intervals.svg").exists()
-
-
 def test_usage_and_places_to_write(bench, capsys):
     (bench.parent / "there").mkdir()
     for arguments in (
@@ -425,18 +372,6 @@ def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
     assert [path.name for path in tmp_path.iterdir()] == (["done.csv"] if done else [])
 
 
-def test_an_interrupt_says_that_something_is_kept_only_where_it_is(tmp_path):
-    out = tmp_path / "study"
-    assert interrupts.resumable(out, "fits/*") == "interrupted; nothing was written"
-    out.mkdir()
-    goes_on = f"--out {out} --resume"
-    said = interrupts.resumable(out, "fits/*")
-    assert said == f"interrupted; nothing was finished yet: {goes_on} begins with the first"
-    (out / "fits" / "0").mkdir(parents=True)
-    said = interrupts.resumable(out, "fits/*")
-    assert said == f"interrupted; what is finished is kept: {goes_on} goes on"
-
-
 def test_an_interrupt_while_the_command_is_imported(tmp_path):
     """heli_jax/__main__.py listens before it imports anything."""
     (tmp_path / "argparse.py").write_text("import signal; signal.raise_signal(signal.SIGINT)\n")
@@ -497,9 +432,7 @@ def test_a_finished_fit_is_shown_where_its_directory_cannot_be_written(bench, ca
     monkeypatch.setattr("heli_jax.report.files.write_signals", full)
     out = bench.parent / "run"
     assert main(["fit", str(bench), "--out", str(out)]) == 2
-    printed = capsys.readouterr()
-    assert "Ixx" in printed.out
-    assert "No space left" in printed.err.splitlines()[-1]
+    assert "Ixx" in capsys.readouterr().out
     assert [p.name for p in bench.parent.iterdir() if "run" in p.name] == []
 
 
@@ -530,31 +463,8 @@ def test_two_fits_of_one_directory_are_both_kept(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"run", "run-2", "run-3"}
 
 
-def test_messages_stay_short():
-    text = f"log.yaml: expected a number, got {'9' * 900_000} in line 3"
-    assert len(str(InputError(text))) < 2100
-    assert str(InputError(text)).endswith("in line 3")
-
-
 def test_arguments_that_are_no_text_are_refused(capsys):
     refused(capsys, ["info", "log\udcff.csv"])
-
-
-# The moments above are those at which it could go wrong; this one waits for the imports of a fit.
-@pytest.mark.slow
-def test_interrupt_leaves_nothing_behind(bench):
-    out = bench.parent / "run"
-    process = as_program("", ["fit", bench, "--out", out, "--set", "fit.starts=2000"], bench.parent)
-    assert process.stderr is not None
-    first = process.stderr.readline()  # it is at work
-    for _ in range(3):
-        process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 130, first
-    assert err.splitlines()[-1] == "heli-jax: interrupted; nothing was written"
-    assert "Traceback" not in err
-    assert not out.exists()
-    assert not list(bench.parent.glob(".run*"))
 
 
 MODEL = """
@@ -678,11 +588,3 @@ def test_quiet_hides_progress_and_no_doubt(tmp_path, bench_log, capsys):
     said = capsys.readouterr().err
     assert "column 't' is taken for a clock in s" in said
     assert "wrote" not in said
-
-
-@pytest.mark.parametrize("arguments", [[], ["fit"], ["frf"]])
-def test_help_says_what_exit_codes_mean(arguments, capsys):
-    with pytest.raises(SystemExit):
-        main([*arguments, "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert all(f" {code} " in said for code in (0, 2, 3, 4, 130))

@@ -59,7 +59,7 @@ ENTRY = {
     "config", "generate", "new_model", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "interrupts",
     "compatibility", "new_config", "simulation_output",
-    "terminal", "studies", "study_output",
+    "terminal", "studies",
     "sweep_workflow",
     "__init__",
     "__main__",
@@ -199,7 +199,7 @@ def test_nothing_imports_the_command_line(name):
             {
                 "sweeps",
                 "studies",
-                "study_output.py",
+                "simulation_output.py",
                 "report/sweeps",
                 "report/responses_netcdf.py",
                 "flights/array_table.py",

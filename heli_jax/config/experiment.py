@@ -450,11 +450,7 @@ def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
 
 
 def _in_si(config: Config, model: Model, path: Path) -> Config:
-    """The configuration with plain numbers in SI for the initial state and the disturbance.
-
-    Raises:
-        InputError: a unit that is unknown or of another kind, or no such state.
-    """
+    """The configuration with plain numbers in SI for the initial state and the disturbance."""
     changes: dict[str, Any] = {}
     if config.initial_state:
         changes["initial_state"] = _initial_state(config, model, path)
@@ -475,11 +471,7 @@ def _in_si(config: Config, model: Model, path: Path) -> Config:
 
 
 def _initial_state(config: Config, model: Model, path: Path) -> dict[str, float]:
-    """The configuration's initial state [SI].
-
-    Raises:
-        InputError: no such state, or its number is wrong.
-    """
+    """The configuration's initial state [SI]."""
     where, states = f"{path}: initial_state", naming.names(model.State)
     for name in config.initial_state:
         if name not in states:

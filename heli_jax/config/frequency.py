@@ -25,7 +25,11 @@ def asked_handling(
     check_pairs(experiment, "handling", config.handling)
     unit = units_of(experiment)
     for i, h in enumerate(config.handling):
-        if h.response == "open-loop" or _is(unit[h.output], "rad") or _is(unit[h.output], "rad/s"):
+        if (
+            h.response == "open-loop"
+            or units.fits(unit[h.output], "rad")
+            or units.fits(unit[h.output], "rad/s")
+        ):
             continue
         raise InputError(
             f"{experiment.path}: frequency.handling[{i}].output: {h.output} is in {unit[h.output]},"
@@ -37,19 +41,11 @@ def asked_handling(
             h.input,
             h.output,
             h.response,
-            integrated=_is(unit[h.output], "rad/s") and h.response != "open-loop",
+            integrated=units.fits(unit[h.output], "rad/s") and h.response != "open-loop",
             gain=h.gain,
         )
         for h in config.handling
     )
-
-
-def _is(unit: str, si: str) -> bool:
-    try:
-        units.factor(unit, si)
-    except ValueError:
-        return False
-    return True
 
 
 def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[Finding, ...]:
@@ -65,9 +61,7 @@ def check_pairs(
     """Refuse pairs of input and output that the model has not.
 
     Args:
-        experiment: the configuration.
         section: of `frequency` that they stand in.
-        pairs: as they stand there.
 
     Raises:
         InputError: one of them.

@@ -1,7 +1,7 @@
 """What stands between motion and log according to the flights' outputs: filters and delays."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,6 @@ class OpenedLogs:
         """The log, opened now or before.
 
         Args:
-            path: of the file.
             number: which flight of several, from 1.
 
         Raises:
@@ -66,7 +65,6 @@ class OpenedLogs:
         """The log if it is open.
 
         Args:
-            path: of the file.
             number: which flight of several, from 1.
         """
         return self._logs.get(_key(path, number))
@@ -92,9 +90,6 @@ def with_measurement(
 
     Args:
         model: with the devices of `onboard` around it.
-        flights: of the configuration.
-        path: the configuration; logs are found from its folder.
-        logs: those that are open; one whose settings are asked for is among them then.
 
     Raises:
         InputError: two flights state different ones, a log does not say what it is asked, or the
@@ -102,7 +97,8 @@ def with_measurement(
     """
     channels: dict[str, tuple[_Channel, int]] = {}
     for i, flight in enumerate(flights):
-        for part, name, output in _outputs(flight):
+        parts = (flight, *flight.also)
+        for part, name, output in ((p, n, o) for p in parts for n, o in p.signals.outputs.items()):
             if name not in naming.names(model.Outputs):
                 continue  # refused where the log is read, with the names that there are
             channel = _channel(part, f"flights[{i}].signals.outputs.{name}", output, path, logs)
@@ -124,14 +120,6 @@ def with_measurement(
         raise InputError(f"{path}: flights.signals.outputs: {e}") from e
 
 
-def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
-    """The outputs of a flight with the section that names their log, which has `log`, `flight` and
-    `signals`: the flight itself, or a further log of it."""
-    for part in (flight, *flight.also):
-        for name, output in part.signals.outputs.items():
-            yield part, name, output
-
-
 def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: OpenedLogs) -> _Channel:
     """The filters and the delay of one output."""
     filters: list[Filter] = []
@@ -141,7 +129,9 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             continue
         log = logs.open(path.parent / part.log, part.flight)
         # First, or a misspelt channel would be taken for one of which the log says nothing.
-        if not _is_derived(output.signal) and output.signal not in log.names:
+        # What is computed from channels stands in no log.
+        derived = "(" in output.signal or output.signal.startswith("ccpm.")
+        if not derived and output.signal not in log.names:
             near = nearest(output.signal[:60], {n[:60] for n in log.names})
             raise InputError(
                 f"{path}: {where}.signal: {part.log} has no channel {shown(output.signal)}{near}"
@@ -156,11 +146,6 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             )
         filters += logged.filters
     return tuple(filters), output.delay or 0.0
-
-
-def _is_derived(signal: str) -> bool:
-    """Whether it is computed from channels, and so stands in no log."""
-    return "(" in signal or signal.startswith("ccpm.")
 
 
 def _words(channel: _Channel) -> str:
@@ -228,7 +213,8 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     late = 1e3 * sum(f.delay for f in filters)
     # All of the line: of an output that a preset supplies the configuration has none.
     line = [f'signal: "{output.signal}"', *([f"unit: {output.unit}"] if output.unit else [])]
-    line += [f"{key}: {value:g}" for key, value in _changed(output).items()]
+    line += [f"scale: {output.scale:g}"] * (output.scale != 1.0)
+    line += [f"offset: {output.offset:g}"] * (output.offset != 0.0)
     line += ["invert: true"] * output.invert
     # The inputs were not: were both filtered alike, the machine would look the same.
     words = (
@@ -238,13 +224,6 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
         "under outputs to model it, or `filter: []` there if it is of no account"
     )
     return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
-
-
-def _changed(output: OutputConfig) -> dict[str, float]:
-    """Scale and offset where they do something."""
-    return {
-        k: v for k, v, d in (("scale", output.scale, 1.0), ("offset", output.offset, 0.0)) if v != d
-    }
 
 
 def _short(setting: str) -> str:

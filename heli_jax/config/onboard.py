@@ -184,9 +184,7 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
     """The model with the devices of a configuration around it.
 
     Args:
-        model: bare.
         config: the section, or None.
-        path: the configuration, for errors.
 
     Raises:
         InputError: a device that the model cannot have.

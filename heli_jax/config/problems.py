@@ -14,7 +14,7 @@ from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
-from heli_jax.config.schema import FitConfig, FreeConfig, LinearConfig
+from heli_jax.config.schema import FitConfig, LinearConfig
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
@@ -50,20 +50,25 @@ def problem(experiment: Experiment) -> Problem:
         if not flight.hold_out:  # which is simulated, and not fitted
             require_some_time(flight)
             require_moving_outputs(flight)
-    free = {name: _free(f) for name, f in config.fit.free.items()}
+    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
+    free = {
+        name: Free(**{**dict(f), "prior": None if f.prior is None else Prior(**dict(f.prior))})
+        for name, f in config.fit.free.items()
+    }
     free, guess = _first_guesses(experiment, flights, free)
     if config.fit.method == "filter-error":
         _require_disturbance(experiment, "fit.method")
     of_method = _of_method(experiment, config.fit.method, flights, free)
     model = of_method["model"]
+    # One number for all flights, since they share one compiled program: the slowest log's.
+    substeps = max(substeps_for(f.dt, model.fastest) for f in flights)
     try:
         whole = Problem(
             **of_method,
             # Not before the noise of the inputs is known, which it makes larger.
             flights=tuple(sharpened(model, f) for f in flights),
             nuisance=nuisance,
-            # One number for all flights, since they share one compiled program: the slowest log's.
-            substeps=_substeps(model, flights),
+            substeps=substeps_of(model, flights) if is_kinematic(model) else substeps,
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             first_guess=guess,
             frequency=_responses(experiment),
@@ -182,23 +187,11 @@ def with_chosen_windows(problem: Problem) -> Problem:
     return dataclasses.replace(problem, flights=tuple(flights))
 
 
-def _substeps(model: Model, flights: Sequence[Flight]) -> int:
-    if is_kinematic(model):
-        return substeps_of(model, flights)
-    return max(substeps_for(f.dt, model.fastest) for f in flights)
-
-
 def _nuisance(config: FitConfig) -> Nuisance:
     stated = config.nuisance.model_dump()
     if isinstance(stated["input_offset"], list):  # YAML has no tuples
         stated["input_offset"] = tuple(stated["input_offset"])
     return Nuisance(**stated)
-
-
-def _free(config: FreeConfig) -> Free:
-    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
-    prior = None if config.prior is None else Prior(**dict(config.prior))
-    return Free(**{**dict(config), "prior": prior})
 
 
 def _check_intervals(config: FitConfig, path: Path) -> None:
@@ -294,12 +287,7 @@ def _first_guesses(
     """The free parameters with their starts, and how these were found; None where they are given.
 
     Args:
-        experiment: whose model is regressed without a disturbance, which needs no start here.
-        flights: read.
         free: as the configuration has them; NaN where a start is left out.
-
-    Raises:
-        InputError: a start is missing, or none can be found.
     """
     config, path = experiment.config.fit, experiment.path
     assert config is not None
@@ -367,7 +355,6 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 
     Args:
         config: whose `instrument` may be meant for the start, or for a method of `also`.
-        method: that the problem is for.
     """
     others = [m for m in (config.start.method, *config.also) if m in METHODS]
     if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
@@ -376,11 +363,7 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
 
 
 def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
-    """The problem with the starts that `fit.start: frequency-error` finds; else as it is.
-
-    Raises:
-        InputError: frequency error cannot solve it.
-    """
+    """The problem with the starts that `fit.start: frequency-error` finds; else as it is."""
     config = experiment.config.fit
     if config is None or config.start.method != "frequency-error":
         return problem

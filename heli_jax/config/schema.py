@@ -5,13 +5,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from heli_jax.config.design_section import SweepConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
+from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
-from heli_jax.config.simulate_section import SimulateConfig
 from heli_jax.identification.equation_error.limits import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign

@@ -43,9 +43,7 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
     and each lag is at most 3 % of its own step.
 
     Args:
-        flight: as read.
         frequencies: [Hz]; none leaves it as it is.
-        where: what a sentence about a wrong one begins with.
 
     Raises:
         InputError: a frequency that the samples do not have, or an output with so many gaps that
@@ -162,7 +160,6 @@ def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...
     """A finding where a rotor's stated speed is none, or its unit is not stated.
 
     Args:
-        vibration: as configured.
         speed: what it states [rad/s].
     """
     if speed > _FASTEST_ROTOR:

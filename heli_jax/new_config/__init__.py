@@ -52,11 +52,9 @@ def write_config(
     """Write a configuration, and for models of a machine's geometry a vehicle file to fill in.
 
     Args:
-        log: of any format that is read.
         out: the configuration's place; what stands there is not replaced.
         model: as a configuration names it, a linear one by its file's name too; chosen by what
             moves unless given.
-        vehicle: a vehicle file.
         flight: of a log that holds several, from 1.
         time_rate: samples a second [Hz] of a table without times.
 

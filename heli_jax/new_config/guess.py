@@ -86,8 +86,6 @@ def by_name(
     """The channels that may be a signal, the likeliest first.
 
     Args:
-        called: what people call it, words by blanks.
-        names: of the log's channels.
         commanded: what else a command of it may name, as `roll` in roll_cmd.
     """
     forms = [tuple(c.split()) for c in called]
@@ -164,7 +162,7 @@ def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> s
     """The first channel, or one of the same words whose unit is stated: rc_aileron(percent)."""
     words = words_of(names[0])
     alike = [n for n in names if words_of(n) == words]
-    known = (n for n in alike if fits(log[n].unit or without_unit(n)[1] or "none", si))
+    known = (n for n in alike if units.fits(log[n].unit or without_unit(n)[1] or "none", si))
     return next(known, names[0])
 
 
@@ -188,7 +186,7 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
     """Whether a channel's name and unit leave room for an output of the model."""
     unit = series.unit or without_unit(name)[1]
     # A model that states no unit takes any.
-    if unit and si != "1" and not fits(unit, si):
+    if unit and si != "1" and not units.fits(unit, si):
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
     return not (_OTHER | _CHANGES) & words - own
@@ -246,12 +244,3 @@ def full_travel(sticks: Mapping[str, Series]) -> float | None:
 def are_whole(values: np.ndarray) -> bool:
     """Whether samples (N,) are whole numbers."""
     return bool(np.all(values == np.rint(values)))
-
-
-def fits(unit: str, si: str) -> bool:
-    """Whether a unit is one of what the model has in `si`."""
-    try:
-        units.factor(unit, si)
-    except ValueError:
-        return False
-    return True

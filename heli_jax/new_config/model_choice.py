@@ -51,9 +51,6 @@ def chosen_model(
 
     Args:
         name: as stated; chosen by what moves unless given.
-        log: of which signals are known.
-        path: of the log.
-        folder: of the configuration, where a module of one's own lies.
     """
     if name is None:
         vehicle = other_vehicle(log.autopilot)

@@ -58,9 +58,6 @@ def filtered_outputs(
     """The filtered ones of the outputs that a preset supplies.
 
     Args:
-        name: of the preset.
-        model: whose outputs they are.
-        log: of the autopilot.
         asked: the outputs to take from the preset; all unless given.
     """
     table, known = preset(name).signals, model_outputs()
@@ -121,20 +118,10 @@ def configuration(
     """The configuration as text.
 
     Args:
-        chosen: the model.
-        log: as the configuration names it.
-        time: the clock of a table.
-        flight: the number, where a log holds several.
-        preset: the table of the autopilot, in place of signals.
-        signals: by the model's names.
-        vehicle: the vehicle file, as the configuration names it.
         free: starts by parameter; None at the vehicle's value.
-        held: parameters that stay at the values of the model's own file.
         rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
             those of several topics.
-        others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
-        filtered: those of the preset's outputs that the autopilot filtered.
         late: which input is logged late, in words, empty where none is; and whether nothing else
             looks like that.
 
@@ -170,8 +157,14 @@ def configuration(
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
-    lines += [_free(name, start) for name, start in free.items()]
-    lines += [_held(name, value) for name, value in held.items()]
+    lines += [
+        f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
+        if start is None
+        else f"    {name}: {{start: {_number(start)}}}"
+        for name, start in free.items()
+    ]
+    stays = "# stays at this, another machine's; found without the first #"
+    lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     guess, sure = late
     why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
@@ -182,17 +175,6 @@ def configuration(
     return "\n".join(lines) + "\n"
 
 
-def _free(name: str, start: float | str | None) -> str:
-    if start is None:
-        return f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
-    return f"    {name}: {{start: {_number(start)}}}"
-
-
-def _held(name: str, value: float) -> str:
-    line = f"    # {name}: {{start: {_number(value)}}}".ljust(33)
-    return f"{line}# stays at this, another machine's; found without the first #"
-
-
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     """A vehicle file to fill in."""
     lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
@@ -201,7 +183,8 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
     needed = {*(n for n in known if n not in defaults), *needed_but_missing(model, params)}
     for name in known:
-        if name not in needed and not _is_read(model, params, name):
+        unset = not math.isfinite(float(getattr(params, name)))
+        if name not in needed and (unset or not reads(model, params, name)):
             continue
         unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
         value = EDIT if name in needed else f"{float(getattr(params, name)):g}"
@@ -212,10 +195,6 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
             meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or let the fit find it"
         lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
     return "\n".join(lines) + "\n"
-
-
-def _is_read(model: Any, params: Any, name: str) -> bool:
-    return math.isfinite(float(getattr(params, name))) and reads(model, params, name)
 
 
 def _axes(model: Any, logged: Collection[str]) -> tuple[str, ...]:

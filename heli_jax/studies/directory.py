@@ -103,11 +103,6 @@ def read_fit(place: Path) -> dict[str, Any] | None:
     return None
 
 
-def is_done(place: Path) -> bool:
-    """Whether there is a fit in its directory."""
-    return (place / "fit.json").is_file()
-
-
 def write_fit(place: Path, outcome: Outcome) -> None:
     """Write a fit's directory, in place of that of one that failed.
 

@@ -107,11 +107,7 @@ def run(study: Study, out: Path, options: Options) -> xr.Dataset:
 
 
 def _tasks(study: Study, reports: bool) -> list[Task]:
-    """What workers are told; a value that the configuration cannot have is refused now.
-
-    Raises:
-        InputError: it names the point.
-    """
+    """What workers are told; a value that the configuration cannot have is refused now."""
     tasks = []
     path = str(study.path.absolute())
     for point in study.points():
@@ -126,7 +122,7 @@ def _tasks(study: Study, reports: bool) -> list[Task]:
 
 def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) -> None:
     """Fit what is not there yet, and write each fit as it is done."""
-    todo = [k for k, place in enumerate(places) if not directory.is_done(place)]
+    todo = [k for k, place in enumerate(places) if not (place / "fit.json").is_file()]
     if not todo:
         return
     done, pace = len(tasks) - len(todo), Pace(len(tasks), options.progress)

@@ -42,14 +42,7 @@ def split_for(
     computes side by side.
 
     Args:
-        job: the sweep.
         devices: of JAX; those of this process unless given.
-        chunk: elements written at a time; taken as it is where it is given, up to the sweep's.
-        lanes: elements computed side by side on a device; likewise.
-        backend: "xla", "fused" (a run as one program of machine code), or "auto": fused on
-            CPUs where it can be.
-        shares: how many processes take chunks side by side; each shall have several.
-        say: called with a sentence where a run has no fused program.
 
     Raises:
         ValueError: no such backend, or fused where it cannot be.
@@ -89,7 +82,8 @@ def _fused_or_xla(
 def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:
     """Elements of a chunk: whole blocks of all devices, of a few seconds and not much memory."""
     step = BLOCKS * lanes * n_devices
-    heaviest = max(_bytes(shapes(job, i)) for i in range(len(job.flights)))
+    each = (jax.tree.leaves(shapes(job, i)) for i in range(len(job.flights)))
+    heaviest = max(sum(v.size * v.dtype.itemsize for v in leaves) for leaves in each)
     room = min(_MOST_ELEMENTS[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
     # The guess of the time is for a core; a GPU is done with any chunk that fits sooner than that.
     in_time = room if kind == "gpu" else _power(_CHUNK_S * n_devices / _guess(job))
@@ -101,11 +95,6 @@ def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> 
 def _power(n: float) -> int:
     """The power of two at or above n."""
     return 1 << max(0, math.ceil(math.log2(max(1, n))))
-
-
-def _bytes(tree: Any) -> int:
-    """Of all arrays in a pytree, or of arrays of these shapes."""
-    return sum(v.size * v.dtype.itemsize for v in jax.tree.leaves(tree))
 
 
 def _guess(job: Job) -> float:

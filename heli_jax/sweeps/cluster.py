@@ -176,11 +176,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _answering() -> Iterator[None]:
-    """What dask says of lost schedulers and of workers that cannot compute, as a sentence.
-
-    Raises:
-        InputError: the scheduler or too many workers are gone, or one's own modules are not there.
-    """
+    """What dask says of lost schedulers and of workers that cannot compute, as a sentence."""
     try:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
@@ -283,10 +279,6 @@ def _gathered(futures: list[Any]) -> Any:
 def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
     """The futures as they end, in any order, each with what gives its result or raises its error;
     more may be added meanwhile.
-
-    Raises:
-        InputError: the scheduler is gone, or has had no worker for long that takes work: tasks
-            would wait for one without end, and nobody would be told.
     """
     seen = looked = time.monotonic()
     while not running.is_empty():

@@ -19,7 +19,7 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.reducers import Measured, Reduce
+from heli_jax.sweeps.reducers import Measured
 from heli_jax.sweeps.spec import Job, Plan
 
 Scalars = dict[str, jax.Array]
@@ -170,7 +170,6 @@ def design_point(
     """One element.
 
     Args:
-        plan: what is compiled.
         numbers: of the flight and the vehicle, SI.
         values: of the axes, scalars, SI.
         trim: the steady flight to begin in; None for the model's initial state.
@@ -224,8 +223,6 @@ def of_steps(
 
     Args:
         plan, numbers, values, trim: as `design_point` has them.
-        reduced: the running values after the last sample, the State there, and by name whether a
-            limit was left.
     """
     return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, *reduced))
 
@@ -301,7 +298,7 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
     """What all streaming reducers do at a sample, their values before the first, and the measured
     signals (N,) that they compare with."""
     dtype = numbers.dt.dtype
-    reduce = dict(plan.reduce)
+    signals = {n: r.signal for n, r in plan.reduce}
     streams = {n: s for n, r in plan.reduce if (s := reducers.streaming(r)) is not None}
     start = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), s.start) for n, s in streams.items()}
     data = {n: (m.values, m.seen) for n, m in numbers.measured.items()}
@@ -314,16 +311,13 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
 
     def update(value: dict[str, Any], outputs: Any, now: dict[str, Any]) -> dict[str, Any]:
         """The running values with one sample more."""
-        return {
-            name: stream.update(value[name], _signal(reduce[name], outputs), measured(name, now))
-            for name, stream in streams.items()
-        }
+        new = {}
+        for name, stream in streams.items():
+            y = outputs if (signal := signals[name]) is None else getattr(outputs, signal)
+            new[name] = stream.update(value[name], y, measured(name, now))
+        return new
 
     return update, start, data
-
-
-def _signal(reducer: Reduce, outputs: Any) -> Any:
-    return outputs if reducer.signal is None else getattr(outputs, reducer.signal)
 
 
 def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int) -> Scalars:
@@ -339,11 +333,7 @@ def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int)
 
 
 def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
-    """What a function of the user's gives for a run, by name.
-
-    Raises:
-        ValueError: it fails, or gives no real number.
-    """
+    """What a function of the user's gives for a run, by name."""
     called = getattr(function, "__qualname__", str(function))
     try:
         results = {n: jnp.asarray(v) for n, v in _named(name, function(run)).items()}

@@ -84,18 +84,14 @@ class FusedProgram:
         mapped = jax.device_put((filled, trims), parts.split)
         carry, own = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        carry, own = _rows((carry, own))
+        # With the elements as the last dimension, where it takes no copy.
+        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), (carry, own))
         stays = parts.run.stays(own, parts.common(numbers, *first))
         stored = jax.tree.leaves(_records(numbers))
         stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
         results = parts.kernel(stays, stored, carry, self._threads)
         reduced = jax.tree.unflatten(parts.run.results, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
-
-
-def _rows(tree: Any) -> Any:
-    """The same with the elements as the last dimension, where it takes no copy."""
-    return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), tree)
 
 
 def _records(numbers: FlightNumbers) -> Any:

@@ -150,10 +150,6 @@ def create(
 
     Args:
         path: where it is made; None for one in memory.
-        job: the sweep.
-        split: how it is cut; a chunk of the sweep is one of Zarr's, and so one file.
-        attributes: kept with the store, as JSON has them.
-        where: what a message begins with.
 
     Raises:
         OSError: the place cannot be written to.

@@ -14,8 +14,6 @@ import xarray as xr
 import yaml
 
 from heli_jax import cli
-from heli_jax.naming import names
-from heli_jax.vehicle import Helicopter
 
 ROOT = Path(__file__).parents[2]
 
@@ -94,26 +92,6 @@ def test_designs_of_a_configuration(write, tmp_path, capsys):
     np.testing.assert_array_equal(found["a"], np.repeat(table["lift"], 2))
     np.testing.assert_allclose(found["initial.phi"], np.tile([0.0, np.deg2rad(10)], 3))
     assert found["status"].values.tolist() == [0, 0, 0, 0, 1, 1]
-
-
-@pytest.mark.slow
-def test_a_seed_and_a_function_of_ones_own(write, tmp_path):
-    (tmp_path / "my_reducers.py").write_text(
-        "import jax.numpy as jnp\n\ndef swing(run):\n"
-        "    return jnp.max(run.outputs.roll) - jnp.min(run.outputs.roll)\n"
-    )
-    config = content(
-        axes={"seed": {"values": [0, 1, 2]}},
-        reduce={"swing": {"how": "my_reducers:swing"}},
-        trajectories={"signals": ["roll"], "every": 5},
-    )
-    config["disturbance"] = {"axis": "roll", "sigma_w": 1.0, "tau_w": 1.0}
-    out = tmp_path / "out"
-    assert cli.main(["sweep", str(write(config)), "--out", str(out)]) == 0
-    found = opened(out)
-    assert len(set(found["swing"].values.tolist())) == 3
-    assert found["trajectory_roll"].shape == (3, 10)
-    assert found["seed"].dtype == np.int64
 
 
 def test_the_python_of_the_documentation_runs(tmp_path, monkeypatch):
@@ -337,17 +315,3 @@ def test_without_dask_the_extra_is_named(write, tmp_path):
     assert run.returncode == 2
     assert "heli_jax[distributed]" in run.stderr
     assert not (tmp_path / "o").exists()
-
-
-def test_possible_judges_as_impossible_does(vehicles_folder):
-    from heli_jax import load_vehicle
-    from heli_jax.vehicle import impossible, possible
-
-    good = {n: float(getattr(load_vehicle(vehicles_folder / "x-cell-60.yaml"), n))
-            for n in names(Helicopter)}  # fmt: skip
-    for name in names(Helicopter):
-        for value in (-1.0, 0.0, 0.5, 1.5):
-            changed = good | {name: value}
-            judged = possible(good | {name: np.array([value, good[name]])})
-            both = np.broadcast_to(judged, 2).tolist()
-            assert both == [impossible(changed) is None, True], (name, value)

@@ -186,11 +186,6 @@ def test_a_chunk_without_status_is_computed_again(run, whole, tmp_path):
     assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
 
 
-def test_resuming_what_never_began_begins_it(run, whole, tmp_path):
-    found = run(tmp_path / "new", resume=True)
-    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
-
-
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -202,6 +197,7 @@ def test_resuming_what_never_began_begins_it(run, whole, tmp_path):
         ({"precision": "float32"}, "precision was float64 and is float32"),
         ({"chunk": 64}, "chunk 32, expected the same, got 64"),
         ({"lanes": 64}, "lanes 16, expected the same, got 64"),
+        ({"backend": "xla"}, "backend fused"),
     ],
 )  # fmt: skip
 def test_the_store_of_another_sweep_is_refused(run, whole, changed, words):
