@@ -11,6 +11,7 @@ from heli_jax.config import Experiment
 from heli_jax.config.logs import with_log
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
+from heli_jax.finding import note
 from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -109,9 +110,10 @@ def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -
         flights[i] = dataclasses.replace(flight, sd={**sd, **flight.sd})
     held = tuple(f for f in problem.flights if f.hold_out)
     ranking = windows(dataclasses.replace(problem, flights=(*flights, *held)), length)
-    begun = (
+    begun = note(
+        "windows.noise-of-those-stated",
         "The noise is that of the windows which the configuration states, as check guesses it; "
-        "check begins each at rest, and these windows begin where the whole log has come to."
+        "check begins each at rest, and these windows begin where the whole log has come to.",
     )
     return dataclasses.replace(ranking, guessed=tuple(guessed), notes=(*ranking.notes, begun))
 
@@ -178,8 +180,8 @@ def _print_doubts(ranking: Ranking) -> None:
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
     if sentence := too_good(finite, bool(ranking.guessed)):
         tell(f"! {sentence}")
-    for note in ranking.notes:
-        tell(f"! {note}")
+    for found in ranking.notes:
+        tell(f"! {found.sentence}")
     if names := not_determined(ranking):
         whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
         tell(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")

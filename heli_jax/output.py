@@ -27,7 +27,6 @@ from heli_jax.numbers import (
     terse,
     vaf_text,
 )
-from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
@@ -125,8 +124,7 @@ def _print_outcome(fit: Fit) -> None:
         text = "the optimiser stopped before an optimum, and these numbers are no result."
     converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
     tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
-    note = files.whiteness_note(fit)
-    for line in ([note] if note else []) + list(fit.notes):
+    for line in fit.notes:
         tell(f"! {line}")
 
 

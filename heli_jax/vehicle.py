@@ -87,9 +87,7 @@ class Helicopter(eqx.Module):
     K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _absent()
     K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _absent()
     # Beyond the paper from here on: zero leaves its equations as they are printed.
-    Sx: Annotated[Scalar, "m^2", "fuselage drag area from ahead, beyond the paper"] = _field(
-        0.0
-    )
+    Sx: Annotated[Scalar, "m^2", "fuselage drag area from ahead, beyond the paper"] = _field(0.0)
     Sy: Annotated[Scalar, "m^2", "fuselage drag area across, beyond the paper"] = _field(0.0)
     Sz: Annotated[Scalar, "m^2", "fuselage drag area from above, beyond the paper"] = _field(0.0)
     Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)

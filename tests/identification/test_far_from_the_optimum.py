@@ -119,11 +119,9 @@ def test_a_product_is_one_far_from_the_optimum_too():
 def test_two_lags_in_series_are_told_to_be_exchangeable(starts):
     T1, T2 = (Free(s, sign="keep") for s in starts)
     found = fitted(LAGS, SECOND, T1=T1, T2=T2, K=Free(3.0))
-    assert found.verdict.twins == (("T1", "T2"),)
+    assert [other.changed for other in found.verdict.second] == [("T1", "T2")]
     assert found.status == "not-identifiable"
     assert found.not_identifiable == ("T1", "T2")
-    assert "T1 and T2 can be exchanged" in found.verdict.text
-    assert "The data determine K." in found.verdict.text
     assert sorted(found.estimates[n].value for n in ("T1", "T2")) == pytest.approx(
         [0.06, 0.3], rel=0.1
     )
@@ -143,11 +141,11 @@ def test_a_start_by_frequency_error_takes_either_of_two_solutions():
 def test_bounds_that_tell_lags_apart_are_enough():
     T1, T2 = Free(0.2, lower=0.12, upper=2.0), Free(0.05, lower=0.01, upper=0.12)
     problem = Problem(LAGS, TRUTH, [SECOND], {"T1": T1, "T2": T2}, Nuisance(bias=False))
-    assert fit(problem).verdict.twins == ()
-    assert check(problem).verdict.twins == ()
+    assert fit(problem).verdict.second == ()
+    assert check(problem).verdict.second == ()
     free = {"T1": Free(0.2, sign="keep"), "T2": Free(0.05, sign="keep")}
     open_ = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
-    assert check(open_).verdict.twins == (("T1", "T2"),)
+    assert [other.changed for other in check(open_).verdict.second] == [("T1", "T2")]
 
 
 @pytest.mark.parametrize(

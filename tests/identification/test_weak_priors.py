@@ -12,7 +12,6 @@ from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, 
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
@@ -213,4 +212,4 @@ def test_autocorrelated_residuals_and_a_state_that_no_output_shows():
     assert found.coloured
     assert not found.disturbable
     assert found.nuisance["flight 1/initial unseen"].prior_share == pytest.approx(1.0)
-    assert "filter-error" not in whiteness_note(found) + " ".join(found.notes)
+    assert "filter-error" not in " ".join(found.notes)
