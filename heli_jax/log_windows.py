@@ -8,6 +8,7 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax.config import Experiment
+from heli_jax.config.logs import with_log
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
 from heli_jax.finding import note
@@ -20,7 +21,7 @@ from heli_jax.identification.validation.expected_accuracy import GUESSED, too_go
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""
@@ -37,9 +38,7 @@ def rank_log(
     Args:
         experiment: the configuration; windows that it states for its flights are left out of
             account, and what it holds out is not ranked.
-        log: in place of the configuration's, read as its first flight's is.
         length: of a window [s].
-        progress: called with what the log's reader assumed, in words.
 
     Raises:
         InputError: the log or something of the configuration is wrong, or no window may be used.
@@ -48,14 +47,14 @@ def rank_log(
     if not config.flights:
         raise InputError(f"{path}: flights: expected at least one log, got none")
     if log is not None:
-        whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
-        flights = [config.flights[0].model_copy(update=whole)]
+        flights = list(with_log(experiment, log).config.flights)
     else:
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
         # Two flights of one log are, without their windows, the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
     first = config.flights[0]
-    asked = flights if log is None else [first] if _same_file(path, first, log) else []
+    same = log is None or (path.parent / first.log).resolve() == Path(log).resolve()
+    asked = flights if log is None else [first] if same else []
     stated = [_stated_window(config.flights, f) for f in asked]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
@@ -80,11 +79,6 @@ def rank_log(
 
 
 _Window = tuple[float, float] | None
-
-
-def _same_file(path: Path, flight: FlightConfig, log: str) -> bool:
-    """Whether a log is the one that the configuration at `path` names for a flight."""
-    return (path.parent / flight.log).resolve() == Path(log).resolve()
 
 
 def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Window:

@@ -177,22 +177,6 @@ def test_si_of(unit, si):
     assert units.si_of(unit) == si
 
 
-def test_the_units_that_are_known_without_pint_are_those_of_pint(monkeypatch):
-    common, in_si = units._COMMON, units._COMMON_IN_SI
-    monkeypatch.setattr(units, "_COMMON", set())
-    monkeypatch.setattr(units, "_COMMON_IN_SI", {})
-    assert {u: units.factor(u, u) for u in common} == dict.fromkeys(common, 1.0)
-    assert {pair: units.factor(*pair) for pair in in_si} == in_si
-
-
-def test_the_kinds_that_need_no_pint_are_those_it_has(monkeypatch):
-    common = dict(units._COMMON_KINDS)
-    assert all(units.is_unit(u) and units.base_of(u) == kind for u, kind in common.items())
-    monkeypatch.setattr(units, "_COMMON_KINDS", {})
-    for unit, kind in common.items():
-        assert units.is_unit(unit)
-        # In the same order, in which `as_text` writes them.
-        assert list(units.base_of(unit).items()) == list(kind.items())
 
 
 def test_units_are_written_with_newton_and_volt_where_that_is_shorter():

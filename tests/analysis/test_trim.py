@@ -9,7 +9,7 @@ import pytest
 from heli_jax import linearize, load_vehicle, models, naming, trim
 from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.analysis.trim import Condition, equilibrium
-from heli_jax.config.simulate_section import StartConfig
+from heli_jax.config.run_sections import StartConfig
 from heli_jax.dynamics import helicopter as whole
 from tests.dynamics import full_helicopter as second
 from tests.dynamics import whole_helicopter as oracle
