@@ -177,8 +177,6 @@ def test_si_of(unit, si):
     assert units.si_of(unit) == si
 
 
-
-
 def test_units_are_written_with_newton_and_volt_where_that_is_shorter():
     for text in ("rad/s^2/V", "N m/rad", "V s", "kg m^2", "kg/m^3", "1/s^2", "A", "N/V", "V/A"):
         assert units.as_text(units.base_of(text)) == text
