@@ -108,7 +108,7 @@ def test_a_product_is_one_far_from_the_optimum_too():
 def test_two_lags_in_series_are_told_to_be_exchangeable():
     T1, T2 = (Free(s, sign="keep") for s in (0.4, 0.03))
     found = fitted(LAGS, SECOND, T1=T1, T2=T2, K=Free(3.0))
-    assert found.verdict.twins == (("T1", "T2"),)
+    assert [other.changed for other in found.verdict.second] == [("T1", "T2")]
     assert found.status == "not-identifiable"
     assert found.not_identifiable == ("T1", "T2")
     assert sorted(found.estimates[n].value for n in ("T1", "T2")) == pytest.approx(

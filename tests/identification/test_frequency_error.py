@@ -21,7 +21,7 @@ from heli_jax import (
     naming,
     simulate,
 )
-from heli_jax.dynamics.linearised import point
+from heli_jax.dynamics.jacobians import point
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
     errors_of_lines,
