@@ -84,7 +84,7 @@ def problem(flight, model=BOTH, **options):
 
 @pytest.fixture(scope="module")
 def whole():
-    flight = record(1, 1000)
+    flight = record(1, 1500)
     return flight, fit(problem(flight))
 
 
@@ -131,7 +131,7 @@ def test_sizes_and_times_are_recovered_within_their_intervals(whole):
 
 
 def test_one_that_is_not_there_freezes_no_other():
-    flight = record(2, 1000, np.array([2.0, 0.0]))
+    flight = record(2, 1500, np.array([2.0, 0.0]))
     found = fit(problem(flight))
     assert found.status == "converged"
     assert found.nuisance["sigma_w_q"].value == 0.0

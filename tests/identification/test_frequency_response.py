@@ -72,6 +72,7 @@ def test_only_outputs_that_forget_within_a_window_are_simulated():
     assert not forgets(matrices, 0.02, np.ones(1), 80, 6000)[0]
 
 
+@pytest.mark.slow
 def test_rows_of_flights_of_several_lengths_and_their_slopes():
     """What differs in numbers alone is evaluated together, with slopes of its own."""
     flights = [record(BENCH, seed=3, n=n) for n in (1500, 1300, 1500)]

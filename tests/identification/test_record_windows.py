@@ -49,6 +49,7 @@ def test_the_excited_part_is_found(ranked):
     assert not any(a.overlaps(b) for a in taken for b in taken if a is not b)
 
 
+@pytest.mark.slow
 def test_the_expected_sd_is_that_of_a_check_of_the_window_alone(ranked):
     whole = excited(800, 1200)
     # One that begins at rest, as `check` begins.
