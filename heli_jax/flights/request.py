@@ -114,11 +114,10 @@ class Request:
             raise wrong(path, "no input or output is asked for, expected at least one")
         # Columns first: a column with two uses makes every further sentence about it doubtful.
         self._check_columns()
-        time = (
-            {} if self.time is None else {"the time": Signal(self.time.name, self.time.unit, "s")}
-        )
         uses = {f"{kind} {key!r}": signal for (key, kind), signal in self.signals.items()}
-        for use, signal in (time | uses).items():
+        if self.time is not None:
+            uses = {"the time": Signal(self.time.name, self.time.unit, "s"), **uses}
+        for use, signal in uses.items():
             if problem := _problem(use, signal):
                 raise wrong(path, problem, column(signal.name))
         self._check_numbers()

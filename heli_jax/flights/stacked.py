@@ -39,7 +39,9 @@ def unstacked(
     ):
         shape = None
     made: dict[str, np.ndarray] = {}
-    for name, values in arrays.items() if shape is not None else ():
+    for name, values in arrays.items():
+        if shape is None:
+            break
         if name in times and values.size == shape[1]:
             made[name] = np.tile(values.ravel(), shape[0])
         elif values.dtype.kind in "biuf" and values.ndim <= DEEPEST and values.shape[:2] == shape:

@@ -54,7 +54,6 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
     """The channels of a log that hold samples.
 
     Args:
-        path: of any format that is read.
         number: of the flight, of a log that holds several, from 1.
         rate: samples a second [Hz] of a table without times.
 

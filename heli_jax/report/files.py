@@ -18,7 +18,6 @@ from heli_jax.identification.result import Check
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import fit_content as content
 from heli_jax.report.card import card
-from heli_jax.report.fit_content import whiteness_note as whiteness_note
 from heli_jax.report.fitted_responses import FittedResponses
 from heli_jax.report.handling_json import handling_json
 from heli_jax.report.method_content import frequency_start_content, methods_content

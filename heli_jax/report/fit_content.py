@@ -9,53 +9,22 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import as_data
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
+from heli_jax.identification.agreement import COLOURED
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Estimate, Fit, Status
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
 from heli_jax.identification.validation.follows_response import LEVEL
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
-from heli_jax.numbers import percent
 
 
 def whiteness_note(fit: Fit) -> str:
-    """Why the intervals cannot be taken at their word; empty where the residuals are white."""
-    not_white = [name for name, w in fit.whiteness.items() if not w.white]
-    if not not_white:
-        return ""
-    # By the correlation at one sample, which is the number that the sentence gives.
-    worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    estimator = estimator_of(fit.method)
-    if estimator.noise_spectrum:
-        # Where no optimum was reached there are no intervals.
-        allow = "" if fit.status == "not-converged" else " and the intervals allow for it"
-        return (
-            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
-            f"the noise's spectrum is estimated{allow}."
-        )
-    what, better = estimator.errors, fit.disturbable
-    if fit.status == "not-converged":
-        consequence = ""
-    elif fit.coloured:
-        consequence = (
-            "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
-            "residuals' autocorrelation"
-            + (", which filter-error would use for a better estimate." if better else ".")
-        )
-    else:
-        # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
-        # samples.
-        consequence = "The intervals count every sample as news and are too narrow."
-    return (
-        f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
-        f"at one sample, {percent(worst.outside, 0)} of the lags outside the 99 % band): "
-        f"a disturbance or dynamics that the model lacks is in them. {consequence}".rstrip()
-    )
+    """What coloured residuals do to the intervals; empty where the residuals are white."""
+    return next((f.sentence for f in fit.findings if f.code == COLOURED), "")
 
 
 def residuals(fit: Fit) -> dict[str, Any]:
@@ -260,7 +229,6 @@ def verdict(verdict: Verdict) -> dict[str, Any]:
         "without_effect": list(verdict.without_effect),
         "resting_on_priors": list(verdict.resting),
         "exchangeable_nuisances": list(verdict.exchangeable),
-        "exchangeable_parameters": [list(pair) for pair in verdict.twins],
         "other_solutions": [other.values for other in verdict.second],
         "names": list(verdict.names),
         "correlation": verdict.correlation,

@@ -49,8 +49,6 @@ class VerdictContent(TypedDict):
     """parameters that the priors determine, and not the data"""
     exchangeable_nuisances: list[str]
     """nuisances, as `flight 1/bias p`, that make up for what is not determined"""
-    exchangeable_parameters: list[list[str]]
-    """pairs whose values may be exchanged: the data do not tell which is which"""
     other_solutions: list[dict[str, float]]
     """other values of the free parameters that fit as well [SI]"""
     names: list[str]

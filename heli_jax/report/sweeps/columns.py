@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 import xarray as xr
 
-from heli_jax.sweeps.chunks import chunks_of
+from heli_jax.sweeps.datasets import chunks_of
 
 # Factor over which numbers of one sign are drawn logarithmically: on a linear scale the lower half
 # of that range, in decades, would lie within a sixth of the panel.
