@@ -20,8 +20,8 @@ from heli_jax.config import (
     read_flights,
     signals,
 )
+from heli_jax.dynamics.check_model import cannot_start
 from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
-from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight

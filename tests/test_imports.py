@@ -161,13 +161,6 @@ def test_no_modules_import_each_other_in_a_circle():
     graphlib.TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize("name", ["config", "generate", "output"])
-def test_nothing_imports_the_command_line(name):
-    mine = [p for p in FILES if part(p) == name]
-    assert mine
-    assert "cli" not in {other for path in mine for other, _ in inner(path)}
-
-
 @pytest.mark.parametrize(
     ("library", "homes"),
     [
@@ -223,18 +216,6 @@ def test_libraries_stay_at_home(library, homes):
         return file in homes or any(file.startswith(f"{home}/") for home in homes)
 
     assert [file for file in sorted(importers(library)) if not at_home(file)] == []
-
-
-def test_identification_takes_only_the_adjoint_from_diffrax():
-    source = (ROOT / "identification/estimation/simulated_flights.py").read_text()
-    names = {
-        node.attr
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Attribute)
-        and isinstance(node.value, ast.Name)
-        and node.value.id in ("dfx", "diffrax")
-    }
-    assert names <= {"ForwardMode"}
 
 
 def test_nothing_evaluates_text():

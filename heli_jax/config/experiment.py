@@ -17,9 +17,9 @@ from heli_jax.config.kinematics import completed
 from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
+from heli_jax.dynamics.check_model import starting_at
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, constant, read_vehicle, vehicle_from_mapping

@@ -183,7 +183,6 @@ def assemble(
         converged=status != "not-converged",
     )
     findings = [
-        *coloured,
         *fit_notes(
             problem,
             search,
@@ -192,6 +191,7 @@ def assemble(
             numbers,
             end.correlated if errors.coloured else {},
             end.all_white,
+            coloured,
         ),
         *(open_directions(run.before, errors.verdict) if astray else ()),
         *limit_notes(errors.limits),

@@ -1,6 +1,6 @@
 """What a fit says in sentences: of its optimum, of what its method assumes, of its numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from heli_jax.dynamics.disturbance import disturbances_of
@@ -83,6 +83,7 @@ def fit_notes(
     numbers: Numbers,
     correlated: dict[str, float],
     white: bool,
+    coloured: Sequence[Finding],
 ) -> list[Finding]:
     """Findings about the optimum, what the method takes for granted, and the estimates.
 
@@ -94,6 +95,7 @@ def fit_notes(
         numbers: all that was estimated.
         correlated: by pair of outputs the correlations that the intervals allow for.
         white: whether all residuals, or innovations, are white.
+        coloured: what it does to the intervals where they are not.
     """
     layout, data, best = search.layout, search.data, optimum.best
     at = Solution(layout, data, optimum.noise, best.z)
@@ -104,6 +106,7 @@ def fit_notes(
         *bound_findings(numbers.of_interest),
         # Rounding has a remedy of its own.
         *([] if numbers.ill else _stopped_notes(layout, best, optimum)),
+        *coloured,
         *_disturbance_notes(optimum.ratio if none else None, white),
         *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
         *_absent_notes(layout, optimum.absent),

@@ -12,7 +12,7 @@ import scipy.linalg
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint
-from heli_jax.analysis.spectra import partial_coherence, segment_transforms, size_of, without
+from heli_jax.analysis.spectral import partial_coherence, segment_transforms, size_of, without
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals

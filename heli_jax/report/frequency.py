@@ -14,7 +14,7 @@ from heli_jax.analysis.operating_point import (
     OperatingPoint,
     operating_point,
 )
-from heli_jax.analysis.spectra import OWN, leakage, spectra
+from heli_jax.analysis.spectral import OWN, leakage, spectra
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit

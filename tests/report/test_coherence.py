@@ -9,7 +9,7 @@ import scipy.signal
 
 from heli_jax import Flight, models, naming
 from heli_jax import config as configuration
-from heli_jax.analysis.spectra import partial_coherence
+from heli_jax.analysis.spectral import partial_coherence
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.generate import generate
 from heli_jax.identification.result import Signals

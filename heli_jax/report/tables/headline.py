@@ -8,6 +8,7 @@ from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
+from heli_jax.report.fit_content import whiteness_note
 from heli_jax.vehicle import of_helicopter
 
 
@@ -83,7 +84,8 @@ def _doubts(fit: Fit) -> list[str]:
 def warnings(fit: Fit) -> list[str]:
     """What a reader has to know before the numbers."""
     # Whiteness first: the template takes the first one for it where residuals are not white.
-    return list(fit.notes)
+    note = whiteness_note(fit)
+    return [*([note] if note else []), *(n for n in fit.notes if n != note)]
 
 
 def model_remark(problem: Problem) -> str:

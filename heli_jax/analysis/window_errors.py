@@ -1,4 +1,4 @@
-"""What windows add to a response at the ends of a record and of its parts, and how it is taken off.
+"""Errors that windows make, at the ends of a record and of few averages, and how they go.
 
 Of an answer y = h * u a window w sees, by Taylor's series of w(t + tau),
 
@@ -16,15 +16,75 @@ of a straight line through responses at such places. Of a single sine they are a
 not known: it may then be anything that windows of that length resolve.
 
 Source: Pintelon and Schoukens (2012), chapter 6, for the errors of windows.
+
+Where there are few averages the noise of a response is a mean over frequencies. Of n averages a
+variance is known to the n - m degrees of freedom that m inputs leave, of two averages to little
+more than its order of magnitude. Weights by such variances trust the frequencies that happened to
+look quiet: of windows of half a record 72 % of a delay's 95 % intervals held the truth.
+
+Source: Pintelon and Schoukens (2012), section 9.4, for weights by estimated variances.
 """
 
 import warnings
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.noise_over_lines import RESOLVED
+Z95 = 1.959963984540054
+"""half of a 95 % interval in standard deviations that are known"""
+_ENOUGH = 40.0
+"""degrees of freedom of a variance from which on weights by it are as good as by the true one"""
+RESOLVED = 1.95
+"""frequencies closer than this over the window's length are not independent (Hann)"""
+_TRIANGLE = 1.5
+"""equal terms whose mean is as certain as one in a triangle of half this half-width"""
+
+
+def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[np.ndarray, " k"]:
+    """Of each frequency (k,) how much of an independent one it is.
+
+    Args:
+        omega: (k,) [rad/s], rising.
+    """
+    # Half of the way to each neighbour.
+    width = np.gradient(omega) if omega.size > 1 else np.ones(1)
+    return np.minimum(width * seconds / (2.0 * np.pi * RESOLVED), 1.0)
+
+
+def averaged(
+    noise: Float[np.ndarray, " k"], shares: Float[np.ndarray, " k"], averages: float
+) -> tuple[Float[np.ndarray, " k"], float]:
+    """A mean over as many independent frequencies as it takes, and its degrees of freedom.
+
+    Args:
+        noise: density (k,); NaN where it is not known.
+        shares: (k,) how much of an independent frequency each is.
+    """
+    known = np.isfinite(noise) & (shares > 0)
+    each = 2.0 * averages
+    # Half-width of the triangle, in independent frequencies.
+    reach = _ENOUGH / each / _TRIANGLE
+    at = np.cumsum(shares) - 0.5 * shares
+    near = np.maximum(1.0 - np.abs(at[:, None] - at[None, :]) / reach, 0.0) * np.where(
+        known, shares, 0.0
+    )
+    with np.errstate(all="ignore"):
+        mean = near @ np.where(known, noise, 0.0) / np.sum(near, axis=1)
+    total = float(np.sum(shares[known]))
+    freedom = each * max(min(_TRIANGLE * reach, total), 1.0)
+    return np.where(known, mean, np.nan), freedom
+
+
+def student95(freedom: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Half of a 95 % interval in standard deviations: Student's t.
+
+    Args:
+        freedom: degrees of freedom of the standard deviations, 1 at least; any shape.
+    """
+    return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
+
 
 _LINES = 2.5
 """of the window, around a frequency, that the response's derivative is taken from: its error is
@@ -58,9 +118,7 @@ def without_ends(
     Args:
         omega: frequencies [rad/s], rising.
         H: l outputs over m inputs; NaN where they are not known.
-        sd: of their real and imaginary parts.
         ends: what of each input in the window's slope counts as each input in the window [1/s].
-        seconds: length of a window.
     """
     known = np.isfinite(H) & np.isfinite(sd) & (sd > 0)
     # Where an input has no response of its own it has none to take off.
@@ -121,11 +179,9 @@ def _line(
     """How derivatives are taken from l responses to one input.
 
     Args:
-        omega: where they are asked for.
         at: (k,) where the responses were measured.
         measured: these, zero where they are not known, and the standard deviations of their real
             and imaginary parts, NaN there.
-        seconds: length of a window.
     """
     H, variance = measured[0], measured[1] ** 2
     known = np.isfinite(variance)
