@@ -17,11 +17,11 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
-from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
 from heli_jax.report.tables.handling import handling_lines
+from heli_jax.report.tables.headline import whiteness_note
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
 
@@ -115,7 +115,7 @@ def _print_outcome(fit: Fit) -> None:
         text = "the optimiser stopped before an optimum, and these numbers are no result."
     converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
     tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
-    note = files.whiteness_note(fit)
+    note = whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         tell(f"! {line}")
 

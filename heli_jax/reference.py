@@ -26,12 +26,12 @@ def print_keys(pattern: str | None) -> None:
     """
     matches = keys() if pattern is None else matching(pattern)
     if not matches:
-        from heli_jax.report import fit_keys
+        from heli_jax.report import document
 
         hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(pattern or '')}"
         raise InputError(
             f"keys: expected a text that some key or its meaning holds, got {pattern}"
-            f"{hint if fit_keys.matching(pattern or '') else ''}"
+            f"{hint if document.matching(pattern or '') else ''}"
         )
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     for key in matches:
@@ -58,9 +58,9 @@ def print_fit_keys(pattern: str | None, *, as_json: bool) -> None:
     Raises:
         InputError: no key holds it.
     """
-    from heli_jax.report import fit_keys
+    from heli_jax.report import document
 
-    matches = fit_keys.fit_keys() if pattern is None else fit_keys.matching(pattern)
+    matches = document.fit_keys() if pattern is None else document.matching(pattern)
     if as_json:
         print(json.dumps([key._asdict() for key in matches], indent=1))
         return

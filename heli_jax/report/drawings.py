@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import figures
 from heli_jax.report.embedded import Logged
-from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import FittedFlight
 
@@ -27,15 +27,6 @@ type Draw = Callable[[], Figure | None]
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
-
-
-class Analysis(NamedTuple):
-    """A fit, and all that its report is made of."""
-
-    fit: Fit
-    problem: Problem
-    baseline: Baseline | None = None
-    supplementary: SupplementaryAnalyses = SupplementaryAnalyses()
 
 
 def drawings(analysis: Analysis) -> dict[str, Draw]:

@@ -16,9 +16,9 @@ from heli_jax.analysis.window_resolution import forgets
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number, with_sd
+from heli_jax.report.document import handling_content
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.responses import branch_of, draw_response, seen_of
-from heli_jax.report.handling_json import handling_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import picture
@@ -72,7 +72,7 @@ def write_responses(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
     (directory / "handling_qualities.json").write_text(
-        json.dumps(handling_json(handling), indent=2, allow_nan=False) + "\n", encoding="utf-8"
+        json.dumps(handling_content(handling), indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
     (directory / "figures").mkdir()
     pictures, numbers = [], Numbers()

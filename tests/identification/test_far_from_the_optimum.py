@@ -1,7 +1,6 @@
 """What slopes at one point do not tell: sums that look like products, parameters that may be
 exchanged, bounds, and swings that the samples hardly show."""
 
-import json
 from dataclasses import replace
 from typing import Annotated, NamedTuple
 
@@ -17,7 +16,7 @@ from heli_jax.identification.uncertainty.estimates import with_limits
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
-from heli_jax.report import fit_content
+from heli_jax.report.document import VerdictContent, written
 from tests.identification.test_enough import steps
 
 DT, N = 0.02, 1000
@@ -105,7 +104,7 @@ def test_of_a_sum_nothing_but_the_sum_is_said_to_be_determined(starts):
     assert c.value == pytest.approx(alone.value + TRUTH.Lb, rel=1e-4)
     assert c.sd == pytest.approx(alone.sd, rel=0.02)
     assert "The data determine only La + Lb of La and Lb" in found.verdict.text
-    assert json.loads(json.dumps(fit_content.combinations(found.verdict)))[0]["kind"] == "sum"
+    assert written(VerdictContent, found.verdict)["determined_combinations"][0]["kind"] == "sum"
 
 
 def test_a_product_is_one_far_from_the_optimum_too():

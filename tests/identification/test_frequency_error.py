@@ -39,7 +39,7 @@ from heli_jax.identification.frequency_start import _value, frequency_error_star
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.report.method_content import methods_content
+from heli_jax.report.document import MethodsCompared, written
 from heli_jax.report.tables import first_guess, methods
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
 
@@ -314,9 +314,9 @@ def test_methods_are_laid_side_by_side(by):
     doubt = Finding("dynamics.depends-on-amplitude", "doubt", "", shifts=shifts)
     doubted = dataclasses.replace(other, findings=(doubt,))
     assert MethodResult("frequency-error", doubted, "", 0.5).word == "If not trusted"
-    written = methods_content(compared)["results"]
-    assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
-    assert written["filter-error"]["reason"] == "there is no disturbance"
+    content = written(MethodsCompared, compared)["results"]
+    assert content["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
+    assert content["filter-error"]["reason"] == "there is no disturbance"
     moved = {**other.estimates, "If": b._replace(value=a.value + 5.0 * (a.sd**2 + b.sd**2) ** 0.5)}
     away = results[1]._replace(fit=dataclasses.replace(other, estimates=moved))
     assert "differ in If by 5.0 joint" in MethodComparison((results[0], away)).sentences[0]
@@ -332,7 +332,10 @@ def test_methods_are_laid_side_by_side(by):
     compared = MethodComparison(tuple(late))
     assert compared.difference(late[1], "time_shift") == pytest.approx(2.0)
     assert [row[0] for row in methods(compared).rows][3:] == ["time_shift", "verdict", "time"]
-    assert "time_shift" in methods_content(compared)["results"]["frequency-error"]["parameters"]
+    assert (
+        "time_shift"
+        in written(MethodsCompared, compared)["results"]["frequency-error"]["parameters"]
+    )
 
 
 def hardening(p, s, u):

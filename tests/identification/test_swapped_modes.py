@@ -1,6 +1,5 @@
 """A servo's lag before a rate's damping: the same response with the two modes exchanged."""
 
-import json
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
 from heli_jax.naming import Scalar
-from heli_jax.report import fit_content
+from heli_jax.report.document import VerdictContent, written
 from tests.identification.test_enough import steps
 
 DT, N = 0.02, 1000
@@ -86,8 +85,8 @@ def test_both_solutions_are_told_from_either(factor):
     assert found.estimates["Lp"].sd is None
     assert "Lp, L and ts have two solutions that answer alike" in found.verdict.text
     assert "The data determine" not in found.verdict.text
-    written = json.loads(json.dumps(fit_content.verdict(found.verdict), default=np.ndarray.tolist))
-    assert written["other_solutions"] == [other.values]
+    content = written(VerdictContent, found.verdict)
+    assert content["other_solutions"] == [other.values]
 
 
 def test_what_tells_them_apart_leaves_one():
