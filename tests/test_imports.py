@@ -201,7 +201,7 @@ def test_nothing_imports_the_command_line(name):
                 "sweeps",
                 "studies",
                 "study_command.py",
-                "report/sweeps",
+                "report/sweeps.py",
                 "report/responses_netcdf.py",
                 "flights/array_table.py",
                 "flights/convert.py",

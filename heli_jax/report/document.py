@@ -11,7 +11,7 @@ import operator
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -46,9 +46,6 @@ from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
 from heli_jax.report.tables.headline import whiteness_note
 from heli_jax.versions import versions
-
-if TYPE_CHECKING:
-    from heli_jax.report.files import Analysis
 
 ABSENT = object()
 """what a source returns where the file lacks the key"""
@@ -357,7 +354,7 @@ class HoldContent(TypedDict):
 def _start(kind: type) -> Callable[[Any], Any]:
     """Starts that were found so: where the fit began, not its result."""
 
-    def found(analysis: "Analysis") -> Any:
+    def found(analysis: Any) -> Any:
         guess = analysis.problem.first_guess
         return guess if isinstance(guess, kind) else None
 
@@ -468,7 +465,8 @@ TOO: dict[type, type] = {
 """what the file has beside the fields of a class, or in their place"""
 
 
-# Values that are no attribute: a mapping holds keys as they stand in the file.
+# Values that are no attribute: a mapping holds keys as they stand in the file. An analysis is
+# `heli_jax.report.files.Analysis`, which imports this module.
 
 
 def _shown(estimates: Mapping[str, Estimate], status: Status) -> dict[str, Any]:
@@ -485,7 +483,7 @@ def _adequate(fit: Fit) -> bool | None:
     return None if fit.status == "not-converged" else fit.adequate
 
 
-def _parameters(analysis: "Analysis") -> dict[str, Any]:
+def _parameters(analysis: Any) -> dict[str, Any]:
     fit = analysis.fit
     return _fixed(analysis.problem) | _shown(fit.estimates, fit.status)
 
@@ -533,7 +531,7 @@ def _methods(compared: MethodComparison) -> dict[str, Any]:
     return results
 
 
-def _handling(analysis: "Analysis") -> list[dict[str, Any]]:
+def _handling(analysis: Any) -> list[dict[str, Any]]:
     responses = analysis.supplementary.responses
     return handling_content(responses.handling if responses else ())
 

@@ -9,7 +9,7 @@ from heli_jax.numbers import NOTHING, number
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, of_file
-from heli_jax.report.sweeps.files import stems
+from heli_jax.report.sweeps import stems
 from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
 
