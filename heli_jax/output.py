@@ -20,8 +20,8 @@ from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, t
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
-from heli_jax.report.tables.handling import handling_lines
-from heli_jax.report.tables.headline import whiteness_note
+from heli_jax.report.statements import whiteness_note
+from heli_jax.report.tables import handling_lines
 from heli_jax.terminal_table import print_table, tell
 from heli_jax.workflow import FitRun
 

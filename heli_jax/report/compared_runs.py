@@ -13,15 +13,14 @@ from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
-from heli_jax.report.compared_combinations import combinations
 from heli_jax.report.saved_fit import SavedFit, load_fit
+from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
 from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NOT_DETERMINED = "not determined"
 NOT_CONVERGED = "not converged"
 _ABSENT = "–"
 _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
@@ -45,13 +44,6 @@ _SAME = (
 )
 
 
-class Table(NamedTuple):
-    """Text in rows under a head."""
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
 class ComparedRuns(NamedTuple):
     """Fits, each with a name that no other has."""
 
@@ -70,12 +62,12 @@ class ComparedRuns(NamedTuple):
         """As `estimates`, with numbers and units as all pages have them."""
         head, rows = self._estimates(lambda value, sd: measured(sd, value), pretty)
         first = 1 + len(self.labels)
-        signed = (
-            tuple(c.replace("-", "−") if i >= first else c for i, c in enumerate(row[:-1]))
-            for row in rows
-        )
         return Table(
-            head, tuple((*cells, row[-1]) for cells, row in zip(signed, rows, strict=True))
+            head,
+            [
+                (*row[:first], *(c.replace("-", "−") for c in row[first:-1]), row[-1])
+                for row in rows
+            ],
         )
 
     def _estimates(
@@ -99,12 +91,12 @@ class ComparedRuns(NamedTuple):
             ]
             apart = [_difference(there[0], other) for other in there[1:]]
             rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
-        return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
+        return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
         """Each run's estimates, the combinations that one of the runs determines, then what all its
         flights share beside them: gains, a time shift, the disturbance."""
-        pairs = zip(self.runs, combinations(self.runs), strict=True)
+        pairs = zip(self.runs, _combinations(self.runs), strict=True)
         return [{**run.estimates, **of_run, **_shared(run)} for run, of_run in pairs]
 
     @property
@@ -119,7 +111,7 @@ class ComparedRuns(NamedTuple):
                     where = "held out" if held_out else "fitted"
                     cells = (_agreement(m.get(output), key, text) for m in of)
                     rows.append((output, where, words, *cells))
-        return Table(("output", "flights", "metric", *self.labels), tuple(rows))
+        return Table(("output", "flights", "metric", *self.labels), rows)
 
     @property
     def verdicts(self) -> Table:
@@ -140,7 +132,7 @@ class ComparedRuns(NamedTuple):
             for label, run in zip(self.labels, self.runs, strict=True)
         ]
         head = ("run", "model", "method", "optimiser", "what the data determine", "adequate")
-        return Table(head, tuple(rows))
+        return Table(head, rows)
 
     @property
     def notes(self) -> tuple[Finding, ...]:
@@ -251,6 +243,40 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
             return tuple(labels)
     # The same directory twice: by their place.
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
+
+
+def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
+    """By run the combinations that any of them determines without determining their parts.
+
+    A run that determines the parts themselves has them by its estimates, their correlations, and
+    the constants that it took as known; one that has neither lacks that entry.
+    """
+    stated = [_stated(run) for run in runs]
+    every = {n: c for of in stated for n, c in of.items()}
+    by_run: list[dict[str, Estimate]] = [{} for _ in runs]
+    for run, of, found in zip(runs, stated, by_run, strict=True):
+        constants, verdict = run.content.get("constants") or {}, run.content["verdict"]
+        among = verdict.get("names") or [], verdict.get("correlation") or []
+        for name, c in every.items():
+            made = None
+            if name in of:
+                made = combination(*(of[name][key] for key in _NUMBERS))
+            elif c.get("kind", "product") == "product":
+                made = product(c["exponents"], run.estimates, constants, *among)
+            if made is not None:
+                found[name] = made
+    return by_run
+
+
+_NUMBERS = ("value", "sd", "lower95", "upper95")
+
+
+# Any: what fit.json holds.
+def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
+    """What the fit itself says that the data determine; nothing of one without an optimum."""
+    every = run.content.get("determined_combinations") or ()
+    known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
+    return {c["name"]: c for c in known if _arrived(run)}
 
 
 # Any: mappings of estimates or of metrics by name.

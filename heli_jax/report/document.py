@@ -44,7 +44,7 @@ from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
-from heli_jax.report.tables.headline import whiteness_note
+from heli_jax.report.statements import whiteness_note
 from heli_jax.versions import versions
 
 ABSENT = object()

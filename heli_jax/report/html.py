@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from heli_jax.identification.result import Fit
-from heli_jax.report import card, tables
+from heli_jax.report import card, statements, tables
 from heli_jax.report.captions import GROUPS, alt_text, caption
 from heli_jax.report.drawings import MOST_FLIGHTS, Analysis, drawings, logged_outputs, logged_units
 from heli_jax.report.embedded import Numbers
@@ -118,11 +118,11 @@ def _results(analysis: Analysis) -> dict[str, Any]:
         "fit": fit,
         "problem": problem,
         "baseline": baseline,
-        "headline": tables.headline(fit),
-        "sentences": tables.further_sentences(fit),
-        "meanings": tables.meanings(fit),
-        "warnings": tables.warnings(fit),
-        "remark": tables.model_remark(problem),
+        "headline": statements.headline(fit),
+        "sentences": statements.further_sentences(fit),
+        "meanings": statements.meanings(fit),
+        "warnings": statements.warnings(fit),
+        "remark": statements.model_remark(problem),
         "parameters": tables.parameters(fit),
         "prior_note": tables.prior_note(problem, fit),
         "nuisances": tables.nuisances(fit),

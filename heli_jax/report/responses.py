@@ -23,9 +23,8 @@ from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import picture
 from heli_jax.report.responses_netcdf import quotient, write_netcdf
-from heli_jax.report.tables.handling import handling as handling_table
-from heli_jax.report.tables.handling import handling_sentences
-from heli_jax.report.tables.table import Table
+from heli_jax.report.tables import Table, handling_sentences
+from heli_jax.report.tables import handling as handling_table
 
 _FILES = (
     "responses.csv",

@@ -10,7 +10,7 @@ from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, of_file
 from heli_jax.report.sweeps import stems
-from heli_jax.report.tables.table import Table
+from heli_jax.report.tables import Table
 from heli_jax.report.unit_symbols import pretty
 
 _QUANTILES = ("min", "q05", "median", "q95", "max")

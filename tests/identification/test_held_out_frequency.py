@@ -10,7 +10,7 @@ import scipy.linalg
 from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
-from heli_jax.report import tables
+from heli_jax.report import statements, tables
 from heli_jax.report.card import card, failed
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, response, vehicle
@@ -104,7 +104,7 @@ def test_a_model_that_is_worse_than_none_is_no_result(found):
     [said] = [f for f in found[0].findings if f.denies]
     assert (said.code, said.subjects) == ("held-out.worse-than-none", ("turned", "roll"))
     assert found[0].exit_code == 4
-    assert tables.headline(found[0]).level == "bad"
+    assert statements.headline(found[0]).level == "bad"
 
 
 def test_what_cannot_be_compared_is_said(found):

@@ -17,7 +17,7 @@ from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.panels import panels
 from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.pictures import picture
-from heli_jax.report.tables.agreement import agreement
+from heli_jax.report.tables import agreement
 from tests.report.test_view import decoded
 
 

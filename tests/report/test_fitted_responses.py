@@ -14,7 +14,7 @@ from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.html import render
 from heli_jax.report.style import styled
-from heli_jax.report.tables.handling import handling_lines
+from heli_jax.report.tables import handling_lines
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,11 @@ from heli_jax.flights.flight import Signal
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.numbers import percent, relative
-from heli_jax.report import compared_page, drawings, figures
+from heli_jax.report import compared_page, drawings, figures, tables
 from heli_jax.report.charts import chart_of
 from heli_jax.report.embedded import Logged, Numbers
 from heli_jax.report.files import write_signals
 from heli_jax.report.saved_fit import load_fit
-from heli_jax.report.tables import estimates
 from tests.report.test_compared_runs import METRICS, write_run
 
 
@@ -89,7 +88,7 @@ def test_an_interval_without_ends_is_not_determined():
     unknown = types.SimpleNamespace(
         value=8.9e-4, sd=math.inf, lower95=-math.inf, upper95=math.inf, unit="rad"
     )
-    table = estimates.nuisances(types.SimpleNamespace(nuisance={"bias roll": unknown}))
+    table = tables.nuisances(types.SimpleNamespace(nuisance={"bias roll": unknown}))
     assert table.shown.rows == [("bias roll", "not determined", "–", "–", "rad")]
 
 

@@ -6,7 +6,7 @@ import pytest
 from heli_jax.analysis.handling_qualities import Number
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.report.responses import fit_row, fit_sentences
-from heli_jax.report.tables.handling import _shown
+from heli_jax.report.tables import _shown
 
 WINDOW = 20.0
 
