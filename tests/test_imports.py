@@ -202,7 +202,7 @@ def test_nothing_imports_the_command_line(name):
                 "studies",
                 "study_command.py",
                 "report/sweeps.py",
-                "report/responses_netcdf.py",
+                "report/responses.py",
                 "flights/array_table.py",
                 "flights/convert.py",
                 "exports.py",

@@ -22,7 +22,7 @@ from heli_jax.dynamics.model import Axis
 from heli_jax.finding import note
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
-from heli_jax.report.figures.responses import branch_of, seen_of
+from heli_jax.report.figures.bode import branch_of, seen_of
 from heli_jax.report.fitted_responses import NO_RESPONSES, FittedResponses
 from heli_jax.report.responses import _content, fit_row, fit_sentences
 from heli_jax.workflow import FitRun

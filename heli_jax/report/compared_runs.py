@@ -14,8 +14,8 @@ from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
 from heli_jax.report.saved_fit import SavedFit, load_fit
+from heli_jax.report.style import pretty
 from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
-from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
 
 if TYPE_CHECKING:
@@ -285,11 +285,7 @@ def _in_order(mappings: Any) -> list[str]:
 
 
 def method_of(run: SavedFit) -> str:
-    """The method, and by which inputs' instruments: such a fit is another estimator.
-
-    Args:
-        run: what `load_fit` read.
-    """
+    """The method, and by which inputs' instruments: such a fit is another estimator."""
     inputs = run.content.get("instruments") or ()
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 

@@ -668,11 +668,7 @@ def fit_keys() -> list[Key]:
 
 
 def matching(text: str) -> list[Key]:
-    """The keys whose path holds a text, in any case; else those whose meaning does.
-
-    Args:
-        text: blanks at its ends are left out.
-    """
+    """The keys whose path holds a text, in any case; else those whose meaning does."""
     words, every = text.strip().lower(), fit_keys()
     by_path = [k for k in every if words in k.path.lower()]
     return by_path or [k for k in every if words in k.meaning.lower()]

@@ -67,11 +67,7 @@ def fit_json(
 
 
 def check_json(check: Check) -> dict[str, Any]:
-    """What `heli-jax check` found as plain data; what is not a finite number is null.
-
-    Args:
-        check: what is known before a fit.
-    """
+    """What `heli-jax check` found as plain data; what is not a finite number is null."""
     verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
     # Of a parameter that is not determined the number would be no expectation.
     lacking = {*verdict.undetermined, *verdict.without_effect}
@@ -98,7 +94,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(as_json(content) + "\n", encoding="utf-8")
 
 
-def as_json(content: dict[str, Any]) -> str:
+def as_json(content: Any) -> str:
     """Plain data as text, readable and strict (no NaN)."""
     # Python would write NaN, which JSON does not have and other languages refuse to read.
     return json.dumps(content, indent=2, allow_nan=False)
@@ -110,29 +106,21 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
     `time` counts from the flight's first sample, `log_time` from the log's beginning, as windows
     do; flights without a log have none. A flight without some signal has empty cells there.
     """
-    # The columns of all flights, in the order in which they first appear.
-    names = ["flight", "time"]
-    if any(s.log_start is not None for s in signals):
-        names.append("log_time")
-    for s in signals:
-        names += [n for n in s.inputs if n not in names]
-        names += [
-            f"{n}_{what}"
-            for n in s.measured
-            for what in ("measured", "simulated", "residual", "innovation")
-            if (what != "innovation" or s.innovations is not None) and f"{n}_{what}" not in names
-        ]
-    write_table(path, stacked([_columns(s) for s in signals], names))
+    columns = [_columns(s) for s in signals]
+    # Those of all flights, in the order in which they first appear.
+    names = list(dict.fromkeys(name for of_flight in columns for name in of_flight))
+    write_table(path, stacked(columns, names))
 
 
 def _columns(s: Signals) -> dict[str, Any]:
     """The columns of one flight by their names."""
     # The name of the flight in every row: a table program can group by it, whatever the rows'
     # order.
-    columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
+    columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times}
     if s.log_start is not None:
         # Rounded: 42 + 0.01 k in binary is 42.010000000000005, and nobody's clock has its digits.
         columns["log_time"] = np.round(s.log_times, 9)
+    columns |= s.inputs
     for output, measured in s.measured.items():
         columns[f"{output}_measured"] = measured
         columns[f"{output}_simulated"] = s.simulated[output]

@@ -68,21 +68,18 @@ def _determined(fit: Fit) -> tuple[str, str]:
 def _doubts(fit: Fit) -> list[str]:
     """What a reader has to know of estimates that are determined."""
     v = fit.verdict
-    doubts = [
-        (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
-        (
-            f"zero is in the interval of {listed(v.through_zero) if v.through_zero else ''}",
-            bool(v.through_zero),
-        ),
-        ("the intervals are too narrow", fit.overconfident),
-        (
-            f"{listed(fit.untrusted) if fit.untrusted else ''} not trusted",
-            bool(fit.untrusted),
-        ),
-        ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
-        ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
-    ]
-    return [words for words, is_so in doubts if is_so]
+    doubts = [f"{listed(v.roughly)} only roughly"] if v.roughly else []
+    if v.through_zero:
+        doubts.append(f"zero is in the interval of {listed(v.through_zero)}")
+    if fit.overconfident:
+        doubts.append("the intervals are too narrow")
+    if fit.untrusted:
+        doubts.append(f"{listed(fit.untrusted)} not trusted")
+    if v.condition > ILL_CONDITIONED or v.pairs:
+        doubts.append("they are hardly separated")
+    if any(e.at_bound for e in fit.estimates.values()):
+        doubts.append("an estimate is at its bound")
+    return doubts
 
 
 def whiteness_note(fit: Fit) -> str:
@@ -142,11 +139,7 @@ def model_remark(problem: Problem) -> str:
 
 
 def meanings(fit: Fit) -> list[tuple[str, str]]:
-    """Heading and text of each statement, and of what residuals that are not white do to it.
-
-    Args:
-        fit: whose method decides which of the limits hold.
-    """
+    """Heading and text of each statement, and of what residuals that are not white do to it."""
     return [
         (
             "Converged",

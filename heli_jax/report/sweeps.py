@@ -113,15 +113,7 @@ class Column:
     def scale(
         self, ax: Axes, which: Which, ends: Sequence[float], ticks: int, letters: int = _LETTERS
     ) -> None:
-        """Give an axis of a panel its scale, limits, ticks and label.
-
-        Args:
-            ax: the panel.
-            which: its horizontal or its vertical axis.
-            ends: the least and the largest value on it.
-            ticks: how many at most.
-            letters: of its name at most.
-        """
+        """Give an axis of a panel its scale, limits, ticks and label."""
         low, high = float(ends[0]), float(ends[-1])
         axis = ax.xaxis if which == "x" else ax.yaxis
         if self.log:
@@ -192,11 +184,6 @@ def write_figures(directory: Path, ds: xr.Dataset, worst: Mapping[str, np.ndarra
 
     They are slices-RESULT, maps-RESULT (the first six results), corner and worst; what a file
     should not be called becomes `_`.
-
-    Args:
-        directory: where they are written.
-        ds: the sweep; read in pieces.
-        worst: the worst elements of each result, worst first.
     """
     # One table for all figures: each column is read once.
     table = Table(ds, worst.values())
@@ -386,8 +373,7 @@ def corner(table: Table) -> Figure | None:
         return None
     shown = [*axes, *drawn][:_VARIABLES]
     n = len(shown)
-    figure = style.figure(0.9 + min(6.5, 1.9 * n))
-    figure.set_layout_engine("constrained")
+    figure = style.figure(0.9 + min(6.5, 1.9 * n), constrained=True)
     grid = figure.subplots(n, n, squeeze=False, sharex="col")
     # Rice's rule; and about ten elements a cell, or a density is mostly empty.
     count = np.count_nonzero(table.ok)
@@ -508,8 +494,7 @@ def worst_elements(table: Table, by_result: Mapping[str, np.ndarray]) -> Figure 
 def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """Panels in rows, each of a height [inch]."""
     rows = -(-count // columns)
-    figure = style.figure(0.6 + rows * height)
-    figure.set_layout_engine("constrained")
+    figure = style.figure(0.6 + rows * height, constrained=True)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax in every[count:]:
         ax.remove()

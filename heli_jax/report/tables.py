@@ -38,7 +38,7 @@ from heli_jax.numbers import (
     with_sd,
 )
 from heli_jax.report.card import Gate, shown
-from heli_jax.report.unit_symbols import pretty
+from heli_jax.report.style import pretty
 from heli_jax.vehicle import Constant
 
 NOT_DETERMINED = "not determined"
@@ -240,13 +240,7 @@ def starts(fit: Fit) -> Table:
 def agreement(
     fit: Fit, baseline: Baseline | None, logged: Mapping[str, tuple[str, float]] | None = None
 ) -> Table:
-    """The same metrics for fit, held-out flights and RLS, output by output.
-
-    Args:
-        fit: the fit.
-        baseline: the RLS, where there is one.
-        logged: by output the unit of its log, and what SI is times to be in it.
-    """
+    """The same metrics for fit, held-out flights and RLS, output by output."""
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
     rows, units = [], logged or {}
     # An output may have been measured in the flights held out alone.
@@ -601,11 +595,7 @@ _AS_READ = {"s": ("ms", 1e3)}
 
 
 def handling(entries: Sequence[Handling]) -> Table:
-    """A row for each number of each response, with the columns that were asked for.
-
-    Args:
-        entries: what model and data say.
-    """
+    """A row for each number of each response, with the columns that were asked for."""
     sources = _sources(entries)
     rows = []
     for entry in entries:
@@ -653,11 +643,7 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
 
 
 def handling_lines(entries: Sequence[Handling]) -> list[str]:
-    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5 to 5.3), 0.812 Hz`
-
-    Args:
-        entries: what model and data say.
-    """
+    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5 to 5.3), 0.812 Hz`"""
     sources = _sources(entries)
     lines = []
     for entry in entries:

@@ -13,8 +13,7 @@ from heli_jax.identification.equation_error.baseline import baseline
 from heli_jax.identification.equation_error.smoothing import segments
 from heli_jax.identification.validation.feedback import untested
 from heli_jax.identification.validation.metrics import whiteness
-from heli_jax.report.figures.residuals import residual_correlation
-from heli_jax.report.figures.time_domain import response
+from heli_jax.report.figures import residual_correlation, response
 
 from .bench import BENCH, amplitude_for, denominators, steps, vehicle
 

@@ -9,7 +9,7 @@ from heli_jax.analysis.flight_responses import Settings
 from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import frequency
 from heli_jax.report.drawings import Analysis, drawings
-from heli_jax.report.figures.match import match
+from heli_jax.report.figures import match
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.html import render
@@ -84,15 +84,6 @@ def _with_noise(pair):
     H, coherence, sd = (np.array(each) for each in (pair.H, pair.coherence, pair.sd))
     H[-3:], coherence[-3:], sd[-3:] = 1e6 * np.nanmax(np.abs(H)), 0.2, 1.0
     return pair._replace(H=H, coherence=coherence, sd=sd)
-
-
-def test_responses_without_a_figure_are_named(sound, shown):
-    fit, problem, baseline = sound
-    assert shown.incoherent == ()
-    lacking = shown._replace(incoherent=("lon to p", "ped to p"))
-    analysis = Analysis(fit, problem, baseline, SupplementaryAnalyses(responses=lacking))
-    words = "No figure: lon to p, ped to p, whose coherence stays below 0.6"
-    assert words in render(analysis, "title", {}, [])
 
 
 def test_flights_that_are_too_short_say_so(sound):

@@ -12,7 +12,7 @@ from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Convergence, Posterior
 from heli_jax.report import figures, tables
 from heli_jax.report.drawings import Analysis, drawings
-from heli_jax.report.figures.samples import coordinate, gaussian_ellipse, share_within
+from heli_jax.report.figures.estimates import coordinate, gaussian_ellipse, share_within
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.html import write_report
 from heli_jax.report.origin import Origin
