@@ -75,7 +75,6 @@ def of_fit(content: Mapping[str, Any], code: int) -> Result:
     findings = [*content["findings"], *(f for f in content["record"] if f["severity"] != "ok")]
     verdict = content["verdict"]
     exits = [] if content["status"] == "converged" else [f"exit {content['status']}"]
-    exits += ["exit exchangeable"] if verdict["exchangeable_parameters"] else []
     exits += ["exit other solutions"] if verdict["other_solutions"] else []
     exits += [f["code"] for f in findings if f["denies"]]
     exits += [distrust["code"] for distrust in content["untrusted"].values()]

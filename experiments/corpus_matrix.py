@@ -41,7 +41,6 @@ def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
 
 
 ABLATIONS: tuple[Ablation, ...] = (
-    Ablation("noisy_inputs", f"{_VALIDATION}.noisy_inputs:noisy_inputs", lambda *_, **__: []),
     Ablation(
         "noisy_scales", f"{_IDENTIFICATION}.estimation.noisy_scales:free_scales", lambda *_: ()
     ),
@@ -67,16 +66,10 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.estimation.same_responses:better_of_same_responses",
         lambda search, optimum: optimum,
     ),
-    Ablation("twins", f"{_IDENTIFICATION}.identifiability.twins:twins_of", lambda *_, **__: ()),
     Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.swapped_modes:second_solutions",
         lambda *_, **__: (),
-    ),
-    Ablation(
-        "as_likely",
-        f"{_IDENTIFICATION}.identifiability.as_likely:unless_as_likely",
-        lambda verdict, others: verdict,
     ),
     Ablation("valley", f"{_IDENTIFICATION}.identifiability.valley:Valley.tied", _untied),
 )

@@ -2,33 +2,171 @@
 
 import argparse
 import contextlib
+import json
+import math
 import os
+import shlex
+import shutil
 import sys
+import textwrap
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import (
-    cli_options,
-    file_commands,
-    import_path,
-    interrupts,
-    run_commands,
-    run_directory,
-    terminal,
-)
+from heli_jax import import_path, interrupts, run_directory, terminal
 from heli_jax.errors import InputError
 from heli_jax.interrupts import resumable
+from heli_jax.numbers import ADEQUATE
+from heli_jax.regular_file import read_regular
 from heli_jax.stages import Note
+from heli_jax.terminal import print_table, tell
+from heli_jax.versions import version
 
 if TYPE_CHECKING:
-    pass
+    from heli_jax.config.study import Study
+    from heli_jax.flights.convert import Selection
 
 # 2 is what argparse ends with.
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
 INTERRUPTED = interrupts.INTERRUPTED
+_EXIT_CODES = (
+    "Exit codes: 0 done; 2 wrong input, in one sentence; 3 the data cannot determine what was "
+    "asked, or an interval is not trusted; 4 an optimiser did not converge, the model is not "
+    "adequate, or sensors are not compatible; 130 interrupted."
+)
+_LARGEST_FIT = 10**9
+"""bytes of a fit.json"""
+_DEEPEST = 3
+"""folders below the one in which `runs` looks"""
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"expected a number of seconds above 0, got {text!r}")
+    return value
+
+
+# Any: keywords of argparse.
+def _arg(*names: str, **keywords: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """An argument of a command; those with `either` exclude one another."""
+    if names[0].startswith("--") and not keywords.keys() & {"action", "metavar"}:
+        keywords["action"] = "store_true"
+    return names, keywords
+
+
+# fmt: off
+_CONFIG = (
+    _arg("config", metavar="CONFIG", help="experiment configuration (YAML)"),
+    _arg("--set", action="append", default=[], metavar="KEY=VALUE",
+         help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50"),
+)
+_OUT = _arg("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+_JSON = _arg("--json", help="everything, for other programs")
+_LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+_OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
+                  help="read as the configuration's first (default: its own)")
+_CLOCK = (
+    _arg("--time", metavar="NAME", help="of a table: the column of time stamps"),
+    _arg("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns"),
+)
+_TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
+                  help="of a table without times: samples a second")
+_FLIGHT = _arg("--flight", type=_count, metavar="N", help="of a log of several (from 1)")
+_RESUME = _arg("--resume", help="go on where the study or sweep in --out was ended")
+_WORKERS = (
+    _arg("--workers", type=_count, metavar="N", either=True,
+         help="processes of this machine (of a study: as many as cores unless given)"),
+    _arg("--scheduler", metavar="tcp://HOST:8786", either=True,
+         help="compute on the workers of this dask scheduler"),
+)
+_COMMANDS = {
+    "fit": ("estimate parameters; write a run directory with a report", (
+        *_CONFIG, _OUT, _JSON, _RESUME, *_WORKERS,
+        _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
+             help="a study (docs/studies.md): fit with each value, with several keys each "
+             "combination; as --set repeated with one KEY, or study in CONFIG"),
+        _arg("--reports", help="of a study: write each fit's page too, which takes seconds"),
+    )),
+    "compatibility": ("do a log's sensors agree? their errors", (*_CONFIG, _OUT)),
+    "check": ("identifiability, sampling and excitation before any fit", (*_CONFIG, _JSON)),
+    "windows": ("which parts of a log say most, before any fit", (
+        _OTHER_LOG, *_CONFIG,
+        _arg("--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"),
+    )),
+    "frf": ("frequency responses of a log, with coherence and intervals", (
+        _OTHER_LOG, *_CONFIG, _OUT,
+    )),
+    "simulate": ("simulate the configuration's run, or its flights", (
+        *_CONFIG,
+        _arg("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)"),
+        _arg("--view", nargs="?", const="", metavar="HTML",
+             help="also a page with figures and the flight in 3D (default: beside --out)"),
+    )),
+    "sweep": ("run a design of many vehicles; results in a Zarr store", (
+        *_CONFIG, _OUT, _RESUME, *_WORKERS,
+        _arg("--devices", type=_count, metavar="N",
+             help="processor cores or GPUs to use (default: all)"),
+        _arg("--no-figures", help="draw none: it takes seconds"),
+    )),
+    "info": ("signals, rates, duration and gaps of a log", (
+        _LOG, *_CLOCK, _TIME_RATE, _FLIGHT, _JSON,
+        _arg("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'"),
+    )),
+    "convert": ("signals of a log on one clock, as a table", (
+        _LOG, _arg("out", metavar="OUT", help=".csv, .parquet or .nc"),
+        *_CLOCK, _TIME_RATE, _FLIGHT,
+        _arg("--signals", nargs="+", default=[], metavar="NAME",
+             help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)"),
+        _arg("--preset", metavar="NAME", help="its signals, by its names and in SI"),
+        _arg("--config", metavar="CONFIG",
+             help="the signals of its first flight, by the model's names and in SI; or its "
+             "swashplate, for --signals ccpm.roll"),
+        _arg("--rate", type=float, metavar="HZ", help="resample to this rate"),
+        _arg("--window", nargs=2, type=float, metavar=("FROM", "TO"),
+             help="[s] from the log's beginning"),
+    )),
+    "runs": ("the fits that a folder holds", (
+        _arg("directory", nargs="?", default="runs", metavar="DIR", help="default: runs"), _JSON,
+    )),
+    "compare": ("fits side by side: estimates, verdicts, agreement", (
+        _arg("runs", nargs="+", metavar="RUN", help="directories of heli-jax fit"),
+        _arg("--out", metavar="FILE", help="page (.html), estimates as .csv or as LaTeX (.tex)"),
+    )),
+    "new": ("a configuration that begins with what a log holds", (
+        _LOG, _TIME_RATE, _FLIGHT,
+        _arg("--model", metavar="NAME",
+             help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
+             "(default: the linear model of the axis whose stick moves most)"),
+        _arg("--vehicle", metavar="FILE", help="a vehicle file that is there already"),
+        _arg("--out", metavar="FILE", help="configuration (default: the log's name)"),
+    )),
+    "keys": ("what may stand in a configuration", (
+        _arg("pattern", nargs="?", metavar="TEXT",
+             help="of keys or their meaning (default: all keys)"),
+        _JSON,
+        _arg("--schema", metavar="FILE",
+             help="write the JSON schema, by which editors complete YAML"),
+        _arg("--fit", help="what stands in fit.json instead"),
+    )),
+    "new-model": ("write the files that a model of one's own needs", (
+        _arg("name", metavar="NAME", help="of the model and its module"),
+        _arg("--out", metavar="DIR", help="new folder (default: NAME)"),
+    )),
+}
+# fmt: on
+"""by name: its help and its arguments; the function of `new-model` is `_new_model`"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -39,16 +177,13 @@ class _Parser(argparse.ArgumentParser):
 
 def _refuse(prog: str, message: str) -> NoReturn:
     """End with one line, which names the help of the command (`heli-jax fit`) that was begun."""
-    helps = "says what it takes" if " " in prog else "lists the commands"
-    terminal.say(f"{message} ({prog} --help {helps})")
+    terminal.say(f"{message} (see {prog} --help)")
     raise SystemExit(WRONG_INPUT)
 
 
 class _Version(argparse.Action):
     # Any: what argparse passes.
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from heli_jax.versions import version
-
         print(version())
         raise SystemExit(DONE)
 
@@ -80,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             options.say = terminal.say_notes if options.quiet else terminal.say
             with terminal.progress_shown(options.quiet):
-                code = options.run(options)
+                code = globals()[f"_{options.command.replace('-', '_')}"](options)
             # Now, where a full disk is told in words.
             if sys.stdout is not None:
                 sys.stdout.flush()
@@ -115,71 +250,20 @@ def _parser() -> argparse.ArgumentParser:
         prog="heli-jax",
         description="Physical parameters of small helicopters from logged runs, with honest "
         "uncertainties.",
-        epilog=cli_options.EXIT_CODES,
+        epilog=_EXIT_CODES,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-    # Each command's function becomes `options.run`, so that `main` needs no table of them.
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def command(
-        name: str, run: Callable[[argparse.Namespace], int], words: str
-    ) -> argparse.ArgumentParser:
-        added = commands.add_parser(
-            name, help=words, description=words, epilog=cli_options.EXIT_CODES
-        )
+    for command, (words, arguments) in _COMMANDS.items():
+        added = commands.add_parser(command, help=words, description=words, epilog=_EXIT_CODES)
         added.add_argument("--quiet", action="store_true", help="results, doubts and errors alone")
-        added.set_defaults(run=run)
-        return added
-
-    fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
-    _add_config(fit)
-    cli_options.add_fit_options(fit)
-    fit.add_argument("--json", action="store_true", help="print fit.json, for other programs")
-    agree = command("compatibility", _compatibility, "do a log's sensors agree? their errors")
-    _add_config(agree)
-    agree.add_argument("--out", metavar="DIR", help="run directory (default: as of fit)")
-    check = command("check", _check, "identifiability, sampling and excitation before any fit")
-    _add_config(check)
-    check.add_argument("--json", action="store_true", help="everything, for other programs")
-    windows = command("windows", _windows, "which parts of a log say most, before any fit")
-    cli_options.add_windows_options(windows)
-    _add_config(windows)
-    frf = command("frf", _frf, "frequency responses of a log, with coherence and intervals")
-    cli_options.add_frf_options(frf)
-    _add_config(frf)
-    simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
-    _add_config(simulate)
-    cli_options.add_simulate_options(simulate)
-    sweep = command("sweep", _sweep, "run a design of many vehicles; results in a Zarr store")
-    _add_config(sweep)
-    cli_options.add_sweep_options(sweep)
-    info = command("info", _info, "signals, rates, duration and gaps of a log")
-    cli_options.add_info_options(info)
-    convert = command("convert", _convert, "signals of a log on one clock, as a table")
-    cli_options.add_convert_options(convert)
-    listing = command("runs", run_commands.runs, "the fits that a folder holds")
-    cli_options.add_runs_options(listing)
-    compare = command("compare", _compare, "fits side by side: estimates, verdicts, agreement")
-    cli_options.add_compare_options(compare)
-    new = command("new", _new, "a configuration that begins with what a log holds")
-    cli_options.add_new_options(new)
-    listing = command("keys", _keys, "what may stand in a configuration")
-    cli_options.add_keys_options(listing)
-    new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
-    new_model.add_argument("name", metavar="NAME", help="of the model and its module")
-    new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
+        either = None
+        for names, keywords in arguments:
+            group = added
+            if "either" in keywords:
+                group = either = either or added.add_mutually_exclusive_group()
+            group.add_argument(*names, **{k: v for k, v in keywords.items() if k != "either"})
     return parser
-
-
-def _add_config(command: argparse.ArgumentParser) -> None:
-    command.add_argument("config", metavar="CONFIG", help="experiment configuration (YAML)")
-    command.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50",
-    )
 
 
 def _prepare_jax(cpu_devices: int | None = None) -> None:
@@ -187,9 +271,6 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
 
     Args:
         cpu_devices: so many processors are devices; JAX decides unless given.
-
-    Raises:
-        InputError: JAX_PLATFORMS asks for a device that is not there.
     """
     # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
     # option, --help and `info` need none of them.
@@ -224,14 +305,9 @@ def _prepare_jax(cpu_devices: int | None = None) -> None:
         ) from e
 
 
-def _cache() -> Path:
-    """Where what was compiled and measured is kept from one command to the next."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
-
-
 def _private_cache() -> str | None:
     """The cache folder, of this user alone; None where it is not: what was compiled is code."""
-    folder = _cache()
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)  # refused where it is another user's, unless this one is root
@@ -243,11 +319,15 @@ def _private_cache() -> str | None:
 
 def _new_directory(options: argparse.Namespace) -> Path:
     """Where a run's files go, known to be free."""
-    config = Path(options.config)
-    out = Path(options.out) if options.out else run_directory.default_directory(config)
-    resume = ", or --resume" if getattr(options, "over", None) else ""
+    out = _directory(options)
+    resume = ", or --resume" if hasattr(options, "resume") else ""
     run_directory.require_free(out, resume)  # at once, before the seconds of the imports
     return out
+
+
+def _directory(options: argparse.Namespace) -> Path:
+    config = Path(options.config)
+    return Path(options.out) if options.out else run_directory.default_directory(config)
 
 
 def _fit(options: argparse.Namespace) -> int:
@@ -255,13 +335,17 @@ def _fit(options: argparse.Namespace) -> int:
     if not options.resume:
         _new_directory(options)
     _prepare_jax()
-    from heli_jax import study_command
+    from heli_jax.config.study import read_study
 
-    study = study_command.asked(options)
+    study = read_study(options.config, options.set, options.over)
     if study is not None:
-        if options.json:
-            raise InputError("--json: prints the fit.json of one fit, and a study has many")
-        return study_command.fit(options, study, options.say)
+        return _fit_study(options, study)
+    for option in ("resume", "workers", "scheduler", "reports"):
+        if getattr(options, option):
+            raise InputError(
+                f"--{option}: is for a study of fits, expected --over KEY=VALUE,VALUE, or "
+                f"study in {options.config}"
+            )
     out = _new_directory(options)
     from heli_jax import output, workflow
 
@@ -281,14 +365,53 @@ def _fit(options: argparse.Namespace) -> int:
     return run.fit.exit_code
 
 
+def _fit_study(options: argparse.Namespace, study: "Study") -> int:
+    """Carry out a study and print it; returns the exit code of the worst fit."""
+    from heli_jax import simulation_output
+    from heli_jax.studies import directory
+    from heli_jax.studies import run as studies
+
+    if options.json:
+        raise InputError("--json: prints the fit.json of one fit, and a study has many")
+    _require_out(options)
+    out = _directory(options)
+    options.interrupts.words = lambda: resumable(out, directory.FINISHED)
+    # Workers of dask have to be told; our own processes end with this one.
+    options.interrupts.unwinds = bool(options.scheduler)
+    # Without a scheduler --workers are processes of our own, for which dask is not needed.
+    with _dask_client(options) if options.scheduler else contextlib.nullcontext() as client:
+        how = {"workers": options.workers, "client": client, "reports": options.reports}
+        result = studies.run(study, out, studies.Options(options.resume, **how, say=options.say))
+    simulation_output.print_study(result)
+    tell(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
+    return simulation_output.study_exit_code(result)
+
+
+def _require_out(options: argparse.Namespace) -> None:
+    if options.resume and not options.out:
+        raise InputError("--resume: expected --out DIR too, the directory that was begun")
+
+
+# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
+def _dask_client(options: argparse.Namespace) -> contextlib.AbstractContextManager[Any]:
+    """A dask client where --scheduler or --workers asks for one."""
+    if options.scheduler is None and options.workers is None:
+        return contextlib.nullcontext()
+    try:
+        from heli_jax.sweeps.cluster import connected
+    except ImportError as e:
+        option = "--workers" if options.scheduler is None else "--scheduler"
+        raise InputError(
+            f"{option}: dask.distributed is not installed, expected the extra distributed: "
+            "pip install 'heli_jax[distributed]'"
+        ) from e
+    return connected(options.scheduler, options.workers)
+
+
 def _discard_output() -> None:
     """Send what is still to be printed nowhere."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _status_code(status: str) -> int:
-    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(status, NOT_CONVERGED)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -321,10 +444,13 @@ def _windows(options: argparse.Namespace) -> int:
 def _compatibility(options: argparse.Namespace) -> int:
     out = _new_directory(options)
     _prepare_jax()
-    from heli_jax import output
+    from heli_jax import compatibility, output
 
-    compatible = output.run_compatibility(options.config, out, options.set, options.say)
-    return DONE if compatible else NOT_CONVERGED
+    result = compatibility.run_compatibility(
+        options.config, out, overrides=options.set, progress=options.say
+    )
+    output.print_compatibility(result)
+    return DONE if result.compatible else NOT_CONVERGED
 
 
 def _frf(options: argparse.Namespace) -> int:
@@ -336,7 +462,8 @@ def _frf(options: argparse.Namespace) -> int:
     statuses = log_responses.run_responses(experiment, out, options.log, options.say)
     # The responses are written whatever comes of a transfer function; a script that looks at the
     # code alone must not take numbers that are not there.
-    return max(map(_status_code, statuses), default=DONE)
+    codes = {"converged": DONE, "not-identifiable": NOT_DETERMINED}
+    return max((codes.get(status, NOT_CONVERGED) for status in statuses), default=DONE)
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -375,12 +502,8 @@ def _simulate(options: argparse.Namespace) -> int:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    config = Path(options.config)
-    if options.resume and not options.out:
-        raise InputError("--resume: expected --out DIR too, the directory of the sweep")
-    out = Path(options.out) if options.out else run_directory.default_directory(config)
-    if not options.resume:
-        run_directory.require_free(out, ", or --resume")
+    _require_out(options)
+    out = _directory(options) if options.resume else _new_directory(options)
     from heli_jax.numerics.cores import cores
 
     # Each core a device of its own; where there are GPUs they are the devices.
@@ -391,15 +514,11 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import simulation_output, sweep_workflow
     from heli_jax.sweeps.store import FINISHED
 
-    experiment = configuration.load(config, options.set)
-
+    experiment = configuration.load(options.config, options.set)
     options.interrupts.words = lambda: resumable(out, FINISHED)
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with (
-        simulation_output.sweep_progress(quiet=options.quiet) as progress,
-        cli_options.dask_client(options) as client,
-    ):
+    with _dask_client(options) as client:
         sweep_workflow.run_sweep(
             experiment,
             out,
@@ -408,8 +527,6 @@ def _sweep(options: argparse.Namespace) -> int:
             # Of GPUs there are as many as there are, so --devices takes the first of them.
             devices=jax.local_devices()[: options.devices],
             client=client,
-            memory=_cache() / "lanes.json",
-            progress=progress,
             say=options.say,
         )
     simulation_output.print_sweep(out)
@@ -435,7 +552,7 @@ def _convert(options: argparse.Namespace) -> int:
     out = Path(options.out)
     convert.require_output(out, options.log)
     run_directory.require_place(out, f"{out}")
-    selection = cli_options.selection(options)
+    selection = _selection(options)
     if options.config is not None:
         _prepare_jax()
         from heli_jax import workflow
@@ -454,21 +571,173 @@ def _convert(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _selection(options: argparse.Namespace) -> "Selection":
+    """What `convert` takes of a log."""
+    from heli_jax.flights import convert, named
+
+    if options.preset is not None and (options.signals or options.config is not None):
+        other = "--signals" if options.signals else "--config"
+        raise InputError(f"--preset: names the columns, expected it without {other}")
+    by_preset = None
+    if options.preset is not None:
+        try:
+            by_preset = named.by_preset(options.preset)
+        except ValueError as e:
+            raise InputError(f"--preset: {e}") from e
+    return convert.Selection(
+        options.signals,
+        options.rate,
+        None if options.window is None else tuple(options.window),
+        options.flight,
+        options.time,
+        options.time_unit,
+        options.time_rate,
+        by_preset,
+    )
+
+
+def _runs(options: argparse.Namespace) -> int:
+    folder = Path(options.directory)
+    if not folder.exists():
+        raise InputError(
+            f"{folder}: there is no such folder, expected one that holds runs of heli-jax fit: "
+            "heli-jax runs DIR"
+        )
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of runs, got a file")
+    listed = sorted(_found(folder), key=lambda run: run["date"])
+    if options.json:
+        print(json.dumps(listed, indent=1))
+        return DONE
+    if not listed:
+        raise InputError(f"{folder}: holds no run of heli-jax fit")
+    keys = ("run", "date", "model", "method", "status", "adequate", "untrusted")
+    rows = [tuple(str(run[k]) for k in keys) for run in listed]
+    print_table(keys, rows)
+    return DONE
+
+
+def _found(folder: Path) -> Iterator[dict[str, Any]]:
+    for path in _files(folder, _DEEPEST):
+        try:
+            content = json.loads(read_regular(path, "the fit.json of a run", _LARGEST_FIT))
+            # Without its reasons, for which a table has no room.
+            adequate = ADEQUATE[content["adequate"]]
+            row = {k: content[k] for k in ("model", "method", "status")}
+            untrusted = ", ".join(map(str, content.get("untrusted") or ()))
+            date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
+        # Any file may be called so: what no fit wrote is no run.
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            continue
+        name = str(path.parent.relative_to(folder))
+        yield {"run": name, "date": date, **row, "adequate": adequate, "untrusted": untrusted}
+
+
+def _files(folder: Path, deepest: int) -> Iterator[Path]:
+    # Also one that may be listed and not entered says of nothing in it what it is.
+    try:
+        inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        files = [e.path for e in inside if e.name == "fit.json" and e.is_file()]
+        folders = [e.path for e in inside if e.is_dir(follow_symlinks=False)]
+    except OSError:
+        return
+    yield from map(Path, files)
+    for path in folders if deepest else ():
+        yield from _files(Path(path), deepest - 1)
+
+
 def _compare(options: argparse.Namespace) -> int:
-    return run_commands.compare(options, options.say)
+    from heli_jax.report.compared_runs import compare_runs
+
+    place = None if options.out is None else Path(options.out)
+    endings = (".html", ".csv", ".tex")
+    if place is not None and place.suffix.lower() not in endings:
+        raise InputError(f"--out {place}: expected a name ending in {', '.join(endings)}")
+    compared = compare_runs(options.runs)
+    # Numbers for names: several directories' names are wider than a terminal.
+    numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
+    for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
+        label, model, method, status, verdict, adequate = row
+        tell(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
+    print_table(numbered.estimates.head, list(numbered.estimates.rows))
+    # Output, flights and metric are a row's name, where a narrow terminal parts the table too.
+    print_table(numbered.agreement.head, list(numbered.agreement.rows), keys=3)
+    for found in numbered.notes:
+        tell(f"! {found.sentence}")
+    if place is None:
+        return DONE
+    run_directory.require_place(place, f"--out {place}")
+    with run_directory.whole_file(place, f"--out {place}") as temporary:
+        if place.suffix.lower() == ".html":
+            from heli_jax.report.compared_page import write_page
+
+            write_page(temporary, compared)
+        else:
+            csv = place.suffix.lower() == ".csv"
+            temporary.write_text(
+                compared.to_csv() if csv else compared.to_latex(), encoding="utf-8"
+            )
+    options.say(f"wrote {place}")
+    return DONE
 
 
 def _new(options: argparse.Namespace) -> int:
-    return file_commands.new(options, options.say)
+    from heli_jax.new_config import write_config
+
+    log = Path(options.log)
+    out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
+    chosen = (options.model, options.vehicle, options.flight, options.time_rate)
+    for found in write_config(log, out, *chosen).notes:
+        options.say(found.sentence)
+    return DONE
 
 
 def _keys(options: argparse.Namespace) -> int:
-    return file_commands.keys(options, options.say)
+    from heli_jax.config import keys
+    from heli_jax.report import document
+
+    if options.schema is not None:
+        place = Path(options.schema)
+        with run_directory.whole_file(place, f"--schema {place}") as temporary:
+            text = json.dumps(keys.json_schema(), indent=1)
+            temporary.write_text(f"{text}\n", encoding="utf-8")
+        options.say(f"wrote {place}")
+        return DONE
+    matching = document.matching if options.fit else keys.matching
+    found = matching(options.pattern or "")
+    if options.json:
+        print(json.dumps([key._asdict() for key in found], indent=1))
+        return DONE
+    if not found:
+        hint = ""
+        if not options.fit and document.matching(options.pattern):
+            hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(options.pattern)}"
+        raise InputError(
+            f"keys: expected a text that some key or its meaning holds, got {options.pattern}{hint}"
+        )
+    # Longer lines are hard to read.
+    width, indent = min(shutil.get_terminal_size().columns, 100), "    "
+    for key in found:
+        default = getattr(key, "default", "")
+        default = "has to be there" if default is None else default and f"default {default}"
+        # A default of null says that the key may be left out, and no more.
+        default = "optional" if default == "default null" else default
+        head = "; ".join(filter(None, (f"{key.path}: {key.kind}", default)))
+        for text, first in ((head, ""), (key.meaning, indent)):
+            lines = textwrap.wrap(
+                text, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
+            )
+            print(*lines, sep="\n", end="\n" if lines else "")
+    return DONE
 
 
 def _new_model(options: argparse.Namespace) -> int:
-    return file_commands.new_model(options, options.say)
+    from heli_jax.new_model import write_skeleton
 
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    written = write_skeleton(options.name, options.out)
+    tell("\n".join(map(str, written)))
+    options.say(
+        f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
+        f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"
+    )
+    return DONE

@@ -113,7 +113,9 @@ def run_compatibility(
         words = _SMOOTH if _smooth(run) else _BEYOND_NOISE
         reason = Finding("sensors.noise-not-told", "doubt", words)
         progress("filter error has no end: once more by output error")
-        compatibility = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
+        compatibility = judged(
+            workflow.run_fit(_by_output_error(experiment), progress=lambda _: None)
+        )
         compatibility = dataclasses.replace(compatibility, doubts=(reason, *compatibility.doubts))
         run = compatibility.run
     if out is None:
@@ -166,10 +168,6 @@ def _by_output_error(experiment: Experiment) -> Experiment:
     assert config.fit is not None  # it has been fitted
     fit = config.fit.model_copy(update={"method": "output-error"})
     return experiment._replace(config=config.model_copy(update={"fit": fit}))
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 def judged(run: FitRun) -> Compatibility:

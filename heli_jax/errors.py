@@ -67,12 +67,6 @@ def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> st
 def require_kind(argument: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
     """Refuse an argument of another kind than it has to be.
 
-    Args:
-        argument: its name.
-        value: what was passed.
-        kinds: what it may be an instance of.
-        expected: these in words, with what makes one.
-
     Raises:
         TypeError: naming the argument, what was expected and what was found.
     """

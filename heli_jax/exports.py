@@ -39,9 +39,6 @@ def runs_frame(runs: Mapping[str, Mapping[str, Any]]) -> "pd.DataFrame":
     """The estimates of several runs as a long data frame: a row for each run and parameter.
 
     What the data do not determine has no number.
-
-    Args:
-        runs: estimates by name, by run.
     """
     import pandas as pd
 

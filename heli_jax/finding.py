@@ -95,7 +95,6 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
     """By parameter the finding that takes its interval away, the largest shift first.
 
     Args:
-        findings: of a fit.
         estimates: by parameter, with `sd` [SI]; None where it is not identifiable.
     """
     out: dict[str, Distrust] = {}
@@ -116,7 +115,6 @@ def weighed(findings: Iterable[Finding], estimates: Mapping[str, Any]) -> list[F
     """The findings, a doubt of those that take an interval away and a note of misfits that do not.
 
     Args:
-        findings: of a fit.
         estimates: by parameter, with `sd` [SI].
     """
     out = []
@@ -135,8 +133,6 @@ def exit_code(status: str, adequate: bool, distrusts: Mapping[str, Distrust]) ->
     (not identifiable, or not trusted). 4: not converged, or the model does not explain the record.
 
     Args:
-        status: of the fit.
-        adequate: whether the model explains the record.
         distrusts: of `distrusted`.
     """
     if status == "not-converged" or not adequate:

@@ -1,34 +1,36 @@
 """Runs that a configuration describes and the project makes itself."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
+from heli_jax import naming, units
 from heli_jax.analysis.pilot import Pilot, attitude_hold
 from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, trim
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
+    StickConfig,
     disturbed,
     first_signals,
     in_wind,
     read_flights,
     signals,
 )
+from heli_jax.dynamics.check_model import cannot_start
 from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
-from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import decide
 from heli_jax.naming import Record
 from heli_jax.simulation import events
+from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
-from heli_jax.stick_inputs import factor_to_si, stick_inputs
 from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
@@ -51,6 +53,59 @@ class Simulated(NamedTuple):
     def whole(self) -> bool:
         """Whether it was the full nonlinear helicopter that flew."""
         return is_full_nonlinear(self.model)
+
+
+def _stick_inputs(
+    experiment: Experiment, settings: SimulateConfig, n: int, rng: np.random.Generator, where: str
+) -> dict[str, np.ndarray]:
+    """Every input of the model in SI; one that is not named stays at neutral.
+
+    Args:
+        settings: the configuration's `simulate`.
+    """
+    record = experiment.model.Inputs
+    for name in settings.inputs:
+        if name not in naming.names(record):
+            raise InputError(
+                f"{where}.inputs: model {experiment.model.name} has no input {name!r}"
+                f"{nearest(name, naming.names(record))}"
+            )
+    out = {}
+    # In the model's order, not the configuration's: the draws must not depend on how it is written.
+    for name in naming.names(record):
+        stick = settings.inputs.get(name)
+        if stick is None:
+            out[name] = np.zeros(n)
+            continue
+        si = naming.unit(record, name) or "1"
+        scale = _factor_to_si(stick.unit or si, si, f"{where}.inputs.{name}.unit")
+        out[name] = stick.amplitude * scale * _stick(stick, n, 1.0 / settings.rate, rng)
+    return out
+
+
+def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
+    if config.kind == "random-steps":
+        return sticks.random_steps(n, dt, rng, config.hold)
+    if config.kind == "3-2-1-1":
+        return sticks.multistep_3211(n, dt, rng, config.step, config.pause)
+    if config.kind == "sweep":
+        # Now the word for a parameter sweep alconfig.
+        warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
+    if config.kind in ("chirp", "sweep"):
+        return sticks.chirp(n, dt, *config.band)
+    return np.zeros(n)
+
+
+def _factor_to_si(unit: str, si: str, where: str) -> float:
+    """As `units.factor`, with a place.
+
+    Args:
+        si: the SI unit of what it is for.
+    """
+    try:
+        return units.factor(unit, si)
+    except ValueError as e:
+        raise InputError(f"{where}: {e}") from e
 
 
 def generate(experiment: Experiment) -> Simulated:
@@ -79,8 +134,13 @@ def generate(experiment: Experiment) -> Simulated:
         needed = " and ".join(drawn.parameters)
         raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
     # What can be refused is refused before the run, which takes longest.
-    _check_outputs(experiment, settings, where)
-    driven = stick_inputs(experiment, settings, n, rng, where)
+    for name in settings.noise:
+        if name not in (known := naming.names(experiment.model.Outputs)):
+            raise InputError(
+                f"{where}.noise: model {experiment.model.name} has no output {name!r}"
+                f"{nearest(name, known)}"
+            )
+    driven = _stick_inputs(experiment, settings, n, rng, where)
     _check_full_nonlinear(experiment, settings, where)
     flown = in_wind(experiment) if settings.wind is not None else experiment
     run, commanded = _run(flown, settings, n, driven, where)
@@ -93,7 +153,7 @@ def generate(experiment: Experiment) -> Simulated:
     outputs = {k: np.asarray(v) for k, v in naming.asdict(run.outputs).items()}
     for name, noise in settings.noise.items():
         si = naming.unit(experiment.model.Outputs, name) or "1"
-        scale = factor_to_si(noise.unit or si, si, f"{where}.noise.{name}.unit")
+        scale = _factor_to_si(noise.unit or si, si, f"{where}.noise.{name}.unit")
         # Drawn for the whole record, so that a ground does not change the noise of what is left.
         draws = noise.sd * scale * rng.standard_normal(n)
         outputs[name] = outputs[name] + draws[: outputs[name].size]
@@ -133,7 +193,7 @@ def drive(experiment: Experiment) -> Made:
     n, rng = round(settings.duration * settings.rate), np.random.default_rng(settings.seed)
     flown = in_wind(experiment) if settings.wind is not None else experiment
     # The same draws as `generate` makes: element by element the sweep flies that manoeuvre.
-    inputs = stick_inputs(flown, settings, n, rng, where)
+    inputs = _stick_inputs(flown, settings, n, rng, where)
     flight = Flight(dt=1.0 / settings.rate, inputs=inputs, outputs={}, name="simulate")
     if not is_full_nonlinear(flown.model):
         return Made(flown, flight, None, None)
@@ -145,16 +205,6 @@ def drive(experiment: Experiment) -> Made:
     if settings.hold_attitude:
         pilot = _pilot(flown, _begin(flown, settings, where), where)
     return Made(flown, flight, trimmed, pilot)
-
-
-def _check_outputs(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
-    known = naming.names(experiment.model.Outputs)
-    for name in settings.noise:
-        if name not in known:
-            raise InputError(
-                f"{where}.noise: model {experiment.model.name} has no output {name!r}"
-                f"{nearest(name, known)}"
-            )
 
 
 def _run(
@@ -383,7 +433,7 @@ def _as_logged(
     # An autopilot's log needs no name for the time; the table that is written here has one.
     time = logged.time
     name, unit = ("time", "s") if time is None else (time.signal or "time", time.unit)
-    seconds = factor_to_si(unit, "s", f"{where}.time.unit")
+    seconds = _factor_to_si(unit, "s", f"{where}.time.unit")
     # A column that counts samples; where rows are the clock, times do no harm beside them.
     if time is not None and time.rate is not None and time.signal is not None:
         seconds = 1.0 / time.rate

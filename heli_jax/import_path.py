@@ -30,9 +30,7 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     """The object at 'package.module:name', or None where the module has nothing of that name.
 
     Args:
-        path: 'package.module:name'.
         where: what errors begin with, such as the file and the key.
-        folder: where the module may lie, as beside the configuration that names it.
 
     Raises:
         InputError: it is no such path, or the module cannot be imported, whatever goes wrong in

@@ -22,8 +22,6 @@ from heli_jax import run_directory
 INTERRUPTED = 130
 """what a shell reports of a program ended by SIGINT (128 + 2)"""
 _ENDING = (signal.SIGINT, signal.SIGTERM)
-_AT_ONCE = 0.5
-"""s: a main thread that runs Python has heard of a signal by then"""
 _UNWINDING = 20.0
 """s for a command that has other processes to end"""
 
@@ -39,49 +37,33 @@ class Interrupts:
         """the sentence of the end"""
         self.unwinds = False
         """whether a KeyboardInterrupt is raised all the same: a cluster has to be taken down"""
-        self._over = threading.Event()
-        self._ending = threading.Lock()
+        self.over = threading.Event()
+        """set where the command has come to its own end"""
 
     def heard(self, number: int, frame: FrameType | None) -> None:
-        """What the main thread does when it hears of a signal.
-
-        Args:
-            number: of the signal.
-            frame: where it was, not used.
+        """Stop what the main thread does; `watch` ends the process.
 
         Raises:
             KeyboardInterrupt: the first time, where the command unwinds.
         """
         self.seen.append(number)
         if not self.unwinds:
-            self.end()
+            # It must not meet what is being removed.
+            threading.Event().wait()
         # Pressed again, it would break off the cleaning up of the first time.
         if len(self.seen) == 1:
             raise KeyboardInterrupt
 
     def watch(self, pipe: int) -> None:
-        """End the command where its main thread does not hear: within compiled code.
-
-        Args:
-            pipe: to which the system's own handler writes a signal's number, at any moment.
-        """
+        """End the command: a thread, since the main one hears of no signal within compiled code."""
         while numbers := os.read(pipe, 64):
             if heard := [n for n in _ENDING if n in numbers]:
-                if self._over.wait(_UNWINDING if self.unwinds else _AT_ONCE):
+                if self.over.wait(_UNWINDING if self.unwinds else 0.0):
                     break
-                self.seen += heard
-                self.end()
+                self._end(heard[0])
         os.close(pipe)
 
-    def finish(self) -> None:
-        """The command has come to its own end: nothing is to be ended any more."""
-        self._over.set()
-
-    def end(self) -> None:
-        """End the process; does not return."""
-        if not self._ending.acquire(blocking=False):
-            # The other thread is at it. This one must not meet what is being removed.
-            threading.Event().wait()
+    def _end(self, number: int) -> None:
         run_directory.remove_unfinished()
         # Past Python's own buffers, whose locks the interrupted code may hold. A progress bar hides
         # the cursor of a terminal.
@@ -89,7 +71,7 @@ class Interrupts:
         with contextlib.suppress(OSError):
             os.write(2, f"{restored}heli-jax: {self.words()}\n".encode())
         # As a shell reports of a program that was ended by a signal.
-        os._exit(128 + (self.seen or [signal.SIGINT])[0])
+        os._exit(128 + number)
 
 
 @contextlib.contextmanager
@@ -119,7 +101,7 @@ def as_program() -> Iterator[Interrupts]:
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        interrupts.finish()
+        interrupts.over.set()
         signal.set_wakeup_fd(before)
         os.close(writing)
 
@@ -144,12 +126,7 @@ def as_function() -> Iterator[Interrupts]:
 
 
 def resumable(out: Path, finished: str) -> str:
-    """The sentence of the end of work that --resume goes on with.
-
-    Args:
-        out: its directory.
-        finished: a pattern of files in it, of which there are none before a part is finished.
-    """
+    """The sentence of the end of work that --resume goes on with."""
     if not out.exists():
         return "interrupted; nothing was written"
     if any(out.glob(finished)):

@@ -1,6 +1,4 @@
-"""What `heli-jax info` prints of a log, as text of at most 80 columns or as JSON.
-
-On a terminal of fewer columns tables leave some of theirs out, and sentences go on a line below.
+"""What `heli-jax info` prints of a log, as text or as JSON.
 
 Apart from `output.py`, which imports JAX: a look at a log need not wait for it.
 """
@@ -9,9 +7,6 @@ import dataclasses
 import fnmatch
 import json
 import math
-import re
-import shutil
-import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -22,12 +17,10 @@ from heli_jax.flights.rotor_lines import LEAST, RotorLines
 from heli_jax.flights.row_clock import ROWS
 from heli_jax.flights.vibration import SMALLEST, line_words
 from heli_jax.numbers import terse
-from heli_jax.terminal_table import plain_text
+from heli_jax.terminal import print_table, tell
 
-# The width of a terminal that nobody has widened, and one below which nothing is narrowed.
-_WIDTH, _NARROWEST = 80, 44
-_ROOM = 12
-"""columns of the screen for a channel's name at least, before a number more is shown"""
+_WIDEST = 44
+"""characters of a name in a table"""
 _MOST_CHANNELS = 150
 """that are listed without being asked for: a PX4 log has a thousand"""
 _MOST_LINES = 10
@@ -37,8 +30,6 @@ _MOST_OF_BURST, _BURST = 200, 0.02
 """messages, and seconds within which they came, that are no signal with a rate"""
 _MOST_VIBRATIONS = 3
 """of a channel"""
-_NUMBER = 10
-"""columns of the screen for a number"""
 
 
 def print_flights(
@@ -53,16 +44,25 @@ def print_flights(
     """
     log = flights[0]
     rows = "" if log.topics else f", {log.n_rows} rows"
-    words = f"{log.format}, {log.size} bytes{rows}"
-    name = plain_text(log.path)
-    width = min(_WIDTH, max(_NARROWEST, shutil.get_terminal_size((_WIDTH, 24)).columns))
-    # A path has no end that could be left out, and a hash is copied whole.
-    print(f"{name}: {words}" if len(name) + len(words) + 2 <= width else f"{name}\n{words}")
-    print(f"sha256 {log.sha256}")
+    tell(f"{log.path}: {log.format}, {log.size} bytes{rows}\nsha256 {log.sha256}")
     for flight in flights:
-        count = flight.flight[1] if chosen else len(flights)
-        for line in _flight_lines(flight, count, pattern, width):
-            print("\n".join(map(plain_text, _lines(line, width))))
+        _print_flight(flight, flight.flight[1] if chosen else len(flights), pattern)
+
+
+def _print_flight(flight: LogInfo, count: int, pattern: str | None) -> None:
+    # A table has one clock and no firmware, so most of the lines below would be empty.
+    for line in _flight_lines(flight, count) if flight.topics else _clock_lines(flight.time):
+        tell(line)
+    # What was lost or assumed stands before the numbers, which are read with that in mind.
+    for found in flight.notes[:_MOST_LINES]:
+        tell(f"! {found.sentence}")
+    # Who asks for channels of a name has not asked for the topics.
+    if flight.topics and pattern is None:
+        _print_topics(flight.topics)
+    _print_channels(flight.columns, pattern)
+    if pattern is None:
+        for line in _setting_lines(flight):
+            tell(line)
 
 
 def as_json(flights: Sequence[LogInfo]) -> str:
@@ -112,37 +112,20 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) -> Iterator[str]:
-    # A table has one clock and no firmware, so most of the lines below would be empty.
-    if not flight.topics:
-        yield from _clock_lines(flight.time)
-        yield from (f"! {n.sentence}" for n in flight.notes[:_MOST_LINES])
-        yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern, width)
-        return
+def _flight_lines(flight: LogInfo, count: int) -> Iterator[str]:
     number, of = flight.flight
     if of > 1:
-        yield ""
-        yield f"flight {number} of {of}" + (f" ({count} with samples)" if count < of else "")
+        yield f"\nflight {number} of {of}" + (f" ({count} with samples)" if count < of else "")
     if flight.firmware:
         yield f"firmware: {flight.firmware}"
-    length = (
-        "unknown: rows have an order and no times, which no fit can use"
-        if math.isnan(flight.duration)
-        else ""
-    )
-    yield f"duration: {length or f'{flight.duration:.6g} s'}"
-    # What was lost or assumed stands before the numbers, which are read with that in mind.
-    yield from (f"! {n.sentence}" for n in flight.notes[:_MOST_LINES])
+    if math.isnan(flight.duration):
+        yield "duration: unknown: rows have an order and no times, which no fit can use"
+    else:
+        yield f"duration: {flight.duration:.6g} s"
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"
     yield from _vibration_lines(flight.vibration)
-    # Who asks for channels of a name has not asked for the topics.
-    if pattern is None:
-        yield from _topic_lines(flight.topics, width)
-    yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern, width)
-    if pattern is None:
-        yield from _setting_lines(flight)
 
 
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
@@ -215,38 +198,23 @@ def _vibration_content(rotor: RotorLines | None) -> dict[str, Any] | None:
     return rotor._asdict() | {"signals": signals}
 
 
-def _topic_lines(topics: Sequence[TopicInfo], width: int) -> Iterator[str]:
-    yield ""
-    # How many channels, and how long the longest gap is, say least.
-    wide = width >= _WIDTH
-    room = 30 if wide else width - 32
-
-    def start(name: str, channels: int | str, rows: int | str) -> str:
-        count = f" {channels:>8}" if wide else ""
-        return f"{_squeezed(name, room):{room}}{count} {rows:>7}"
-
-    head = f"{start('topic', 'channels', 'rows')} {'rate Hz':>8} {'jitter':>7} {'gaps':>5}"
-    yield f"{head} {'longest':>8}" if wide else head
+def _print_topics(topics: Sequence[TopicInfo]) -> None:
+    rows = []
     for topic in topics:
-        clock = topic.time
-        line = start(topic.name, len(topic.columns), topic.n_rows)
+        clock, cells = topic.time, ("", "", "", "")
         if clock is None:
-            yield f"{line} no times" if not wide else f"{line} no times, only an order"
+            cells = ("no times, only an order", "", "", "")
         elif clock.problem:
-            yield _cut(f"{line} {clock.problem}", width)
-        elif _is_burst(clock, topic.n_rows):
-            yield f"{line} all within {_short_time(clock.duration)}"
+            cells = (_cut(clock.problem), "", "", "")
+        elif topic.n_rows <= _MOST_OF_BURST and clock.duration < _BURST:
+            cells = (f"all within {_short_time(clock.duration)}", "", "", "")
         else:
             # The longest says whether a rate can bridge them; the number alone does not.
-            gaps = max((gap.length for gap in clock.gaps), default=0.0)
-            longest = f" {_short_time(gaps) if gaps else '':>8}" if wide else ""
-            jitter = _percent(clock.jitter)
-            yield f"{line} {clock.rate:>8.4g} {jitter:>7} {len(clock.gaps):>5}{longest}"
-
-
-def _is_burst(clock: TimeInfo, rows: int) -> bool:
-    """Whether a few messages were written at once, as those of a mission: they have no rate."""
-    return rows <= _MOST_OF_BURST and clock.duration < _BURST
+            longest = max((gap.length for gap in clock.gaps), default=0.0)
+            gaps = (str(len(clock.gaps)), _short_time(longest) if longest else "")
+            cells = (f"{clock.rate:.4g}", _percent(clock.jitter), *gaps)
+        rows.append((_squeezed(topic.name), str(len(topic.columns)), str(topic.n_rows), *cells))
+    print_table(("topic", "channels", "rows", "rate Hz", "jitter", "gaps", "longest"), rows)
 
 
 def _short_time(seconds: float) -> str:
@@ -266,49 +234,29 @@ def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInf
     return [c for c in columns if fnmatch.fnmatchcase(c.name, literal)]
 
 
-def _channel_lines(
-    shown: list[ColumnInfo], columns: Sequence[ColumnInfo], pattern: str | None, width: int
-) -> Iterator[str]:
-    yield ""
+def _print_channels(columns: Sequence[ColumnInfo], pattern: str | None) -> None:
+    shown = _asked(columns, pattern)
     if not shown:
-        which = (
-            f"none is named {pattern!r}" if pattern else "--channels 'att*' lists those of a name"
-        )
-        yield f"{len(columns)} channels; {which}"
+        of = f"none is named {pattern!r}" if pattern else "--channels 'att*' lists those of a name"
+        tell(f"{len(columns)} channels; {of}")
         return
-    # The column of units is as wide as it has to be, and away where the log states none: the names
-    # need the room.
-    units = max((len(_cut(c.unit, 8)) for c in shown), default=0)
-    units = max(units, 4) if units else 0
-    words = ["min", "max", "mean"]
-    left = width - 6 - (units + 1 if units else 0)
-    if left - len(words) * (_NUMBER + 1) < _ROOM:
-        words.pop()
-    name = left - len(words) * (_NUMBER + 1)
-    name = min(name, max(7, *(len(plain_text(c.name)) for c in shown)))
-    unit = f" {'unit':{units}}" if units else ""
-    heads = "".join(f" {word:>{_NUMBER}}" for word in words)
-    yield f"{'channel':{name}}{unit}{heads} {'NaN %':>5}"
-    for channel in shown:
-        unit = f" {_cut(channel.unit, 8):{units}}" if units else ""
-        if channel.kind == "text":
-            content = channel.strays or f"text in {channel.count} rows"
-            yield f"{_squeezed(channel.name, name):{name}}{unit} {content}"
-            continue
-        numbers = (channel.min, channel.max, channel.mean)[: len(words)]
-        cells = "".join(f" {_number(v):>{_NUMBER}}" for v in numbers)
-        yield f"{_squeezed(channel.name, name):{name}}{unit}{cells} {_share(channel):>5}"
+    rows = []
+    for c in shown:
+        cells = (*map(terse, (c.min, c.max, c.mean)), _share(c))
+        if c.kind == "text":
+            cells = (_cut(c.strays or f"text in {c.count} rows"), "", "", "")
+        rows.append((_squeezed(c.name), c.unit[:8], *cells))
+    print_table(("channel", "unit", "min", "max", "mean", "NaN %"), rows)
 
 
 def _setting_lines(flight: LogInfo) -> Iterator[str]:
     if not flight.parameters:
         return
-    yield ""
     names = list(flight.filters)
     count = len(flight.parameters)
-    yield f"{count} settings of the firmware (--json has all), {len(names)} of filters"
+    yield f"\n{count} settings of the firmware (--json has all), {len(names)} of filters"
     for name in names[:_MOST_FILTERS]:
-        yield f"  {name} = {flight.filters[name]}"
+        yield f"  {name} = {_cut(str(flight.filters[name]))}"
     if len(names) > _MOST_FILTERS:
         yield f"  and {len(names) - _MOST_FILTERS} more"
 
@@ -326,33 +274,17 @@ def _share(channel: ColumnInfo) -> str:
     return "<.01" if share < 0.01 else f"{share:.2g}" if share < 99.5 else f"{share:.3g}"
 
 
-def _number(value: float) -> str:
-    return terse(value)
-
-
 def _percent(share: float) -> str:
     if math.isnan(share):
         return "-"
     return "0 %" if share < 1e-7 else f"{100 * share:.2g} %"  # below is the rounding of float64
 
 
-def _cut(text: str, width: int) -> str:
-    text = plain_text(text)
-    return text if len(text) <= width else f"{text[: width - 3]}..."
+def _cut(text: str) -> str:
+    return text if len(text) <= _WIDEST else f"{text[: _WIDEST - 3]}..."
 
 
-def _squeezed(text: str, width: int) -> str:
+def _squeezed(text: str) -> str:
     """A name that is cut in its middle: the ends tell the topic and the field."""
-    text = plain_text(text)
-    half = (width - 3) // 2
-    return text if len(text) <= width else f"{text[:half]}...{text[half + 3 - width :]}"
-
-
-def _lines(text: str, width: int) -> list[str]:
-    """Lines no wider than the screen: a setting without its end, a sentence going on below."""
-    text = plain_text(text).rstrip()
-    if len(text) <= width:
-        return [text]
-    if re.match(r"  \S+ = ", text):
-        return [_cut(text, width)]
-    return textwrap.wrap(text, width, subsequent_indent="  ", break_on_hyphens=False)
+    half = (_WIDEST - 3) // 2
+    return text if len(text) <= _WIDEST else f"{text[:half]}...{text[half + 3 - _WIDEST :]}"

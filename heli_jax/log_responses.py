@@ -15,14 +15,14 @@ from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.logs import read_flights
+from heli_jax.config.logs import read_flights, with_log
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.numbers import plain_words
 from heli_jax.stages import Note
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 _HOLDS = {
@@ -42,13 +42,11 @@ def responses_of_log(
     Args:
         experiment: the configuration; its section `frequency` says band, window and transfer
             functions, its model only how signals are called.
-        log: in place of the configuration's, read as its first flight's is.
-        progress: called with what the log's reader assumed, in words.
 
     Raises:
         InputError: the log or something of the configuration is wrong, or no response is to be had.
     """
-    experiment = _of_log(experiment, log)
+    experiment = experiment if log is None else with_log(experiment, log)
     config = experiment.config.frequency or FrequencyConfig()
     requests = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
     points = config.points or Settings().points
@@ -97,12 +95,7 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """What inputs were taken to do between samples where a log decided it, and what hangs on it.
-
-    Args:
-        flights: of one rate.
-        inputs: by name.
-    """
+    """What inputs were taken to do between samples where a log decided it, and what hangs on it."""
     mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:
@@ -134,7 +127,6 @@ def _straight_lines(guessed: Mapping[str, str], half: float) -> list[Finding]:
     """In one sentence that inputs were taken to move in straight lines, which is a guess.
 
     Args:
-        guessed: by input the reason.
         half: of the longest step between samples [ms].
     """
     if not guessed:
@@ -173,17 +165,6 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     )
 
 
-def _of_log(experiment: Experiment, log: str | None) -> Experiment:
-    """The configuration with a log in place of its own."""
-    if log is None:
-        return experiment
-    if not experiment.config.flights:
-        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
-    whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
-    first = experiment.config.flights[0].model_copy(update=whole)
-    return experiment._replace(config=experiment.config.model_copy(update={"flights": [first]}))
-
-
 def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
     for name in dict.fromkeys(n for f in flights for n in f.outputs):
         if not any(np.isfinite(f.outputs[name]).any() for f in flights if name in f.outputs):
@@ -198,12 +179,6 @@ def run_responses(
 ) -> list[str]:
     """Write the responses into a new directory, and print them; returns the statuses of the
     transfer functions, those of fits.
-
-    Args:
-        experiment: the configuration.
-        out: the directory.
-        log: in place of the configuration's.
-        say: called with notes, and where the page is.
     """
     from heli_jax.report.responses import transfer_status, write_responses
     from heli_jax.report.tables import handling_lines, handling_sentences
@@ -223,7 +198,7 @@ def run_responses(
         title = Path(experiment.path).stem
         written = responses._replace(notes=(*responses.notes, *gaps))
         units, png = units_of(experiment), experiment.config.report.png
-        config = as_yaml(resolved(_of_log(experiment, log)))
+        config = as_yaml(resolved(experiment if log is None else with_log(experiment, log)))
         write_responses(temporary, written, units, title, handling, config=config, png=png)
     for found in responses.notes:
         say(Note(found.sentence))
@@ -237,11 +212,7 @@ def run_responses(
 
 
 def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
-    """That no response is coherent with its input, where none is.
-
-    Args:
-        responses: the responses.
-    """
+    """That no response is coherent with its input, where none is."""
     pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()

@@ -8,8 +8,10 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax.config import Experiment
+from heli_jax.config.logs import with_log
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
+from heli_jax.finding import note
 from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -19,7 +21,7 @@ from heli_jax.identification.validation.expected_accuracy import GUESSED, too_go
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""
@@ -36,9 +38,7 @@ def rank_log(
     Args:
         experiment: the configuration; windows that it states for its flights are left out of
             account, and what it holds out is not ranked.
-        log: in place of the configuration's, read as its first flight's is.
         length: of a window [s].
-        progress: called with what the log's reader assumed, in words.
 
     Raises:
         InputError: the log or something of the configuration is wrong, or no window may be used.
@@ -47,14 +47,14 @@ def rank_log(
     if not config.flights:
         raise InputError(f"{path}: flights: expected at least one log, got none")
     if log is not None:
-        whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
-        flights = [config.flights[0].model_copy(update=whole)]
+        flights = list(with_log(experiment, log).config.flights)
     else:
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
         # Two flights of one log are, without their windows, the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
     first = config.flights[0]
-    asked = flights if log is None else [first] if _same_file(path, first, log) else []
+    same = log is None or (path.parent / first.log).resolve() == Path(log).resolve()
+    asked = flights if log is None else [first] if same else []
     stated = [_stated_window(config.flights, f) for f in asked]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
@@ -79,11 +79,6 @@ def rank_log(
 
 
 _Window = tuple[float, float] | None
-
-
-def _same_file(path: Path, flight: FlightConfig, log: str) -> bool:
-    """Whether a log is the one that the configuration at `path` names for a flight."""
-    return (path.parent / flight.log).resolve() == Path(log).resolve()
 
 
 def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Window:
@@ -115,9 +110,10 @@ def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -
         flights[i] = dataclasses.replace(flight, sd={**sd, **flight.sd})
     held = tuple(f for f in problem.flights if f.hold_out)
     ranking = windows(dataclasses.replace(problem, flights=(*flights, *held)), length)
-    begun = (
+    begun = note(
+        "windows.noise-of-those-stated",
         "The noise is that of the windows which the configuration states, as check guesses it; "
-        "check begins each at rest, and these windows begin where the whole log has come to."
+        "check begins each at rest, and these windows begin where the whole log has come to.",
     )
     return dataclasses.replace(ranking, guessed=tuple(guessed), notes=(*ranking.notes, begun))
 
@@ -184,8 +180,8 @@ def _print_doubts(ranking: Ranking) -> None:
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
     if sentence := too_good(finite, bool(ranking.guessed)):
         tell(f"! {sentence}")
-    for note in ranking.notes:
-        tell(f"! {note}")
+    for found in ranking.notes:
+        tell(f"! {found.sentence}")
     if names := not_determined(ranking):
         whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
         tell(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")

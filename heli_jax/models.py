@@ -67,7 +67,6 @@ def by_name(
     Args:
         name: such as 'roll', 'helicopter-paper' or 'package.module:name'.
         where: what errors begin with, such as the file and the key.
-        folder: where a module of one's own may lie, as beside the configuration that names it.
         corrections: those of `helicopter`, for the whole helicopter only.
         wind: as that of `helicopter`, likewise.
 

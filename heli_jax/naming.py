@@ -101,7 +101,6 @@ def ravel(
     """A record as a vector, in the order of its class's fields.
 
     Args:
-        record: one scalar a field.
         dtype: of the vector; that of the fields unless given.
         only: the fields to take, in this order; all of them unless given.
     """
@@ -129,7 +128,6 @@ def extended(record: type, title: str, more: Mapping[str, tuple[Any, Any]]) -> t
 
     Args:
         record: the class to extend, not changed.
-        title: name of the new class.
         more: by name, (annotation, default); None for no default.
     """
     # A named tuple, whatever `record` is: it needs no base class, and JAX knows it. Fields without

@@ -242,10 +242,6 @@ ADEQUATE = {True: "yes", False: "no", None: "not judged"}
 
 
 def adequacy_of(content: Mapping[str, Any]) -> str:
-    """The verdict on adequacy in words; by yes and no alone of fits of earlier versions.
-
-    Args:
-        content: of fit.json.
-    """
+    """The verdict on adequacy in words; by yes and no alone of fits of earlier versions."""
     summary = (content.get("adequacy") or {}).get("summary")
     return str(summary or ADEQUATE[content["adequate"]])

@@ -1,28 +1,38 @@
 """What the commands print and write."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from heli_jax import compatibility
+from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
-from heli_jax.identification.identifiability.verdict import Combination, Verdict
+from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import WORST, percent, plain_cell, plain_words, rounded, terse, vaf_text
+from heli_jax.numbers import (
+    WORST,
+    measured,
+    percent,
+    plain,
+    plain_cell,
+    plain_words,
+    terse,
+    vaf_text,
+)
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
-from heli_jax.report.statements import whiteness_note
 from heli_jax.report.tables import handling_lines
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.summaries import of_estimates
+from heli_jax.terminal import print_table, tell
 from heli_jax.workflow import FitRun
 
 
@@ -30,16 +40,15 @@ def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     _print_outcome(fit)
-    shown = {**fit.estimates, **_shown_nuisances(fit.nuisance)}
     stopped = fit.status == "not-converged"
-    rows = [_row(name, e, stopped=stopped) for name, e in shown.items()]
-    head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
-    print_table((*head[:3], fit.interval, *head[4:]), rows)
+    head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
+    _tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), list(rows)))
     if note := report_tables.prior_note(problem, fit):
         tell(f"! {note}")
     # Where no optimum was reached nothing is determined.
     for c in () if stopped else fit.verdict.combinations:
-        tell(_determined(c))
+        value, low, high, sd = map(plain, measured(c.sd, c.value, c.lower95, c.upper95))
+        tell(f"determined: {c.name} = {value}, sd {sd}, 95 % interval {low} to {high}")
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
         _tell_table(table)
@@ -115,8 +124,7 @@ def _print_outcome(fit: Fit) -> None:
         text = "the optimiser stopped before an optimum, and these numbers are no result."
     converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
     tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
-    note = whiteness_note(fit)
-    for line in ([note] if note else []) + list(fit.notes):
+    for line in fit.notes:
         tell(f"! {line}")
 
 
@@ -136,37 +144,18 @@ def _print_handling(run: FitRun) -> None:
         tell(f"! {found.sentence}")
 
 
-def run_compatibility(
-    config: str, out: Path, overrides: list[str], say: Callable[[str], None]
-) -> bool:
-    """Compare a log's sensors and print what was found; whether they agree.
-
-    Args:
-        config: the configuration.
-        out: a new directory.
-        overrides: of `--set`.
-        say: for words as the work goes on.
-
-    Raises:
-        InputError: a log or something of the configuration is wrong.
-    """
-    # Here: of all commands only this one needs it.
-    from heli_jax import compatibility
-
-    result = compatibility.run_compatibility(config, out, overrides=overrides, progress=say)
+def print_compatibility(result: Compatibility) -> None:
+    """Whether a log's sensors agree, and their errors, on standard output."""
     tell(result.verdict)
     for found in result.doubts:
         tell(f"! {found.sentence}")
     head, rows = compatibility.table(result)
     print_table(head, [tuple(map(plain_cell, row)) for row in rows])
-    tell(
-        "R2 of what is reconstructed: "
-        + ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
-    )
+    r_squared = ", ".join(f"{n} {r:.4f}" for n, r in result.r_squared.items())
+    tell(f"R2 of what is reconstructed: {r_squared}")
     assert result.run.directory is not None
     tell(f"corrections: {result.run.directory / compatibility.FILE}")
     tell(f"report: {result.run.directory / 'report.html'}")
-    return result.compatible
 
 
 def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
@@ -182,32 +171,10 @@ def _tell_table(table: report_tables.Table) -> None:
     print_table(table.head, rows)
 
 
-def _determined(c: Combination) -> str:
-    """`determined: a/Ixx = 212.61, sd 0.36, 95 % interval 211.90 to 213.32`"""
-    value, sd = rounded(c.value, c.sd)
-    return f"determined: {c.name} = {value}, sd {sd}, 95 % interval {_range(c)}"
-
-
-def _range(estimate: Estimate | Combination) -> str:
-    """An interval to the digits that its sd leaves; ends far from the value to three."""
-    value, sd = estimate.value, estimate.sd
-    assert sd is not None
-    ends = (estimate.lower95, estimate.upper95)
-    shown = []
-    for end in ends:
-        assert end is not None
-        # Where an interval spans powers of ten its ends have digits of their own.
-        near = abs(end - value) < _NEAR * sd and abs(end) > abs(value) / _NEAR
-        shown.append(rounded(end, sd)[0] if near or end == 0 else terse(end, 3))
-    return f"{shown[0]} to {shown[1]}"
-
-
 _MOST_OFFSETS = 4
 """offsets of inputs that the terminal shows"""
 _GATES = 5
 """failed gates that the terminal names; the report has all"""
-_NEAR = 10.0
-"""standard deviations from the value, or share of it, up to which an end shares its digits"""
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
@@ -229,21 +196,6 @@ def _print_baseline(b: Baseline) -> None:
     tell(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
     for sentence in b.sentences:
         tell(f"  ! {sentence}")
-
-
-def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
-    """A row of the table of estimates; `stopped`: the optimiser did not arrive."""
-    if stopped:
-        at = plain_words(report_tables.where_it_stopped(e))
-        return (name, at, "", "", e.unit, percent(e.prior_share, 0))
-    # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
-    # as an estimate.
-    if e.sd is None or not math.isfinite(e.sd):
-        return (name, "not determined", "", "", e.unit, percent(e.prior_share, 0))
-    at_bound = " (at bound)" if e.at_bound else ""
-    value, sd = rounded(e.value, e.sd)
-    interval = "not trusted" if e.lower95 is None or e.upper95 is None else _range(e)
-    return (name, value + at_bound, sd, interval, e.unit, percent(e.prior_share, 0))
 
 
 def print_check(check: Check) -> None:

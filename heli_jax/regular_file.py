@@ -46,7 +46,6 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
     """The size [bytes] of a regular file, which is not opened.
 
     Args:
-        path: the file, or a link to it.
         what: what it should be, with its article: `a log in CSV`.
         at_most: the largest size that is read [bytes].
 
@@ -62,16 +61,8 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
 
 @contextlib.contextmanager
 def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO]:
-    """A regular file opened for reading.
-
-    Args:
-        path: the file, or a link to it.
-        what: what it should be, with its article.
-        at_most: the largest size that is read [bytes].
-
-    Raises:
-        InputError: as `require_regular`, or it cannot be opened or read.
-    """
+    """A regular file opened for reading; arguments and errors as of `require_regular`, and that it
+    cannot be opened or read."""
     # Before it is opened: to open some devices has an effect (a tape rewinds, a watchdog starts).
     require_regular(path, what, at_most)
     try:
@@ -84,16 +75,7 @@ def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO
 
 
 def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
-    """All of a regular file.
-
-    Args:
-        path: the file, or a link to it.
-        what: what it should be, with its article.
-        at_most: the largest size that is read [bytes].
-
-    Raises:
-        InputError: as `open_regular`.
-    """
+    """All of a regular file; arguments and errors as of `open_regular`."""
     # A file of /proc says that it is empty and gives without end: what is read is counted too.
     pieces, size = [], 0
     with open_regular(path, what, at_most) as file:

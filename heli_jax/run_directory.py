@@ -46,10 +46,6 @@ def free_directory(path: Path) -> Path:
 def require_free(path: Path, otherwise: str = "") -> None:
     """Refuse a directory that exists, before any work is done.
 
-    Args:
-        path: the directory.
-        otherwise: what else is possible, as the end of the sentence.
-
     Raises:
         InputError: it exists, or its parent cannot hold it.
     """
@@ -68,13 +64,35 @@ def require_free(path: Path, otherwise: str = "") -> None:
         ) from e
 
 
+def is_new(path: Path, resume: bool) -> bool:
+    """True if work in a directory that `--resume` goes on with begins with making it.
+
+    Raises:
+        InputError: it exists, and is not to be gone on with.
+    """
+    # An empty folder counts as none: a job on a cluster, killed before it began, is started and
+    # restarted by the same command.
+    if resume and path.exists():
+        return path.is_dir() and not any(path.iterdir())
+    require_free(path, ", or --resume")
+    return True
+
+
+def require_writable(path: Path) -> None:
+    """Refuse a directory in which no files can be made, before minutes of work.
+
+    Raises:
+        InputError: it is none, or may not be written to.
+    """
+    if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"--out {path}: expected a directory that can be written to")
+
+
 @contextlib.contextmanager
 def whole(path: Path, *, replaces: bool = False, or_beside: bool = False) -> Iterator[Path]:
     """A temporary directory beside `path`, renamed to it at the end, removed where that fails.
 
     Args:
-        path: the directory.
-        replaces: whether it stands for an earlier one of this process, which goes then.
         or_beside: whether it becomes `path-2` and so on where another process has made `path`
             meanwhile; `written` says which.
 

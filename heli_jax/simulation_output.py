@@ -1,12 +1,9 @@
-"""What `simulate` and `sweep` print and write: without the estimation, which they need not load."""
+"""What `simulate`, `sweep` and studies print and write: without the estimation, which they need not
+load."""
 
-import contextlib
 import json
-import math
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,12 +14,19 @@ from heli_jax import run_directory
 from heli_jax.finding import sentences
 from heli_jax.flights import write as tables
 from heli_jax.numbers import terse
-from heli_jax.terminal_table import print_table, tell
+from heli_jax.terminal import print_table, tell
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
-    from heli_jax.sweeps.run import Progress
+import math
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+from heli_jax.numbers import rounded
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
@@ -46,12 +50,6 @@ def write_view(
 ) -> None:
     """The page of what was simulated at `out`, which appears whole or not at all.
 
-    Args:
-        out: the HTML file to write.
-        experiment: the configuration, of which the page shows the vehicle.
-        simulated: the runs.
-        table: the file with its samples, where one was written; the page links to it.
-
     Raises:
         InputError: the place cannot be written to.
     """
@@ -66,77 +64,6 @@ def write_view(
     notes = sentences(simulated.notes)
     with run_directory.whole_file(out, f"--view {out}") as temporary:
         write(temporary, simulated.runs, simulated.model, params, title, notes, made)
-
-
-@contextlib.contextmanager
-def sweep_progress(
-    what: str = "sweep", of: str = "elements", *, quiet: bool = False
-) -> Iterator["Callable[[Progress], None]"]:
-    """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
-    line.
-
-    Args:
-        what: what goes on.
-        of: what it has many of.
-        quiet: show nothing.
-    """
-    if quiet:
-        yield lambda _: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    # A bar in a log file is a line of carriage returns.
-    if not sys.stderr.isatty():
-        yield _Lines(what, of)
-        return
-    columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"))
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("compiling", total=1.0)
-        yield lambda p: bar.update(
-            task,
-            completed=p.done / p.total,
-            # Beside the bar's name and the spaces between; rich would cut what is longer.
-            description=_fitting_words(p, of, console.width - len(what) - 3),
-        )
-
-
-class _Lines:
-    """A line at the first chunk, the last, and every ten seconds between."""
-
-    def __init__(self, what: str, of: str) -> None:
-        self.what, self.of, self.last = what, of, -math.inf
-
-    def __call__(self, p: "Progress") -> None:
-        now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
-        if p.done == p.total or now - self.last > 10.0:
-            self.last = now
-            words = f"heli-jax: {self.what}: {_progress_words(p, self.of)}"
-            print(words, file=sys.stderr, flush=True)
-
-
-def _progress_words(p: "Progress", of: str) -> str:
-    return ", ".join(_progress(p, of))
-
-
-def _progress(p: "Progress", of: str) -> list[str]:
-    words = [f"{p.done} of {p.total} {of}"]
-    # The first chunk compiles: a rate that contained it would foretell hours.
-    if not math.isnan(p.rate):
-        words.append(f"{terse(p.rate, 3)} a second")
-        if p.done != p.total:
-            left = max(0, round(p.remaining))
-            words.append(f"{left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left")
-    return words
-
-
-def _fitting_words(p: "Progress", of: str, room: int) -> str:
-    """What of it there is room for: the time left before the rate."""
-    words = _progress(p, of)
-    while len(words) > 1 and len(", ".join(words)) > room:
-        words.pop(1)
-    return ", ".join(words)
 
 
 def _counted(elements: int) -> str:
@@ -193,3 +120,107 @@ def print_sweep(out: Path) -> None:
     tell(f"store: {out / 'sweep.zarr'}")
     if (out / "report.html").is_file():
         tell(f"report: {out / 'report.html'}")
+
+
+DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
+_MOST_ROWS = 40
+_WIDEST = 24
+"""characters of an axis's value"""
+_MOST_FAILURES = 10
+_NAMED = 3
+"""runs that are named of many"""
+
+
+def study_exit_code(result: "xr.Dataset") -> int:
+    """The exit code of the worst fit."""
+    status, adequate, untrusted = (
+        set(map(str, result[n].to_numpy().ravel())) for n in ("status", "adequate", "untrusted")
+    )
+    if status - {"converged", "not-identifiable"} or "no" in adequate:
+        return NOT_CONVERGED
+    return NOT_DETERMINED if "not-identifiable" in status or untrusted - {""} else DONE
+
+
+def print_study(result: "xr.Dataset") -> None:
+    """The fits of a study as a table, and how their estimates scatter, on standard output.
+
+    Args:
+        result: of `run_study`.
+    """
+    axes, parameters = result.attrs["axes"], [str(p) for p in result["parameter"].to_numpy()]
+    # Where every fit failed there is neither a parameter nor an output, and nothing to lay flat.
+    empty = [d for d in ("parameter", "output") if not result.sizes[d]]
+    flat = result.drop_dims(empty).stack(fit=axes, create_index=False)
+    status = [str(s) for s in flat["status"].to_numpy()]
+    counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
+    fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
+    adequate = Counter(str(a) for a in flat["adequate"].to_numpy() if a)
+    judged = ", ".join(f"{count} {words}" for words, count in adequate.items())
+    tell(f"{fits}: {counts}" + (f"; adequate: {judged}" if judged else ""))
+    outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
+    rows = []
+    for i in range(min(len(status), _MOST_ROWS)):
+        one = flat.isel(fit=i)
+        at = [_axis(one[axis].item()) for axis in axes]
+        estimates = [_measured(one, p) for p in parameters]
+        agreement = [f"{v:.1f}" for v in one["nrmse_fit_percent"].to_numpy()] if outputs else []
+        rows.append((*at, status[i], *estimates, *agreement))
+    # One axis alone names no fit: rows of two would look alike in all tables but the first.
+    print_table((*axes, "status", *parameters, *outputs), rows, keys=len(axes))
+    if len(status) > _MOST_ROWS:
+        tell(f"... and {len(status) - _MOST_ROWS} more")
+    _print_scatter(flat, parameters)
+    for names, runs in _distrusted(flat).items():
+        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
+        tell(f"! Not trusted: {names} of {', '.join(runs[:_NAMED])}{more}")
+    pairs = zip(flat["run"].to_numpy(), flat["sentence"].to_numpy(), strict=True)
+    failures = [(str(run), str(words)) for run, words in pairs if words]
+    for run, sentence in failures[:_MOST_FAILURES]:
+        tell(f"! {run}: {sentence}")
+    if len(failures) > _MOST_FAILURES:
+        tell(
+            f"! ... and {len(failures) - _MOST_FAILURES} more that failed: `sentence` of study.zarr"
+        )
+
+
+def _axis(value: Any) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= _WIDEST else f"...{text[3 - _WIDEST :]}"
+
+
+# Any: a Dataset of one fit.
+def _measured(one: Any, parameter: str) -> str:
+    at = one.sel(parameter=parameter)
+    value, sd = at["estimate"].item(), at["sd"].item()
+    if math.isnan(sd):
+        return "not determined" if str(one["status"].item()) != "failed" else "–"
+    return " ± ".join(rounded(value, sd))
+
+
+def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
+    """What lies between the fits beside what each of them claims."""
+    rows = []
+    arrived = flat["status"].to_numpy() != "not-converged"
+    for i, parameter in enumerate(parameters):
+        one = flat.sel(parameter=parameter)
+        values, sds = (one[n].to_numpy() for n in ("estimate", "sd"))
+        there = np.isfinite(values) & np.isfinite(sds) & arrived
+        if np.count_nonzero(there) < 2:
+            continue
+        values, sds = values[there], sds[there]
+        numbers = (values.min(), np.median(values), values.max(), values.std(ddof=1))
+        cells = [terse(v, 5) for v in numbers[:3]]
+        cells += [terse(v, 2) for v in (numbers[3], float(np.median(sds)))]
+        rows.append((parameter, str(values.size), *cells, str(flat["unit"].to_numpy()[i])))
+    if rows:
+        head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")
+        print_table((*head, "median sd of a fit", "unit"), rows)
+
+
+def _distrusted(flat: "xr.Dataset") -> dict[str, list[str]]:
+    """By the parameters whose intervals are not trusted the fits."""
+    by_names: dict[str, list[str]] = {}
+    for run, names in zip(flat["run"].to_numpy(), flat["untrusted"].to_numpy(), strict=True):
+        if names:
+            by_names.setdefault(str(names), []).append(str(run))
+    return by_names

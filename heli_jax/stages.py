@@ -1,4 +1,4 @@
-"""What is being done, how far it is and how long it took, for whoever wants to show or keep it.
+"""The work that is under way, how far it is and how long it took, for whoever shows or keeps it.
 
 Nothing is kept or shown unless somebody asks: `recorded` keeps the times of a run, `observed_by`
 tells an observer, as the command line does.
@@ -16,7 +16,7 @@ _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Note(str):
-    """What a reader assumed or doubts, among the words of progress: who hides these shows it."""
+    """A doubt or an assumption of a reader among the words of progress: --quiet shows it too."""
 
     __slots__ = ()
 
@@ -27,22 +27,18 @@ class Stage:
 
     words: str
     total: int | None = None
-    """how many steps it has; None where that is not known beforehand"""
+    """steps that it has; None where that is not known beforehand"""
     done: int = 0
-    """how many of them are done"""
+    """steps that are done"""
     detail: str = ""
-    """what the last one said: a cost"""
+    """of the last step: a cost"""
     began: float = field(default_factory=time.perf_counter)
     first: tuple[int, float] | None = None
-    """what was done, and when, as the first of them was: it may have been compiled before"""
-    limit: int | None = None
-    """how many steps may be done when the search under way ends at the latest"""
-    part: tuple[int, int] | None = None
-    """which of how many equal parts is under way, from 1: starts of an optimiser"""
+    """steps done, and when, as the first was reported, which may have been compiled before"""
 
 
 class Observer(Protocol):
-    """Hears of stages as they begin and end; what is done within them it reads off them."""
+    """Hears of stages as they begin and end; it reads off them what is done meanwhile."""
 
     def begin(self, stage: Stage) -> None:
         """A stage begins, maybe within another."""
@@ -66,11 +62,7 @@ _work: ContextVar[_Work | None] = ContextVar("heli_jax_work", default=None)
 
 @contextlib.contextmanager
 def observed_by(observer: Observer) -> Iterator[None]:
-    """Tell an observer of the stages meanwhile.
-
-    Args:
-        observer: who hears of them.
-    """
+    """Tell an observer of the stages meanwhile."""
     token = _work.set(_Work(observer))
     try:
         yield
@@ -83,8 +75,8 @@ def recorded() -> Iterator[dict[str, float]]:
     """Keep how long the outermost stages take meanwhile.
 
     Yields:
-        Seconds by the words of a stage, and under 'compilation (of these)' what of them XLA took
-        to compile.
+        Seconds by the words of a stage, and under 'compilation (of these)' the part of them that
+        XLA took to compile.
     """
     # Here, since the command line's parser must not wait for JAX.
     from jax import monitoring
@@ -113,94 +105,53 @@ def stage(
     """A part of the work goes on meanwhile.
 
     Args:
-        words: what is done.
-        total: how many steps it has, where that is known.
         name: under which its time is kept; `words` unless given.
-        shown: whether an observer hears of it.
     """
     work = _work.get()
     if work is None:
         yield
         return
-    one = Stage(words, total)
-    work.stack.append(one)
+    under_way = Stage(words, total)
+    work.stack.append(under_way)
     observer = work.observer if shown else None
     if observer is not None:
-        observer.begin(one)
+        observer.begin(under_way)
     try:
         yield
     finally:
-        work.stack.remove(one)
+        work.stack.remove(under_way)
         if observer is not None:
-            observer.end(one)
+            observer.end(under_way)
         if work.seconds is not None and not work.stack:
-            kept = name or words
-            spent = time.perf_counter() - one.began
-            work.seconds[kept] = work.seconds.get(kept, 0.0) + spent
+            spent = time.perf_counter() - under_way.began
+            work.seconds[name or words] = work.seconds.get(name or words, 0.0) + spent
 
 
 def watched() -> bool:
-    """Whether anybody looks: what it costs to say how far a stage is can be saved otherwise."""
+    """True if anybody looks: to compute how far a stage is can be saved otherwise."""
     work = _work.get()
     return work is not None and work.observer is not None
 
 
+def _innermost() -> Stage | None:
+    work = _work.get()
+    return work.stack[-1] if work is not None and work.stack else None
+
+
 def note(detail: str) -> None:
-    """What the innermost stage is at, between two of its steps.
-
-    Args:
-        detail: in words.
-    """
-    work = _work.get()
-    if work is not None and work.stack:
-        work.stack[-1].detail = detail
-
-
-def at_most(steps: int) -> None:
-    """The innermost stage begins a search that ends after so many further steps at the latest.
-
-    Args:
-        steps: how many.
-    """
-    work = _work.get()
-    if work is not None and work.stack:
-        inner = work.stack[-1]
-        inner.limit = inner.done + steps
-
-
-def part(which: tuple[int, int] | None) -> None:
-    """The innermost stage begins one of several parts that take about as long as each other.
-
-    Args:
-        which: its number from 1, and how many there are; None after the last of them.
-    """
-    work = _work.get()
-    if work is not None and work.stack:
-        work.stack[-1].part = which
+    """Say in words where the innermost stage is between two of its steps."""
+    if (inner := _innermost()) is not None:
+        inner.detail = detail
 
 
 def advance(steps: int = 1, detail: str = "") -> None:
-    """The innermost stage has done more.
-
-    Args:
-        steps: how many.
-        detail: what the last one said.
-    """
-    work = _work.get()
-    if work is not None and work.stack:
-        reach(work.stack[-1].done + steps, detail)
+    """Count further steps of the innermost stage as done; `detail` is of the last one."""
+    if (inner := _innermost()) is not None:
+        reach(inner.done + steps, detail)
 
 
 def reach(done: int, detail: str = "") -> None:
-    """The innermost stage has done so many steps in all.
-
-    Args:
-        done: how many.
-        detail: what the last one said.
-    """
-    work = _work.get()
-    if work is not None and work.stack:
-        inner = work.stack[-1]
+    """Count so many steps in all of the innermost stage as done; `detail` is of the last one."""
+    if (inner := _innermost()) is not None:
         inner.done, inner.detail = done, detail
-        if inner.first is None:
-            inner.first = inner.done, time.perf_counter()
+        inner.first = inner.first or (done, time.perf_counter())

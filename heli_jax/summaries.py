@@ -7,6 +7,7 @@ none of them, and its arguments are `Any`.
 """
 
 import html
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -63,8 +64,9 @@ def of_flight(flight: Any) -> Summary:
             rows.append((role[:-1], name, *_range(values), hold))
     used = ", held out" if flight.hold_out else ""
     known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
+    name = f" {flight.name!r}" if flight.name else ""
     return Summary(
-        f"Flight{_quoted(flight.name)}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
+        f"Flight{name}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
         f"{flight.duration:.6g} s{used}",
         ("", "signal", "lowest", "highest", "hold"),
         tuple(rows),
@@ -91,20 +93,29 @@ def of_problem(problem: Any) -> Summary:
     )
 
 
-def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
-    """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate."""
+def of_estimates(
+    estimates: Mapping[str, Any], *, stopped: bool = False
+) -> tuple[Row, tuple[Row, ...]]:
+    """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate.
+
+    Args:
+        stopped: whether the optimiser did not converge, and no number is a result.
+    """
     # prior share: of the estimate's variance, what the priors and not the data explain.
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
-        if e.sd is None:
-            cells = ("not determined", "", "")
-        elif e.lower95 is None or e.upper95 is None:
-            cells = (*measured(e.sd, e.value), "not trusted")
-        else:
+        # A parameter that is not identifiable keeps its value in fit.json; a number here would be
+        # read as an estimate.
+        cells = ("not determined", "", "")
+        if stopped and math.isfinite(e.value):
+            cells = (f"{number(e.value, 3)} (no result)", "", "")
+        elif not stopped and e.sd is not None and math.isfinite(e.sd):
             # To the digits that the sd leaves, all four alike.
             value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
-            cells = (value, sd, f"{low} to {high}")
+            untrusted = e.lower95 is None or e.upper95 is None
+            interval = "not trusted" if untrusted else f"{low} to {high}"
+            cells = (f"{value}{' (at bound)' * e.at_bound}", sd, interval)
         rows.append((name, *cells, e.unit, percent(e.prior_share, 0)))
     return head, tuple(rows)
 
@@ -209,7 +220,3 @@ def _range(values: np.ndarray) -> tuple[str, str]:
     if not finite.size:
         return NOTHING, NOTHING
     return number(float(finite.min())), number(float(finite.max()))
-
-
-def _quoted(name: str) -> str:
-    return f" {name!r}" if name else ""

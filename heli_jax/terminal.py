@@ -1,18 +1,108 @@
-"""What a command says on standard error while it works."""
+"""What commands print: sentences and tables, and on standard error how far long work is.
+
+No number is ever cut off or in two, and no name of a log, a file or a configuration reaches the
+terminal with what it would obey.
+"""
 
 import contextlib
+import io
+import shutil
 import sys
-from collections.abc import Iterator
+import textwrap
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, TextIO
 
-from heli_jax import stage_display
+from heli_jax import stages
 from heli_jax.errors import shortened
-from heli_jax.stages import Note
-from heli_jax.terminal_table import tell
+from heli_jax.numbers import terminal_sentence
+from heli_jax.stages import Note, Stage
+
+type _Row = tuple[str, ...]
+_BETWEEN = 3
+"""columns from one column's end to the next one's beginning"""
+_AFTER = 2.0
+"""s: a stage that is done sooner shows nothing"""
+_EVERY = 30.0
+"""s between two lines where standard error is no terminal"""
+_COUNTED = 100_000
+"""steps beyond which a share is shown: bytes of a file"""
+
+
+def plain_text(text: str) -> str:
+    """Words without what a terminal would obey: escape sequences, marks that turn the direction of
+    writing, halves of characters."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else " " if c.isspace() else "?" for c in text)
+
+
+def tell(text: str, file: TextIO | None = None) -> None:
+    """Print sentences on `file`, standard output unless given; on a terminal with new lines between
+    words. A new line in them stays one."""
+    text = plain_text(terminal_sentence(text))
+    stream = sys.stdout if file is None else file
+    if stream.isatty():
+        width = shutil.get_terminal_size().columns
+        text = "\n".join(_folded(line, width) for line in text.split("\n"))
+    print(text, file=stream, flush=stream is sys.stderr)
+
+
+def _folded(line: str, width: int) -> str:
+    # A terminal would begin a new line within a number. What is one word, such as a path, it may.
+    indent = " " * (len(line) - len(line.lstrip()) + 2)
+    return textwrap.fill(
+        line,
+        max(width, 20),
+        subsequent_indent=indent,
+        replace_whitespace=False,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
+    """Print a table on standard output, its columns as wide as they need; as a list where that is
+    wider than the terminal. A pipe has lines of any length.
+
+    Args:
+        head: names of the columns.
+        rows: as many cells each.
+        keys: columns that name a row together, the first ones.
+    """
+    # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
+    from rich.box import SIMPLE_HEAD
+    from rich.cells import cell_len
+    from rich.console import Console
+    from rich.table import Table
+
+    head, rows = tuple(map(plain_text, head)), [tuple(map(plain_text, row)) for row in rows]
+    width = sum(max(map(cell_len, column)) + _BETWEEN for column in zip(head, *rows, strict=True))
+    if sys.stdout.isatty() and width > shutil.get_terminal_size().columns:
+        for row in rows:
+            print(f"\n{', '.join(row[:keys])}")
+            for name, cell in zip(head[keys:], row[keys:], strict=True):
+                if cell:
+                    print(f"  {name}: {cell}" if name else f"  {cell}")
+        print()
+        return
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for i, name in enumerate(head):
+        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    # '[deg]' in a unit or a signal's name is markup to rich and would vanish, ':m:' an emoji.
+    # Printed here: rich ends the program where nobody reads any more.
+    text = io.StringIO()
+    plain = {"highlight": False, "markup": False, "emoji": False}
+    terminal = sys.stdout.isatty()
+    Console(file=text, force_terminal=terminal, width=width + _BETWEEN, **plain).print(table)
+    print(text.getvalue(), end="")
 
 
 def say(text: str) -> None:
-    """Print a line."""
-    # On standard error: standard output is for results, which may be piped on.
+    """Print a line on standard error: standard output is for results, which may be piped on."""
     tell(f"heli-jax: {shortened(text)}", sys.stderr)
 
 
@@ -24,13 +114,98 @@ def say_notes(text: str) -> None:
 
 @contextlib.contextmanager
 def progress_shown(quiet: bool) -> Iterator[None]:
-    """Show how far long work is, such as the reading of a log.
-
-    Args:
-        quiet: show nothing.
-    """
+    """Show the stages of work that last, unless `quiet`."""
     if quiet:
         yield
         return
-    with stage_display.on_terminal(say):
-        yield
+    display = _Display()
+    try:
+        with stages.observed_by(display):
+            yield
+    finally:
+        display.hide()
+
+
+class _Display:
+    """An `Observer`: a line that changes on a terminal, else a line now and then."""
+
+    def __init__(self) -> None:
+        self.stack: list[Stage] = []
+        self.over = threading.Event()
+        self.lock = threading.Lock()
+        # Any: of rich, which is imported only when there is something to show.
+        self.live: Any = None
+
+    def begin(self, stage: Stage) -> None:
+        self.stack.append(stage)
+        if len(self.stack) == 1:
+            self.over = threading.Event()
+            threading.Thread(target=self._watch, args=(self.over,), daemon=True).start()
+
+    def end(self, stage: Stage) -> None:
+        self.stack.remove(stage)
+        # The line goes with the last of them: what is printed next may be a result.
+        if not self.stack:
+            self.hide()
+
+    def hide(self) -> None:
+        """Show nothing more."""
+        self.over.set()
+        with self.lock:
+            if self.live is not None:
+                self.live.stop()
+            self.live = None
+
+    def _watch(self, over: threading.Event) -> None:
+        if over.wait(_AFTER):
+            return
+        if sys.stderr.isatty():
+            self._show(over)
+            return
+        while not over.wait(_EVERY):
+            say(self._text())
+
+    def _show(self, over: threading.Event) -> None:
+        from rich.console import Console
+        from rich.live import Live
+        from rich.text import Text
+
+        def line() -> Text:
+            return Text(self._text(), no_wrap=True, overflow="ellipsis")
+
+        with self.lock:
+            if not over.is_set():
+                # What else is printed meanwhile comes above the line.
+                console = Console(stderr=True)
+                live = Live(console=console, get_renderable=line, transient=True)
+                live.start()
+                self.live = live
+
+    def _text(self) -> str:
+        stack = self.stack[-1:]  # of another thread, which may end the last of them now
+        return (
+            plain_text(terminal_sentence(in_words(stack[0], time.perf_counter()))) if stack else ""
+        )
+
+
+def in_words(stage: Stage, now: float) -> str:
+    """A stage as it stands: `fitting Ixx: step 12, cost 1.2e+03, 14 s`; `now` [s] is of the clock
+    `time.perf_counter`."""
+    done, total, spent = stage.done, stage.total, now - stage.began
+    parts = []
+    if stage.first is not None:
+        share = total is not None and total > _COUNTED
+        of = f"{done} of {total}" if total else f"step {done}"
+        parts = [f"{100 * done / total:.0f} %" if total and share else of]
+    parts += [*([stage.detail] if stage.detail else []), _time(spent)]
+    # The first step compiles: a rate that contained it would foretell hours.
+    if stage.first is not None and total and stage.first[0] < done < total:
+        rate = (done - stage.first[0]) / (now - stage.first[1])
+        parts.append(f"{_time((total - done) / rate)} left")
+    return f"{stage.words}: {', '.join(parts)}"
+
+
+def _time(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds // 3600:.0f}:{seconds // 60 % 60:02.0f}:{seconds % 60:02.0f}"

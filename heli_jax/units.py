@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from heli_jax.errors import nearest
-from heli_jax.unit_spelling import as_known
 
 # A registry of its own rather than pint's default: that calls the radian dimensionless (so that a
 # metre of stick would pass for a radian of blade), reads 'a' as a year, and has a thousand
@@ -81,12 +80,43 @@ _EXAMPLES = (
 """what is said to be known; docs/units.md has all"""
 
 
+# Units as files spell them: `degrees_per_second`, `deg s-1`, `m/s²`, `Grad/s`, `deg_s`.
+_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_RAISED = re.compile(r"([A-Za-z°%])([⁻]?[¹²³⁴⁵⁶⁷⁸⁹])")
+_PER = re.compile(r"(?<=[A-Za-z°%])(?:_| )+per(?:_| )+|(?<=[a-z])p(?=s$|s\^?2$)")
+# As UDUNITS has it (Unidata): an exponent right behind the name, products by a point.
+_EXPONENT = re.compile(r"(?<=[A-Za-zµ°])(-?[1-9])(?![0-9.])")
+_POINT = re.compile(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])")
+# In a name there is no stroke: deg_s. Of these no product with a second is logged.
+_UNDERLINED = re.compile(
+    r"(deg|degree|degrees|rad|radian|radians|mrad|cdeg|m|meter|meters|metre|metres|cm|mm|ft|km)"
+    r"_(s|sec|secs|second|seconds|h|min)(\^?2)?"
+)
+_WORDS = {
+    "dps": "deg/s", "radps": "rad/s", "mps": "m/s", "metre": "m", "metres": "m",
+    "Grad": "deg", "grad": "deg", "percentage": "percent", "pct": "percent", "secs": "s",
+    **dict.fromkeys(("U/min", "Upm", "tr/min"), "rpm"),
+}  # fmt: skip
+_WORD = re.compile(r"[A-Za-zµ°%_]+")
+
+
+def _as_known(text: str) -> str:
+    """A unit as pint reads it: names with `^` exponents, products and quotients."""
+    text = _RAISED.sub(lambda m: f"{m[1]}^{m[2].translate(_SUPERSCRIPTS)}", text.strip())
+    if text in _WORDS:
+        return _WORDS[text]
+    if match := _UNDERLINED.fullmatch(text):
+        text = f"{match[1]}/{match[2]}{'^2' if match[3] else ''}"
+    text = _EXPONENT.sub(r"^\1", _POINT.sub(" ", _PER.sub("/", text)))
+    return _WORD.sub(lambda m: _WORDS.get(m[0], m[0]), text)
+
+
 # Any, as pint's quantities have no type that can be imported without pint.
 @functools.cache
 def _parse(unit: str) -> Any:
     registry = _registry()
     # The Greek letter looks like the micro sign.
-    text = as_known(unit.strip().replace("·", "*").replace("μ", "µ"))
+    text = _as_known(unit.strip().replace("·", "*").replace("μ", "µ"))
     if text in ("", "1", "-", "dimensionless"):
         return registry.Quantity(1.0)
     try:
@@ -147,29 +177,7 @@ def _unknown(unit: str, text: str) -> str:
     return f"unknown unit {(wrong if place else unit[:60])!r}{place}{near}"
 
 
-# The units of nearly every file, which need not wait for pint: it takes a third of a second to load
-# and to read its definitions.
-_COMMON = {
-    *("1", "m", "m^2", "m/s", "m/s^2", "s", "rad", "rad/s", "rad/s^2", "1/s", "1/s^2", "1/rad"),
-    *("s/rad", "kg", "kg m^2", "kg/m^3", "N m", "N m/rad"),
-}
-"""in which a unit is what it is wanted in"""
-_COMMON_IN_SI = {
-    ("%", "1"): 0.01,
-    ("mm", "m"): 0.001,
-    ("um", "m"): 1e-6,
-    ("mrad", "rad"): 0.001,
-    ("ms", "s"): 0.001,
-    ("us", "s"): 1e-6,
-    ("deg", "rad"): 0.017453292519943295,
-    ("deg/s", "rad/s"): 0.017453292519943295,
-    ("rpm", "rad/s"): 0.10471975511965977,
-    ("Hz", "rad/s"): 6.283185307179586,
-}
-"""by unit and the SI unit it is wanted in"""
-_COMMON_SI = dict(_COMMON_IN_SI.keys())
-
-
+@functools.cache
 def factor(unit: str, si: str) -> float:
     """The number that turns a value in `unit` into the SI unit `si`.
 
@@ -178,16 +186,12 @@ def factor(unit: str, si: str) -> float:
     Raises:
         ValueError: the unit is unknown, or of another kind than `si`.
     """
-    if unit == si and unit in _COMMON:
-        return 1.0
-    if (unit, si) in _COMMON_IN_SI:
-        return _COMMON_IN_SI[unit, si]
     have, want = _parse(unit), _parse(si)
     if have.dimensionality == want.dimensionality:
         return float((have / want).to_base_units().magnitude)
     # Only where the file leaves the angle out: '1/s' may stand for rad/s. The other way round, Hz
     # or rad/s for 1/s, is refused, since a factor of 2 pi would go unseen.
-    if _angle_free(have) and _without_angle(have) == _without_angle(want):
+    if "[angle]" not in dict(have.dimensionality) and _without_angle(have) == _without_angle(want):
         base = have.to_base_units()
         # Nobody logs radians a minute: 1/min is how many write turns, 2 pi times as many.
         if dict(have.dimensionality) == {"[time]": -1.0} and float(base.magnitude) != 1.0:
@@ -200,45 +204,25 @@ def factor(unit: str, si: str) -> float:
     raise ValueError(f"unit {unit!r} is {_kind(have)}, expected {_kind(want)} such as {si!r}")
 
 
+def fits(unit: str, si: str) -> bool:
+    """Whether `factor` turns one into the other."""
+    try:
+        factor(unit, si)
+    except ValueError:
+        return False
+    return True
+
+
 def turn(si: str) -> float | None:
     """A full turn in an SI unit; None where that is no angle."""
-    if si in _COMMON:
-        return math.tau if si == "rad" else None
-    try:
-        return factor("turn", si)
-    except ValueError:
-        return None
+    return factor("turn", si) if fits("turn", si) else None
 
 
-_SI = [
-    "1",
-    "rad",
-    "rad/s",
-    "rad/s^2",
-    "m",
-    "m/s",
-    "m/s^2",
-    "s",
-    "kg",
-    "kg*m^2",
-    "N",
-    "N*m",
-    "1/s",
-    "1/s^2",
-    "W",
-    "Pa",
-    "1/rad",
-    "kg/m^3",
-    "A",
-    "V",
-    "ohm",
-    "H",
-    "F",
-    "J",
-    "N*m/A",
-    "N*m*s/rad",
+_SI = (
+    *("1", "rad", "rad/s", "rad/s^2", "m", "m/s", "m/s^2", "s", "kg", "kg*m^2", "N", "N*m", "1/s"),
+    *("1/s^2", "W", "Pa", "1/rad", "kg/m^3", "A", "V", "ohm", "H", "F", "J", "N*m/A", "N*m*s/rad"),
     "K",
-]
+)
 
 
 def si_of(unit: str) -> str:
@@ -255,23 +239,6 @@ def si_of(unit: str) -> str:
     raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
 
 
-# Of the rates, angles and speeds of nearly every model: `check` and `fit` ask them of each output,
-# and load pint for nothing else.
-_COMMON_KINDS = {
-    "1": {},
-    "m": {"m": 1},
-    "m/s": {"m": 1, "s": -1},
-    "m/s^2": {"m": 1, "s": -2},
-    "s": {"s": 1},
-    "rad": {"rad": 1},
-    "rad/s": {"s": -1, "rad": 1},
-    "rad/s^2": {"s": -2, "rad": 1},
-    "deg": {"rad": 1},
-    "deg/s": {"s": -1, "rad": 1},
-    "1/s": {"s": -1},
-    "1/s^2": {"s": -2},
-}
-"""exponents of base units, as of `base_of`"""
 _BASE = {
     **{"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad", "[current]": "A"},
     "[temperature]": "K",
@@ -284,16 +251,12 @@ def base_of(unit: str) -> dict[str, int]:
     Raises:
         ValueError: the unit is unknown.
     """
-    if unit in _COMMON_KINDS:
-        return dict(_COMMON_KINDS[unit])
     kind = dict(_parse(unit).dimensionality)
     return {si: round(kind[name]) for name, si in _BASE.items() if kind.get(name)}
 
 
 def is_unit(unit: str) -> bool:
     """Whether a text is a unit of any kind."""
-    if unit in _COMMON_KINDS:
-        return True
     try:
         _parse(unit)
     except ValueError:
@@ -328,10 +291,6 @@ def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
 
 def is_plain(unit: str) -> bool:
     """Whether `unit` is a plain ratio: `1`, `%`, `stick`."""
-    if unit in _COMMON:
-        return unit == "1"
-    if (si := _COMMON_SI.get(unit)) is not None:
-        return si == "1"
     return not dict(_parse(unit).dimensionality)
 
 
@@ -342,10 +301,6 @@ def is_time(unit: str) -> bool:
 
 def _without_angle(quantity: Any) -> dict[str, float]:
     return {k: v for k, v in dict(quantity.dimensionality).items() if k != "[angle]"}
-
-
-def _angle_free(quantity: Any) -> bool:
-    return "[angle]" not in dict(quantity.dimensionality)
 
 
 _KINDS = {

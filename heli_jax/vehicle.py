@@ -6,7 +6,7 @@ damping negative).
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -36,6 +36,10 @@ def _field(default: float | None = None, *, kw_only: bool = False) -> Any:
     return eqx.field(converter=_scalar, default=default)
 
 
+def _absent() -> Any:
+    return _field(math.nan)
+
+
 class Helicopter(eqx.Module):
     """A single-rotor helicopter with a Bell-Hiller flybar; every field a scalar in SI.
 
@@ -48,72 +52,60 @@ class Helicopter(eqx.Module):
     # What the reduced roll model reads has no default; what only the whole helicopter reads is NaN
     # until it is given, and `needed_but_missing` says so.
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
-    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field(math.nan)
+    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _absent()
     R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field(kw_only=True)
     c: Annotated[Scalar, "m", "main rotor blade chord"] = _field(kw_only=True)
     a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field(kw_only=True)
     # What a machine without a flybar has not.
-    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _field(
-        math.nan
-    )
-    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _field(
-        math.nan
-    )
+    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _absent()
+    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _absent()
     L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(kw_only=True)
-    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
-    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _field(math.nan)
+    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _absent()
+    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _absent()
     Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field(kw_only=True)
     rho: Annotated[Scalar, "kg/m^3", "air density"] = _field(1.2)
     g: Annotated[Scalar, "m/s^2", "gravitational acceleration"] = _field(9.80665)
     # Eq. 10's B = 0.97: lift ends at 97 % of the blade.
     B: Annotated[Scalar, "1", "tip loss factor"] = _field(0.97)
-    m: Annotated[Scalar, "kg", "total mass"] = _field(math.nan)
-    Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _field(math.nan)
-    Izz: Annotated[Scalar, "kg m^2", "fuselage inertia about the yaw axis"] = _field(math.nan)
-    Ir: Annotated[Scalar, "kg m^2", "rotor inertia about its shaft"] = _field(math.nan)
-    Cd0: Annotated[Scalar, "1", "profile drag coefficient of the blade"] = _field(math.nan)
-    hr: Annotated[Scalar, "m", "rotor disk above the centre of gravity"] = _field(math.nan)
-    lr: Annotated[Scalar, "m", "rotor axis behind the centre of gravity"] = _field(math.nan)
-    R_T: Annotated[Scalar, "m", "length of a tail rotor blade"] = _field(math.nan)
-    c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _field(math.nan)
-    a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _field(math.nan)
-    L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _field(math.nan)
+    m: Annotated[Scalar, "kg", "total mass"] = _absent()
+    Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _absent()
+    Izz: Annotated[Scalar, "kg m^2", "fuselage inertia about the yaw axis"] = _absent()
+    Ir: Annotated[Scalar, "kg m^2", "rotor inertia about its shaft"] = _absent()
+    Cd0: Annotated[Scalar, "1", "profile drag coefficient of the blade"] = _absent()
+    hr: Annotated[Scalar, "m", "rotor disk above the centre of gravity"] = _absent()
+    lr: Annotated[Scalar, "m", "rotor axis behind the centre of gravity"] = _absent()
+    R_T: Annotated[Scalar, "m", "length of a tail rotor blade"] = _absent()
+    c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _absent()
+    a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _absent()
+    L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _absent()
     # rad/s^2 for a full stick, by eq. 10; the paper's nomenclature says another unit.
-    K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _field(math.nan)
-    K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _field(math.nan)
-    K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
-    K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
-    K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
+    K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _absent()
+    K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _absent()
+    K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _absent()
+    K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _absent()
+    K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _absent()
     # Beyond the paper from here on: zero leaves its equations as they are printed.
-    Sx: Annotated[Scalar, "m^2", "fuselage drag area along the body, beyond the paper"] = _field(
-        0.0
-    )
+    Sx: Annotated[Scalar, "m^2", "fuselage drag area from ahead, beyond the paper"] = _field(0.0)
     Sy: Annotated[Scalar, "m^2", "fuselage drag area across, beyond the paper"] = _field(0.0)
     Sz: Annotated[Scalar, "m^2", "fuselage drag area from above, beyond the paper"] = _field(0.0)
     Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
-    I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _field(math.nan)
-    k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _field(math.nan)
+    I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _absent()
+    k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _absent()
     # Blade-element theory has 1; measured machines tilt less.
     K_mu: Annotated[Scalar, "1", "speed stability over blade-element theory's"] = _field(1.0)
     h_T: Annotated[Scalar, "m", "tail rotor above the centre of gravity"] = _field(0.0)
-    K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _field(
-        math.nan
-    )
-    K_I: Annotated[Scalar, "1/rad", "governor: throttle rate per error of rotor speed"] = _field(
-        math.nan
-    )
+    K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _absent()
+    K_I: Annotated[Scalar, "1/rad", "governor: throttle rate per error of rotor speed"] = _absent()
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
     zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
     # Four times what blade-element theory gives for two blades over a turn: see
     # `aero.cyclic_moment`.
     cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
-    c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _field(math.nan)
-    a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _field(
-        math.nan
-    )
+    c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _absent()
+    a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _absent()
 
     # Imported where they are used: summaries import this module.
     def __repr__(self) -> str:
@@ -141,46 +133,39 @@ def of_helicopter(record: type) -> bool:
     return set(naming.names(Helicopter)) <= set(naming.names(record))
 
 
-def impossible(params: Mapping[str, float]) -> str | None:
-    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
-
-    `params` are numbers by name; a name that is missing is not checked.
-    """
+def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, ...]]]:
+    """What could be wrong with a helicopter's constants: whether it is, and the end of a sentence
+    with the numbers for it. From numbers or arrays (k,) by name; a name that is missing is not
+    checked, and a value that is not a number passes."""
     for name, value in params.items():
-        if _too_small(name, value):
-            bound = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
-            return f"{name} must be {bound}, got {value:g}"
+        if name in naming.names(Helicopter) and name not in _MAY_BE_NEGATIVE:
+            zero = name in _MAY_BE_ZERO
+            bound, low = ("zero or more", value < 0) if zero else ("more than zero", value <= 0)
+            yield low, f"{name} must be {bound}, got {{:g}}", (value,)
     # Exchanged ends would make the flybar's damping negative, and a fit would end in an If below 0.
-    r1, r2 = params.get("R1"), params.get("R2")
-    if r1 is not None and r2 is not None and r1 >= r2:
-        return (
-            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the "
+    if {"R1", "R2"} <= params.keys():
+        words = (
+            "R1 must be less than R2, got R1 = {:g} and R2 = {:g}: R1 is the inner and R2 the "
             "outer end of the flybar paddle (the paper's nomenclature exchanges them)"
         )
-    if (b := params.get("B")) is not None and b > 1:
-        return f"B must be a tip loss factor of at most 1, got {b:g}"
-    return None
+        yield params["R1"] >= params["R2"], words, (params["R1"], params["R2"])
+    if "B" in params:
+        yield params["B"] > 1, "B must be a tip loss factor of at most 1, got {:g}", (params["B"],)
+
+
+def impossible(params: Mapping[str, float]) -> str | None:
+    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can."""
+    return next((words.format(*of) for is_so, words, of in _reasons(params) if is_so), None)
 
 
 def possible(params: Mapping[str, Any]) -> np.ndarray:
-    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name, as `impossible`
-    checks one; a value that is not a number is not checked."""
-    # The same rules for a batch of a sweep: what cannot be is a status there, not an error.
+    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name."""
+    # For a batch of a sweep: what cannot be is a status there, not an error.
+    values = {n: np.asarray(v) for n, v in params.items()}
     fine = np.asarray(True)
-    for name, value in params.items():
-        fine = fine & ~_too_small(name, np.asarray(value))
-    if "R1" in params and "R2" in params:
-        fine = fine & ~(np.asarray(params["R1"]) >= np.asarray(params["R2"]))
-    if "B" in params:
-        fine = fine & ~(np.asarray(params["B"]) > 1)
+    for is_so, *_ in _reasons(values):
+        fine = fine & ~is_so
     return np.asarray(fine)
-
-
-def _too_small(name: str, value: float | int | np.ndarray) -> Any:
-    """Whether values [SI] of a constant are below what it can be."""
-    if name not in naming.names(Helicopter) or name in _MAY_BE_NEGATIVE:
-        return np.zeros(np.shape(value), bool)
-    return value < 0 if name in _MAY_BE_ZERO else value <= 0
 
 
 class Constant(NamedTuple):
@@ -215,8 +200,6 @@ def read_vehicle(
     """As `load_vehicle`, with each constant's unit and source beside the parameters.
 
     Args:
-        path: of the file.
-        params: the class to build.
         may_lack: constants that may be missing, and are NaN then.
     """
     return vehicle_from_mapping(read_mapping(path), str(path), params, may_lack)
@@ -231,9 +214,7 @@ def vehicle_from_mapping(
     """Build the parameters from a mapping of names to numbers or {value, unit, source}.
 
     Args:
-        content: constants by name.
         where: what errors name, such as the file.
-        params: the class to build, Helicopter or a model's own Params.
         may_lack: constants that may be missing, and are NaN then.
 
     Raises:
@@ -250,10 +231,9 @@ def vehicle_from_mapping(
     if missing:
         raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
     # Of a class of one's own nobody knows what is possible.
-    if of_helicopter(params):
-        wrong = impossible({n: c.value for n, c in constants.items()})
-        if wrong:
-            raise InputError(f"{where}: {wrong}")
+    values = {n: c.value for n, c in constants.items()}
+    if of_helicopter(params) and (wrong := impossible(values)):
+        raise InputError(f"{where}: {wrong}")
     # Defaults too: a class that devices extend has them as plain numbers.
     values = {n: _scalar(v) for n, v in naming.defaults(params).items()}
     values |= {n: _scalar(c.value) for n, c in constants.items()}
@@ -265,8 +245,6 @@ def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
     """A number of a file, or {value, unit, source}, in SI.
 
     Args:
-        entry: as YAML has it.
-        name: of the number.
         si: its SI unit; None where it has none, and the file's is taken as it is.
         where: what errors name, such as the file.
 

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import platform
+from collections.abc import Mapping
 
 _PACKAGES = (
     "heli_jax",
@@ -26,3 +27,11 @@ def versions() -> dict[str, str]:
     # Of the installed distributions: not every package has a __version__, and none is imported.
     packages = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {"python": platform.python_version(), **packages}
+
+
+def changed_since(old: Mapping[str, str]) -> str:
+    """Say which versions differ from those that work was begun with; empty where none does."""
+    changed = [f"{n} {old[n]} then, {v} now" for n, v in versions().items() if old.get(n, v) != v]
+    return f"begun with other versions ({', '.join(changed)}): last digits may differ" * bool(
+        changed
+    )

@@ -142,11 +142,7 @@ class NotWritten(InputError):
 
 
 def _written(run: FitRun, out: Path, progress: Say) -> FitRun:
-    """The run with its directory: that of a moment before, or a new one.
-
-    Raises:
-        NotWritten: the disk is full, for example.
-    """
+    """The run with its directory: that of a moment before, or a new one."""
     before = run.directory
     try:
         written = _write(run, before or out, replaces=before is not None)
@@ -180,7 +176,10 @@ def _fit_run(
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
     try:
-        _require_rates(problem)
+        # Refused as by `check`: its estimates would look like any others.
+        for finding in rates(problem):
+            if finding.severity == "refuse":
+                raise ValueError(finding.sentence)
         # Part of the report, which a script that asks for none need not wait for.
         with stage("whether the log is enough", name="findings"):
             guess = first_guess(problem) if with_findings else None
@@ -240,17 +239,6 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
         directory = _written(replace(run, fit=fitted), out, progress).directory
     progress(f"the fit is in {directory}; what else was asked for comes into it")
     return directory
-
-
-def _require_rates(problem: Problem) -> None:
-    """Refuse what `check` refuses: its estimates would look like any others.
-
-    Raises:
-        ValueError: a log is too slow for the model at its start values.
-    """
-    for finding in rates(problem):
-        if finding.severity == "refuse":
-            raise ValueError(finding.sentence)
 
 
 def _at_estimates(

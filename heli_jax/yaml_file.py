@@ -75,7 +75,7 @@ _KINDS: dict[type, str] = {str: "text", list: "a list", int: "a number", float: 
 
 def parse_mapping(text: str, where: str) -> dict[str, Any]:
     """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
-    value = _load(text, where)
+    value = parse_value(text, where)
     if not isinstance(value, dict):
         kind = "nothing" if value is None else _KINDS.get(type(value), "something else")
         # A log begins with a row of words, which is YAML for one text.
@@ -84,17 +84,13 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     return value
 
 
-def parse_value(text: str, where: str) -> Any:
-    """One value as it would stand behind a key: for `--set key=value`."""
-    return _load(text, where)
-
-
 def as_yaml(content: Mapping[str, Any]) -> str:
     """Plain data as YAML, in its own order."""
     return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
-def _load(text: str, where: str) -> Any:
+def parse_value(text: str, where: str) -> Any:
+    """One value as it would stand behind a key: for `--set key=value`."""
     loader = None
     try:
         # Before the parser: it recurses in C, and enough brackets overflow its stack, which no

@@ -1,5 +1,6 @@
 """Configurations of the whole helicopter: its variants, its corrections, and what is refused."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -77,22 +78,30 @@ def test_a_baseline_that_is_switched_off_stays_off(load):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "place"),
     [
-        ({"model": "helicoptr"}, ["model", "did you mean 'helicopter'"]),
-        ({"corrections": {"tial": True}}, ["corrections", "'tial'", "did you mean 'tail'"]),
-        ({"corrections": {"tail": 2}}, ["corrections.tail", "got 2", "boolean"]),
-        ({"model": "roll", "corrections": {"tail": True}}, ["corrections", "'roll' takes no"]),
-        ({"model": "roll", "corrections": {}}, ["corrections", "'roll' takes no", "helicopter"]),
-        ({"corection": {}}, ["corection", "did you mean 'corrections'"]),
+        ({"model": "helicoptr"}, "model"),
+        ({"model": 3}, "model"),
+        ({"corrections": {"tial": True}}, "corrections"),
+        ({"corrections": {"tail": 2}}, "corrections.tail"),
+        ({"model": "roll", "corrections": {"tail": True}}, "corrections"),
+        ({"model": "roll", "corrections": {}}, "corrections"),
+        ({"corection": {}}, "corection"),
+        ({"fit": {"free": {}, "instrument": []}}, "fit.instrument"),
+        ({"fit": {"free": {}, "nuisance": {"input_offset": "yes"}}}, "fit.nuisance.input_offset"),
+        ({"simulate": {"ground": 0.0}}, "simulate.ground"),
+        ({"simulate": {"start": {"clmb": 1}}}, "simulate.start.clmb"),
+        ({"simulate": {"start": 3}}, "simulate.start"),
+        ({"simulate": {"wind": [1, 2]}}, "simulate.wind[2]"),
+        ({"simulate": {"wind": [1, 2, float("nan")]}}, "simulate.wind[2]"),
+        ({"simulate": {"hold_attitude": "often"}}, "simulate.hold_attitude"),
     ],
 )
-def test_wrong_models_and_corrections(load, content, words):
-    with pytest.raises(InputError) as e:
+def test_what_is_wrong_is_refused_with_its_place(load, content, place):
+    if "simulate" in content:
+        content = {"simulate": {"duration": 2, "rate": 50, **content["simulate"]}}
+    with pytest.raises(InputError, match=rf"xcell\.yaml: {re.escape(place)}:"):
         load(**content)
-    assert "xcell.yaml" in str(e.value)
-    for word in words:
-        assert word in str(e.value)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
@@ -110,24 +119,6 @@ def test_shipped_configurations(path):
         assert low < free.start < high
         # A fit that begins at the truth could not fail.
         assert free.start != float(getattr(experiment.vehicle.params, name))
-
-
-@pytest.mark.parametrize(
-    ("simulate", "words"),
-    [
-        ({"ground": 0.0}, ["simulate.ground", "got 0", "less than 0"]),
-        ({"start": {"clmb": 1}}, ["simulate.start.clmb", "did you mean 'climb'"]),
-        ({"start": 3}, ["simulate.start", "got 3", "a section of keys", "keys simulate.start"]),
-        ({"wind": [1, 2]}, ["simulate.wind[2]", "missing"]),
-        ({"wind": [1, 2, float("nan")]}, ["simulate.wind[2]", "finite"]),
-        ({"hold_attitude": "often"}, ["simulate.hold_attitude", "'often'", "boolean"]),
-    ],
-)
-def test_wrong_runs(load, simulate, words):
-    with pytest.raises(InputError) as e:
-        load(simulate={"duration": 2, "rate": 50, **simulate})
-    for word in words:
-        assert word in str(e.value)
 
 
 @pytest.mark.parametrize(

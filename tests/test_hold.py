@@ -1,6 +1,5 @@
 """What the command line says of the time between samples: simulate, check, fit, a sweep."""
 
-import json
 from pathlib import Path
 
 import jax
@@ -33,38 +32,6 @@ def chirped(tmp_path_factory):
     path = folder / "bench.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False))
     return path
-
-
-@pytest.mark.slow
-def test_simulate_check_and_fit_say_what_was_taken_and_why(chirped, capsys, tmp_path):
-    assert main(["simulate", str(chirped), "--out", str(chirped.parent / "bench.csv")]) == 0
-    said = capsys.readouterr().err
-    assert "x_roll: held between samples here" in said
-    assert "hold: zero-order" in said
-    assert main(["check", str(chirped)]) == 0
-    out, err = capsys.readouterr()
-    assert "x_roll is taken as linear between samples, since it moves at " in err
-    assert "! Between samples x_roll is taken as linear (it moves at" in out
-    assert main(["check", str(chirped), "--set", f"{KEY}=zero-order"]) == 0
-    assert "x_roll is taken as zero-order (as stated)" in capsys.readouterr().out
-    held = ["--set", f"{KEY}=zero-order", "--out", str(tmp_path / "a")]
-    assert main(["fit", str(chirped), *held]) == 0
-    found = json.loads((tmp_path / "a" / "fit.json").read_text())
-    assert found["inputs"] == [{"x_roll": {"hold": "zero-order", "reason": "as stated"}}]
-    # The log was held: so its truth is within the intervals, as it is not with straight lines.
-    for name, truth in (("Ixx", 0.024), ("If", 1.7e-4)):
-        assert found["parameters"][name]["lower95"] < truth < found["parameters"][name]["upper95"]
-    # Nothing stated: the log looks like a stick sampled on its way, and the record says otherwise.
-    assert main(["fit", str(chirped), "--out", str(tmp_path / "b")]) == 0
-    found = json.loads((tmp_path / "b" / "fit.json").read_text())
-    assert found["inputs"][0]["x_roll"]["hold"] == "zero-order"
-    assert found["inputs"][0]["x_roll"]["reason"].startswith("explains the record better")
-    assert "timing.likelier-hold" in {f["code"] for f in found["findings"]}
-    for name, truth in (("Ixx", 0.024), ("If", 1.7e-4)):
-        assert found["parameters"][name]["lower95"] < truth < found["parameters"][name]["upper95"]
-    report = (tmp_path / "b" / "report.html").read_text()
-    assert "x_roll between samples" in report
-    assert "zero-order (explains the record" in report
 
 
 def test_no_such_hold(chirped, capsys):

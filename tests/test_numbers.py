@@ -58,47 +58,6 @@ def test_powers_stand_as_python_writes_them(value, page, terminal):
     assert numbers.terse(value) == terminal
 
 
-def test_each_number_on_the_terminal_has_a_power_of_its_own():
-    assert numbers.measured(1.234e-7, 1.7e-4) == ("1.7000·10⁻⁴", "0.0012·10⁻⁴")
-    assert numbers.rounded(1.7e-4, 1.234e-7) == ("1.7000e-04", "1.2e-07")
-
-
-def test_numbers_within_a_sentence_are_written_for_the_terminal():
-    sentence = "a delay of 9.72·10⁻⁵ (−7.7·10⁻⁵ to ∞) s ± 3 %, from x_roll – none"
-    words = "a delay of 9.72e-05 (-7.7e-05 to inf) s ± 3 %, from x_roll - none"
-    assert numbers.plain_words(sentence) == words
-    assert numbers.plain_words("coefficient of s^2 in 12.50") == "coefficient of s^2 in 12.50"
-
-
-def test_a_vaf_far_below_zero_is_a_bound():
-    assert numbers.vaf_percent(0.98761) == "98.76 %"
-    assert numbers.vaf_percent(-3571.4) == "below −1000 %"
-    assert numbers.vaf_percent(None) == numbers.NOTHING
-    assert numbers.vaf_text(-3571.4) == "below -1000 %"
-    assert numbers.vaf_text(-0.41) == "-41.0 %"
-    assert numbers.vaf_text(0.98761, 2) == "98.76 %"
-
-
-def test_what_is_worse_than_the_mean_explains_none():
-    assert numbers.explained_text(-3571.35) == "none"
-    assert numbers.explained_text(0.356) == "36 %"
-
-
-@pytest.mark.parametrize(
-    ("page", "terminal"),
-    [
-        ("0.4·10⁻⁴ to 7.5·10⁻⁴", "4e-05 to 7.5e-04"),
-        ("−1.5·10⁻⁴ ± 0.2·10⁻⁴", "-1.5e-04 ± 2e-05"),
-        ("0.4·10⁻⁴ to 75·10⁻⁴", "4e-05 to 0.0075"),
-        ("kg m²", "kg m^2"),
-        ("a-b 1.20", "a-b 1.20"),
-        ("−∞ to 3", "-inf to 3"),
-    ],
-)
-def test_cells_of_tables_on_the_terminal(page, terminal):
-    assert numbers.plain_cell(page) == terminal
-
-
 @pytest.mark.parametrize(
     ("python", "page", "terminal"),
     [

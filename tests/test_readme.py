@@ -53,15 +53,6 @@ def test_the_readme_is_one_screen():
         assert (ROOT / page).exists(), page
 
 
-@pytest.mark.slow
-def test_the_python_of_the_readme_runs(folder):
-    [program] = parts("README.md")
-    assert len(program.strip().splitlines()) <= 11
-    out = run(folder, program.replace("runs/notebook", "runs/readme"))
-    assert out.strip().splitlines()[-1].startswith("converged 0.02")
-    assert (folder / "runs/readme/fit/report.html").exists()
-
-
 def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
     program = parts("docs/python.md")[0]
     # What the README shows is a part of it, so that one run tells of both.

@@ -58,10 +58,9 @@ def run(config):
     return done
 
 
-def test_a_fit_from_python_is_that_of_the_command_line(config, run, tmp_path, capsys):
+def test_a_fit_from_python_is_that_of_the_command_line(config, run, tmp_path):
     out = tmp_path / "cli"
     assert main(["fit", str(config), "--out", str(out)]) == 0
-    assert "report:" in capsys.readouterr().out
     ours, theirs = (json.loads((d / "fit.json").read_text()) for d in (run.directory, out))
     assert ours.pop("timing_s").keys() == theirs.pop("timing_s").keys()
     assert ours == theirs
@@ -106,22 +105,14 @@ def test_overrides_are_a_mapping_or_the_command_lines_texts(config):
         heli_jax.load_config(config, {"flights.0.rate.x": 1, "flights.0.rate.x.y": 2})
 
 
-def test_nothing_is_written_over(config, run):
+def test_nothing_is_written_over(run):
     before = (run.directory / "fit.json").read_bytes()
-    with pytest.warns(UserWarning, match="exists"):
-        again = heli_jax.run_fit(config, run.directory)
-    with pytest.warns(UserWarning, match="exists"):
-        third = heli_jax.write_report(run, run.directory)
-    for written, number in ((again, 2), (third, 3)):
+    for number in (2, 3):
+        with pytest.warns(UserWarning, match="exists"):
+            written = heli_jax.write_report(run, run.directory)
         assert written.directory == run.directory.with_name(f"{run.directory.name}-{number}")
         assert (written.directory / "report.html").exists()
     assert (run.directory / "fit.json").read_bytes() == before
-
-
-def test_a_run_shows_its_fit(run):
-    assert repr(run).startswith("FitRun of ")
-    assert "report.html" in repr(run)
-    assert run._repr_html_() == run.fit._repr_html_()
 
 
 def test_a_figure_of_the_report_is_drawn(run):
@@ -137,13 +128,6 @@ def test_check_and_further_intervals(config, run):
     assert set(more.by_parameter["Ixx"]) == {"gaussian", "profile"}
 
 
-@pytest.mark.slow
-def test_models_are_compared(config, run):
-    choice = heli_jax.compare_models(run.config, run.problem)
-    assert len(choice.candidates) > 1
-    assert choice.sentences
-
-
 def test_a_sweep_in_memory_and_in_a_directory(config, tmp_path):
     in_memory = heli_jax.run_sweep(config)
     stored = heli_jax.run_sweep(config, tmp_path / "sweep", figures=False)
@@ -153,43 +137,27 @@ def test_a_sweep_in_memory_and_in_a_directory(config, tmp_path):
     assert not (tmp_path / "sweep" / "figures").exists()
 
 
-def test_no_sweep_is_said(config):
-    plain = heli_jax.load_config(config)
-    plain = plain._replace(config=plain.config.model_copy(update={"sweep": None}))
-    with pytest.raises(InputError, match="sweep: missing"):
-        heli_jax.run_sweep(plain)
-
-
-def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
+def test_a_unit_that_nobody_stated_is_told(config, run, tmp_path):
     folder = config.parent
     text = config.read_text().replace("{signal: stick, unit: m}", "{signal: stick}")
     text = text.replace("{signal: roll, unit: rad, sd", "{signal: roll, sd")
     path = folder / "no-units.yaml"
     path.write_text(text)
     assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 0
-    printed = capsys.readouterr().err
-    assert "bench.csv: x_roll: no unit stated, taken as m\n" in printed
-    assert "bench.csv: roll: no unit stated, taken as rad\n" in printed
     saved = heli_jax.load_fit(tmp_path / "fit")
     notes = [(n["code"], n["subjects"]) for n in saved.content["data"][0]["notes"]]
     assert notes == [("units.assumed", ["x_roll"]), ("units.assumed", ["roll"])]
-    page = (tmp_path / "fit/report.html").read_text()
-    assert "x_roll: no unit stated, taken as m" in page
-    with_units = heli_jax.run_fit(config)
-    assert with_units.problem.flights[0].source.notes == ()
-    assert with_units.fit.estimates == saved.estimates
+    assert run.problem.flights[0].source.notes == ()
+    assert run.fit.estimates == saved.estimates
 
 
-def test_what_check_refuses_is_not_fitted(config, tmp_path, capsys):
+def test_what_check_refuses_is_not_fitted(config, tmp_path):
     """Of a roll that swings at a third of a hertz nothing is left at half a hertz."""
     rows = (config.parent / "bench.csv").read_text().splitlines()
     (tmp_path / "bench.csv").write_text("\n".join([rows[0], *rows[1::100]]) + "\n")
     path = tmp_path / "slow.yaml"
     path.write_text(config.read_text().replace("unit: m}", "unit: m, hold: linear}"))
     assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "slow.yaml: fit: flight 1: x_roll was sampled at 0.5 Hz while it moved" in said
-    assert "so this log cannot be fitted with this model; log at" in said
     assert not (tmp_path / "fit").exists()
 
 

@@ -4,6 +4,9 @@ A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_P
 `console`, which runs the block of commands below it and shows what each prints; exit codes have to
 be 0, unless `$ echo $?` follows. Beside them stand the figures and the report of the demo, of which
 nothing is kept in the repository.
+
+Where HELI_JAX_SITE is `links` nothing is simulated, fitted or run: blocks stay as they are, and
+empty files stand for the demo's, so that tests can follow every link within seconds.
 """
 
 import contextlib
@@ -23,6 +26,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
+_LINKS_ALONE = os.environ.get("HELI_JAX_SITE") == "links"
 _MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n((?:.*\n)*?)```$)?", re.MULTILINE)
 _ENDS = re.compile(r"([|<>])")
 _PAGE = re.compile(r"docs/([\w-]+)\.md")
@@ -47,6 +51,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """The page with what it asks for."""
+    if _LINKS_ALONE:
+        markdown = markdown.replace("<!-- generated: console -->", "")
+        markdown = re.sub(r"^```python exec=.*$", "```python", markdown, flags=re.MULTILINE)
     if "<!-- generated: console -->" not in markdown:
         return _MARK.sub(lambda mark: _PARTS[mark[1]](), markdown)
     # A folder for each page, as `make demo` leaves it: its commands build on one another.
@@ -96,6 +103,13 @@ def _made() -> Path:
     from heli_jax.cli import main
 
     folder = Path(tempfile.mkdtemp(prefix="heli_jax-site-"))
+    if _LINKS_ALONE:
+        for page in (_ROOT / "docs").rglob("*.md"):
+            for name in re.findall(r"\]\((?:\.\./)?made/([^)#]+)", page.read_text("utf-8")):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).touch()
+        (folder / "fit.txt").write_text("converged\nacceptance card\n", encoding="utf-8")
+        return folder
     shutil.copytree(_ROOT / "configs", folder / "configs")
     # Commands name files as they are told, and a page must not show where it was built.
     with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -65,7 +65,7 @@ static Factors factors(const Vehicle *p) {
   };
 }
 
-/* The root v of 2 v s = T0 - b v with the flow s of inflow.py, by plain Newton steps from above. */
+/* The root v of 2 v s = T0 - b v with the flow s of aerodynamics.py, by plain Newton steps from above. */
 static inline double induced_velocity(double V2, double W, double T0, double b) {
   double sign = T0 < 0 ? -1.0 : 1.0, c = sign * W, t = sign * T0, q = 2 * c + b;
   double root = sqrt(q * q + 8 * t) + REST;

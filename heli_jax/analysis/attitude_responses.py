@@ -54,12 +54,7 @@ class Handling(NamedTuple):
 
 
 def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair, ...]:
-    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, among the outputs.
-
-    Args:
-        model: any.
-        outputs: those of the model's that were logged.
-    """
+    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, of the outputs."""
     pairs = []
     for axis in axes_of(model):
         stick = _stick(model, axis)
@@ -83,12 +78,7 @@ def _stick(model: Model, axis: Axis) -> str | None:
 
 
 def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
-    """Axes whose angle or rate was logged and that have no stick, a sentence each.
-
-    Args:
-        model: any.
-        outputs: those of the model's that were logged.
-    """
+    """Axes whose angle or rate was logged and that have no stick, a sentence each."""
     axes = axes_of(model)
     with_stick = {a.name for a in axes if _stick(model, a) is not None}
     # An axis of another name is none of an aircraft's, such as a pendulum's with the angle theta.
@@ -116,12 +106,7 @@ def prepared(pair: HandlingPair, curve: Curve) -> Curve:
 def measured_handling(
     flight_responses: FlightResponses, pair: HandlingPair
 ) -> HandlingQualities | str:
-    """Handling qualities of a measured response, or why there are none in words.
-
-    Args:
-        flight_responses: the responses of some flights.
-        pair: which of them.
-    """
+    """Handling qualities of a measured response, or why there are none in words."""
     output = flight_responses.outputs.get(pair.output)
     response = None if output is None else output.pairs.get(pair.input)
     if output is None or response is None:

@@ -1,28 +1,46 @@
-"""Frequency responses of flights together: every output to every input that moves."""
+"""Frequency responses of flights together: every output to every input that moves.
+
+An output's response is taken from parts of flights without a missing sample. Windows look at a part
+of a record, and see inputs whose answers lie outside of it and answers whose inputs do: of noise
+this makes a random error; of a sweep, which visits each frequency once, one that no
+average takes away. It is that of a model's response as well, which is known before and behind the
+windows.
+
+Source: Pintelon and Schoukens (2012), chapter 6, for the errors of windows.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Complex, Float
 
-from heli_jax.analysis.noise_over_lines import Z95, averaged, independent_shares, student95
 from heli_jax.analysis.response_curves import octave_mean
-from heli_jax.analysis.response_parts import Names, coherence_where_moving, groups, records_of
-from heli_jax.analysis.response_pictures import pictures_of, several_windows
-from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import (
     OVERLAP,
+    OWN,
+    CrossSpectra,
     TooFewAveragesError,
+    combined,
     cross_spectra,
+    leakage,
     responses,
+    segment_transforms,
+    weights_by_output,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
-from heli_jax.analysis.window_ends import without_ends
-from heli_jax.analysis.window_resolution import Windows, window_error
+from heli_jax.analysis.window_errors import (
+    Z95,
+    averaged,
+    independent_shares,
+    student95,
+    without_ends,
+)
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
+from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
@@ -34,6 +52,27 @@ _MOST_SAID = 3
 """outputs of which a refusal says why they have no response"""
 _AS_ONE = 1e-6
 """less than 1, coherence of two inputs that move as one at all frequencies"""
+
+
+type Parts = tuple[tuple[int, int, int], ...]
+"""flight, first sample and the one behind the last of each part"""
+type Names = tuple[list[str], tuple[str, ...]]
+"""of the inputs, and of those with an instrument"""
+
+
+class Windows(NamedTuple):
+    """How responses were taken."""
+
+    records: Sequence[Float[np.ndarray, "c N"]]
+    """inputs, instruments and outputs of each part of a flight"""
+    inputs: Sequence[int]
+    """their places among the signals"""
+    instruments: Sequence[int] | None
+    """as many; None without"""
+    omega: Float[np.ndarray, " k"]
+    """[rad/s]"""
+    seconds: float
+    """length of a window"""
 
 
 class Wanted(NamedTuple):
@@ -118,13 +157,12 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     Args:
         flights: of one rate, with the same inputs; an output's parts without a missing sample
             that are at least a window long are used.
-        settings: band, window and transfer functions.
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has a part that is long enough.
     """
-    dt = _one_rate(flights)
+    dt = one_rate(flights)
     flights = [without_jumps(f) for f in flights]
     longest = max(f.duration for f in flights)
     window = settings.window or min(longest / 5.0, _LONGEST)
@@ -187,12 +225,17 @@ def require_window(window: float, longest: float) -> None:
         )
 
 
-def _one_rate(flights: Sequence[Flight]) -> float:
+def one_rate(flights: Sequence[Flight]) -> float:
+    """The sample time [s] of flights that share it.
+
+    Raises:
+        ValueError: they do not.
+    """
     rates = sorted({round(1.0 / f.dt, 6) for f in flights})
     if len(rates) > 1:
         listed = ", ".join(f"{r:g}" for r in rates)
         raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return flights[0].dt
+    return float(flights[0].dt)
 
 
 def _frequencies(settings: Settings, window: float, dt: float, step: float) -> np.ndarray:
@@ -363,9 +406,6 @@ def steady_sd(
 
     Args:
         omega: (k,) [rad/s]
-        output: of flights.
-        input: its name.
-        seconds: length of a window.
     """
     pair = output.pairs[input]
     noise = np.where(np.isfinite(pair.H), output.noise, np.nan)
@@ -419,3 +459,188 @@ def _fitted(
         # All that they do, at the ends too.
         fitted = fit_transfer(measured._replace(H=H + pair.added - added), *orders)
     return fitted
+
+
+_AT_REST = 0.01
+"""of an input's largest standard deviation in a part, below which it rests in another"""
+
+
+def groups(
+    flights: Sequence[Flight], window: int, without: list[Finding]
+) -> list[tuple[list[str], Parts]]:
+    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
+    them.
+
+    Args:
+        window: samples of one, the least of a part.
+        without: why an output has no part is added to them.
+    """
+    by_parts: dict[Parts, list[str]] = {}
+    order = dict.fromkeys(n for f in flights for n in f.outputs)
+    for name in order:
+        parts = parts_of(flights, name, window)
+        if isinstance(parts, str):
+            without.append(note("responses.none", parts, name))
+        else:
+            by_parts.setdefault(parts, []).append(name)
+    return [(names, parts) for parts, names in by_parts.items()]
+
+
+def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str:
+    """The parts without a missing sample, or in words why there is none.
+
+    Args:
+        window: samples of one, the least of a part.
+    """
+    parts, longest = [], 0
+    for i, f in enumerate(flights):
+        if output not in f.outputs:
+            continue
+        for first, last in spans([f.outputs[output]]):
+            longest = max(longest, last - first)
+            if last - first >= window:
+                parts.append((i, first, last))
+    if parts:
+        return tuple(parts)
+    return (
+        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
+        f"missing one, got {longest} at most"
+    )
+
+
+def records_of(
+    flights: Sequence[Flight], names: Names, outputs: list[str], parts: Parts
+) -> list[np.ndarray]:
+    """Inputs, instruments and outputs (signals, N) of each part."""
+    inputs, instruments = names
+    return [
+        np.stack(
+            [
+                *(flights[i].inputs[n][first:last] for n in inputs),
+                *(flights[i].instruments[n][first:last] for n in instruments),
+                *(flights[i].outputs[n][first:last] for n in outputs),
+            ]
+        )
+        for i, first, last in parts
+    ]
+
+
+def coherence_where_moving(
+    coherence: Float[np.ndarray, "k l m"],
+    records: Sequence[Float[np.ndarray, "signals N"]],
+    moving: Sequence[int],
+    window: int,
+) -> Float[np.ndarray, "k l m"]:
+    """Coherence in the flights in which an input moves, of that in all.
+
+    Of sweeps of one stick at a time the others are at rest, and the noise of those flights is
+    nothing that they could be coherent with.
+
+    Args:
+        moving: the inputs, or their instruments, by their place among the signals.
+        window: samples of one.
+    """
+    windows = np.array([max(r.shape[1] - window + 1, 0) for r in records], float)
+    sizes = np.array([np.std(r[list(moving)], axis=1) for r in records])
+    moves = sizes > _AT_REST * np.max(sizes, axis=0)
+    used = np.sum(np.where(moves, windows[:, None], 0.0), axis=0)
+    # One that moves in parts alone that are shorter than a window has none.
+    share = np.where(used > 0, used, np.sum(windows)) / np.sum(windows)
+    with np.errstate(all="ignore"):
+        return coherence / (coherence + share * (1.0 - coherence))
+
+
+_LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
+"""of the windows of a composite, in that one's length"""
+
+
+def several_windows(
+    records: Sequence[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
+) -> list[CrossSpectra]:
+    """Spectra of several windows beside those of one, as far as the records have three of each.
+
+    Args:
+        records: signals (c, N) of each part.
+        dt: between two samples [s].
+    """
+    longest = max(r.shape[1] for r in records) * dt
+    several: list[CrossSpectra] = []
+    for length in _LENGTHS:
+        # Three windows are the least that a coherence can be taken from.
+        if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
+            continue
+        own = length == 1.0
+        spectra = one if own else cross_spectra(records, dt, one.omega, length * window, OVERLAP)
+        if np.min(spectra.averages) >= m + 1:
+            several.append(spectra)
+    return several
+
+
+def pictures_of(
+    several: list[CrossSpectra],
+    omega: np.ndarray,
+    which: tuple[list[int], list[int], list[int] | None],
+) -> np.ndarray:
+    """H (k, l, m) of several windows together; NaN where the record has no two of them.
+
+    Args:
+        omega: (k,) [rad/s]
+        which: places of the m inputs, of the l outputs and of the instruments.
+    """
+    u, outputs, by = which
+    made = np.full((omega.size, len(outputs), len(u)), np.nan, complex)
+    if len(several) < 2:
+        return made
+    weights = weights_by_output(several, u, outputs)
+    for i, y in enumerate(outputs):
+        # Without the other outputs, of which each has its own weights.
+        kept = [*dict.fromkeys([*u, *(by or u)]), y]
+        place = {signal: j for j, signal in enumerate(kept)}
+        own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
+        us, zs = [place[k] for k in u], None if by is None else [place[k] for k in by]
+        both = combined(own, weights[:, :, i])
+        made[:, i] = responses(both, us, [place[y]], zs).H[:, 0]
+    return made
+
+
+_BLOCK = 4096
+"""frequencies at a time, each with its images"""
+
+
+def forgets(fitted: TransferFit, seconds: float) -> bool:
+    """Whether a transfer function forgets within a window, so that what it does is known from the
+    record: its slowest mode falls to 1/e.
+    """
+    poles = fitted.poles
+    return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
+
+
+def window_error(
+    fitted: TransferFit, windows: Windows, input: int, hold: Hold
+) -> Complex[np.ndarray, " k"] | None:
+    """What windows add to the response of a transfer function; None where it does not forget within
+    a window, so that what it does is not known from the record.
+    """
+    if not forgets(fitted, windows.seconds):
+        return None
+    kept = sorted({*windows.inputs, *(windows.instruments or ())})
+    place = {i: j for j, i in enumerate(kept)}
+    records = [
+        np.concatenate([r[kept], _answer(fitted, r[windows.inputs[input]], hold)[None]])
+        for r in windows.records
+    ]
+    spectra = cross_spectra(records, hold.dt, windows.omega, windows.seconds, OVERLAP)
+    by = None if windows.instruments is None else [place[i] for i in windows.instruments]
+    estimate = responses(spectra, [place[i] for i in windows.inputs], [len(kept)], by)
+    return estimate.H[:, 0, input] - fitted.sampled(windows.omega, hold)
+
+
+def _answer(fitted: TransferFit, u: Float[np.ndarray, " N"], hold: Hold) -> Float[np.ndarray, " N"]:
+    """A transfer function's output (N,), from rest at the first value of its input."""
+    # Padded, or the end of the record would wrap round onto its beginning.
+    size = 2 * u.size
+    lines = np.fft.rfft(u - u[0], size)
+    omega = 2.0 * np.pi * np.arange(1, lines.size) / (size * hold.dt)
+    blocks = (omega[i : i + _BLOCK] for i in range(0, omega.size, _BLOCK))
+    H = np.concatenate([fitted.response(np.zeros(1)), *(fitted.sampled(w, hold) for w in blocks)])
+    return np.fft.irfft(lines * H, size)[: u.size]

@@ -110,7 +110,6 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
             unity feedback. The sign of an attitude's response does not matter: it is taken for
             that of a machine whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
             is taken as it is.
-        kind: rate, attitude-command or open-loop.
     """
     grid = np.geomspace(*curve.band, _POINTS)
     points = curve.at(grid)
@@ -172,9 +171,7 @@ class _Response:
 
         Args:
             quantity: log_gain or phase.
-            level: likewise.
             below: [rad/s]
-            first: whether the lowest one is meant.
         """
         values = (self.gain if quantity == "log_gain" else self.phase) - level
         end = self.grid.size if below is None else int(np.searchsorted(self.grid, below))
@@ -224,7 +221,6 @@ class _Response:
             omega: where the curve has the level [rad/s].
             off: (k,) of the curve from the level, on the grid.
             reach: (k,) of the curve's interval.
-            start: the same at omega.
         """
         if not np.isfinite(reach).all():
             return np.nan, np.nan

@@ -46,8 +46,6 @@ def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) 
     """The model's matrices at a point.
 
     Args:
-        model: any.
-        params: its constants.
         state: the model's initial state unless given.
         inputs: zeros unless given.
     """
@@ -63,7 +61,6 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
     """Eigenvalues of A [1/s], (n,) complex, slowest first.
 
     Args:
-        model: any.
         params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
@@ -111,7 +108,6 @@ def eigenmodes(
     move (an eigenvalue of zero, a position or a heading) it is the right eigenvector's alone.
 
     Args:
-        model: any.
         params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
@@ -197,10 +193,7 @@ def transfer_function(
     A delay of the input (`Model.delays`) is no ratio of polynomials and is left out.
 
     Args:
-        model: any.
         params: its constants, concrete.
-        output: the name of one.
-        input: the name of one.
 
     Raises:
         ValueError: the model has no such output or input.
@@ -224,8 +217,6 @@ def frequency_response(
     An input that acts late by d [s] (`Model.delays`) has the factor exp(-i omega d).
 
     Args:
-        model: any, with p outputs and m inputs.
-        params: its constants.
         omega: (k,) [rad/s].
     """
     A, B, C, D = jacobians(model, params)

@@ -46,7 +46,6 @@ def d2c(
         num: of Hd(z), highest power first.
         den: of Hd(z), highest power first.
         dt: time between samples [s].
-        method: "zoh" or "real-log".
 
     Raises:
         ValueError: no such method, not a proper transfer function, a pole at z = 0 (its logarithm
@@ -115,14 +114,7 @@ def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> 
 def siso_polynomials(
     A: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
 ) -> Polynomials:
-    """num and den of c (s - A)^-1 b + d; leading zeros of num are cut, and zero stays one number.
-
-    Args:
-        A: (n, n).
-        b: (n,).
-        c: (n,).
-        d: the direct part.
-    """
+    """num and den of c (s - A)^-1 b + d; leading zeros of num are cut, zero stays one number."""
     den = np.real(np.poly(A))
     proper = _numerator(A, b, c)
     # What rounding leaves of a coefficient that is zero. The Markov parameters c A^k b set its

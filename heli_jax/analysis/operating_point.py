@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.analysis.linear import modes
-from heli_jax.analysis.mean_flight import flown, mean_condition
 from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
@@ -54,12 +53,10 @@ def operating_point(
     that they give in a simulation, or the initial state where that diverges.
 
     Args:
-        model: any model, also one with a disturbance, which is zero at the point.
         params: its parameters, of this flight, SI.
         inputs: as they act (N,), by name, SI: as logged, times a gain where one was estimated.
         outputs: as measured (N,), by name, SI; NaN where missing.
         dt: sample time [s].
-        substeps: of the simulation.
     """
     if model.linear:
         return EVERYWHERE
@@ -81,10 +78,7 @@ def modes_of_flight(
     where there are no finite matrices.
 
     Args:
-        model: the model that is fitted.
         params: its parameters, SI; what is known of the flight replaces them.
-        flight: the record.
-        substeps: of the simulation.
     """
     here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # What is known of this flight first: an added mass moves the trim.
@@ -145,13 +139,7 @@ def _undisturbed(model: Model) -> Model:
     State: Any = NamedTuple("State", [(n, fields[n]) for n in kept])  # type: ignore[misc]
 
     def vector_field(p: Any, s: Any, u: Any) -> Any:
-        """The model's derivatives where the disturbance is zero.
-
-        Args:
-            p: the model's Params, SI.
-            s: the State without the disturbance.
-            u: the model's Inputs.
-        """
+        """The model's derivatives where the disturbance is zero."""
         rates = model.vector_field(p, _extended(model, s), u)
         return State(**{n: getattr(rates, n) for n in kept})
 
@@ -175,3 +163,58 @@ def _extended(model: Model, state: Any) -> Any:
     # Of the given dtype: strict promotion raises where a float32 state meets a float64 zero.
     zero: Array = jnp.zeros((), jnp.result_type(*(jnp.asarray(v) for v in values.values())))
     return model.State(**{n: values.get(n, zero) for n in naming.names(model.State)})
+
+
+_SLOW = 0.5
+"""m/s: a record of less mean speed is of hover"""
+
+
+def mean_condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
+    """The mean motion of a record; hover where it is slow or nothing tells.
+
+    Args:
+        outputs: as measured (N,), by name, SI; NaN where missing.
+        dt: sample time [s].
+    """
+    dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
+    psi = mean_heading(outputs)
+    # From the axes of the ground to those of the heading, which a trim speaks of.
+    forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
+    # Records of hover drift: their trim would be called one of forward flight.
+    forward, lateral, up = (float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz))
+    return Condition(forward, lateral, up, psi) if forward or lateral or up else HOVER
+
+
+def mean_heading(outputs: Mapping[str, np.ndarray]) -> float:
+    """The mean of psi [rad]; 0 where it was not measured.
+
+    Args:
+        outputs: as measured (N,), by name, SI; NaN where missing.
+    """
+    psi = outputs.get("yaw")
+    # A circular mean: headings on either side of south are near one another, and far in numbers.
+    return 0.0 if psi is None else float(np.angle(np.nanmean(np.exp(1j * psi))))
+
+
+def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
+    """Mean velocity along an axis [m/s], from what was measured of it."""
+    # A measured velocity tells more than two noisy positions at the ends of the record.
+    if f"d{axis}" in outputs:
+        return float(np.nanmean(outputs[f"d{axis}"]))
+    if axis in outputs:
+        seen = np.flatnonzero(np.isfinite(outputs[axis]))
+        if seen.size > 1:
+            first, last = seen[0], seen[-1]
+            return float((outputs[axis][last] - outputs[axis][first]) / ((last - first) * dt))
+    return 0.0
+
+
+def flown(condition: Condition) -> str:
+    """A condition in words: `in hover`, `at 12 m/s ahead`."""
+    named = (
+        ("ahead", condition.forward_speed),
+        ("to the right", condition.lateral_speed),
+        ("up", condition.climb),
+    )
+    parts = [f"{v:.2g} m/s {n}" for n, v in named if v]
+    return f"at {', '.join(parts)}" if parts else "in hover"

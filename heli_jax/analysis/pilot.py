@@ -53,9 +53,6 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     """The pilot who holds the attitude of `trimmed`, heading included; concrete parameters only.
 
     Args:
-        model: with sticks for its axes.
-        params: its constants.
-        trimmed: the flight to hold.
         pace: every mode of the attitude decays at least as fast [1/s].
 
     Raises:

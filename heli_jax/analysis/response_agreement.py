@@ -134,13 +134,8 @@ def pair_agreements(
     """Response by response.
 
     Args:
-        w: the flights in windows.
-        used: which take part at which frequencies.
         H: measured.
         E: measured less the model's.
-        variance: of E.
-        coherence: partial.
-        simulated: by output how the model's response was made.
     """
     out = []
     for j, output in enumerate(w.outputs):
@@ -188,10 +183,6 @@ def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.
 def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
     """What chi-squared over its degrees of freedom lies in with 95 % probability, where the noise
     was estimated from what no response explains: Fisher's F.
-
-    Args:
-        freedom: degrees of freedom.
-        of_noise: those of the noise.
     """
     low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))
     return float(low), float(high)

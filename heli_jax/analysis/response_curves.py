@@ -275,9 +275,6 @@ def linear_responses(
     is left out.
 
     Args:
-        model: with n states.
-        params: its parameters, SI.
-        names: of those that derivatives are taken by.
         state: the model's initial state unless given.
         inputs: zeros unless given.
     """
@@ -321,11 +318,8 @@ def modelled_curve(
     """A model's continuous response, delays included, with errors by those of its parameters.
 
     Args:
-        of: the matrices.
-        pair: input and output.
         root: (q, r) R with R R' the covariance of the parameters; NaN where it is not known.
         band: [rad/s]
-        acting: gain and delay of the input that were estimated.
     """
     j = naming.names(of.model.Inputs).index(pair[0])
     i = naming.names(of.model.Outputs).index(pair[1])

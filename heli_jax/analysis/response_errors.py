@@ -98,7 +98,6 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 
     Args:
         g: windows times the turning of each line (k, samples), less their means.
-        d: lines.
         step: from a window to the next, in samples.
     """
     a, b = g[: len(g) - d], np.conj(g[d:])
@@ -154,8 +153,6 @@ def response_of(
     """The response dH from the inputs that errors have; NaN where inputs move as one.
 
     Args:
-        w: the flights in windows.
-        at: of these.
         E: errors, or the outputs themselves; zero in windows that an output does not have.
     """
     S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
@@ -172,8 +169,6 @@ def noise_density(
     """The spectral matrix of what no response explains of the errors, smoothed over frequency.
 
     Args:
-        w: the flights in windows.
-        at: of these.
         E: errors (W, k, p); zero in windows that an output does not have.
         described: of raw spectral matrices (k, q, q) of some outputs, by their place, what is known
             of their shape: the mean over lines is taken of what is left by that (`None`: nothing).
@@ -253,12 +248,7 @@ def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
 
 
 def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
-    """Of the errors of all responses at one frequency.
-
-    Args:
-        at: what the inputs say.
-        S: the noise's spectral matrix.
-    """
+    """Of the errors of all responses at one frequency."""
     P = np.nan_to_num(at.P)
     return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
 
@@ -268,11 +258,6 @@ def whitening(
 ) -> Complex[np.ndarray, "k r r"]:
     """What makes rows of variance 1 of the errors of the responses that are used, independent of
     one another at a line; the rows of the others are zero. r = p m.
-
-    Args:
-        at: what the inputs say.
-        S: the noise's spectral matrix.
-        used: which responses at which frequencies.
     """
     k, p, m = used.shape
     taken = used.reshape(k, -1)
@@ -307,14 +292,7 @@ def pairs_used(
     coherence: Float[np.ndarray, "k p m"],
     sound: Bool[np.ndarray, "k p m"],
 ) -> Bool[np.ndarray, "k p m"]:
-    """Which responses take part at which frequencies.
-
-    Args:
-        w: the flights in windows.
-        options: pairs, bands and coherences asked for.
-        coherence: partial.
-        sound: where there is a response at all.
-    """
+    """Which responses take part at which frequencies."""
     used = np.zeros(sound.shape, bool)
     omega = 2.0 * np.pi * w.hz
     everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)

@@ -9,6 +9,20 @@ where pilot or autopilot close the loop.
 Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Welch (1967); Rabiner, Schafer
 and Rader (1969) for the chirp-z transform; Wellstead (1981) for responses by instrument; Tischler
 and Remple (2012), chapters 7 to 10.
+
+Responses by instrument are ratios of two numbers with errors of their own. With w_j the combination
+of the instruments that goes with input j alone, H_j = S_wy over S_wu, and a response H' agrees with
+the record where |S_we| of y - H' u is within its interval,
+
+    |H' - H|^2 <= c (S_ee - 2 Re(conj(H' - H) S_ue) + |H' - H|^2 S_vv),  c = t^2 S_ww / (2 n),
+
+t being Student's (1.96 of many averages) and v what of the input no instrument explains. That is a
+disc. Where the excitation is weak beside v it is larger than the first-order error and lies to one
+side, and where c S_vv reaches 1 it has no end: nothing is known of the response.
+
+Source: Fieller (1954); Anderson and Rubin (1949) for instruments.
+
+The report's spectra and coherences (`spectra`, `partial_coherence`) are Welch's.
 """
 
 from collections.abc import Sequence
@@ -20,8 +34,141 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.analysis.fieller import sd_of_ratio
-from heli_jax.analysis.noise_over_lines import student95
+from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.window_errors import Z95, student95
+
+# numpy's FFT alone: scipy.signal has csd and welch, but one function of it imports all of it, which
+# takes a second of every report, and the partial coherence needs the segments, not their averages.
+
+
+_NO_POWER = 1e-20
+"""of a signal's power: less is what rounding leaves where others explain all of it"""
+OWN = 10.0
+"""times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
+
+
+class Spectra(NamedTuple):
+    """One-sided spectral densities of two signals, each (k,)."""
+
+    omega: np.ndarray
+    """[rad/s]"""
+    uu: np.ndarray
+    yy: np.ndarray
+    uy: np.ndarray
+    """complex: conj(U) Y, so that uy / uu estimates the response from u to y"""
+
+
+def spectra(
+    u: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"], dt: float, length: int
+) -> Spectra:
+    """Averages over half-overlapping segments, each less its straight line, in a Hann window.
+
+    Args:
+        dt: time between samples [s].
+        length: samples of a segment, at most N.
+
+    Source: Welch (1967), IEEE Trans. Audio and Electroacoustics 15(2).
+    """
+    omega, transforms = segment_transforms(np.stack([u, y]), dt, length)
+    U, Y = np.moveaxis(transforms, -1, 0)
+    # A density over frequency in Hz; the window takes some of the power away.
+    density = np.full(omega.size, 2.0 * dt / np.sum(np.hanning(length) ** 2))
+    # Zero frequency and Nyquist's, which an odd length has not, have no twin of negative frequency.
+    density[0] /= 2.0
+    if length % 2 == 0:
+        density[-1] /= 2.0
+    uu, yy, uy = (np.mean(np.conj(a) * b, axis=1) for a, b in ((U, U), (Y, Y), (U, Y)))
+    return Spectra(omega, density * uu.real, density * yy.real, density * uy)
+
+
+def segment_transforms(
+    signals: Float[np.ndarray, "channels N"], dt: float, length: int
+) -> tuple[Float[np.ndarray, " k"], Complex[np.ndarray, "k segments channels"]]:
+    """Fourier transforms of half-overlapping segments, each less its straight line, in a Hann
+    window, at k = length // 2 + 1 frequencies [rad/s] from zero on.
+
+    Args:
+        signals: (channels, N), sampled together.
+        dt: time between samples [s].
+        length: samples of a segment, at most N.
+    """
+    # The next segment begins where the second half of this one does.
+    step = length - length // 2
+    segments = 1 + (signals.shape[1] - length) // step
+    at = np.arange(segments)[:, None] * step + np.arange(length)
+    # numpy's window is symmetric, SciPy's by default periodic; responses and coherences share it.
+    windowed = _detrended(signals[:, at]) * np.hanning(length)
+    omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)
+    return omega, np.moveaxis(np.fft.rfft(windowed, axis=-1), -1, 0).swapaxes(1, 2)
+
+
+def _detrended(segments: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n"]:
+    """Segments less the straight line that fits each best: a drift would leak into the lowest
+    frequencies."""
+    # Symmetric about zero, so that slope and mean are found apart from each other.
+    t = np.linspace(-1.0, 1.0, segments.shape[-1])
+    slopes = (segments @ t / (t @ t))[..., None]
+    return segments - segments.mean(axis=-1, keepdims=True) - slopes * t
+
+
+def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
+
+    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
+
+    Args:
+        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
+        u: (k, segments)
+        y: (k, segments)
+
+    Source: Bendat and Piersol, Random Data (2010), chapter 7.
+    """
+    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
+    # the pilot moves two sticks together.
+    # A coherence has no size, and the squares of a simulation that diverged have none in numbers.
+    u, y = u / size_of(u), y / size_of(y)
+    left_u, left_y = without(others, u), without(others, y)
+    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
+    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
+    enough = uu > _NO_POWER * np.sum(np.abs(u) ** 2, axis=1)
+    enough &= yy > _NO_POWER * np.sum(np.abs(y) ** 2, axis=1)
+    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
+
+
+def size_of(x: np.ndarray) -> float:
+    """The largest number, by which what hangs on no unit may be divided; 1 where there is none."""
+    size = float(np.max(np.abs(x), initial=0.0))
+    return size if size > 0 and np.isfinite(size) else 1.0
+
+
+def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """x (k, segments) less its projection on the others (k, segments, inputs)."""
+    if not others.shape[2]:
+        return x
+    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
+    gains = np.linalg.pinv(others) @ x[:, :, None]
+    return x - (others @ gains)[:, :, 0]
+
+
+def leakage(S: np.ndarray) -> np.ndarray:
+    """What the Hann window's sidelobes bring to each frequency from all others, (k,).
+
+    Args:
+        S: spectral density (k,) of segments in a Hann window.
+
+    Source: Harris (1978), Proceedings of the IEEE 66(1): the window's transform m lines away is at
+    most 1/(pi m (m^2 - 1)) of its height.
+    """
+    m = np.arange(S.size, dtype=float)
+    sidelobes = np.zeros(S.size)
+    # Up to two lines away is the main lobe: there a signal is itself.
+    far = m > 2
+    # Its square, and of that the mean of a squared sine: where between two lines a frequency lies
+    # is as good as random.
+    sidelobes[far] = 0.5 / (np.pi * m[far] * (m[far] ** 2 - 1.0)) ** 2
+    both = np.concatenate([sidelobes[:0:-1], sidelobes])
+    return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
+
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
@@ -85,7 +232,6 @@ def chirp_z(
     """The sums over n of x[n] exp(-i omega n dt), by Bluestein's (1970) convolution.
 
     Args:
-        x: signals (..., N).
         dt: between two samples [s].
         omega: (k,) [rad/s], equally spaced.
 
@@ -269,9 +415,7 @@ def responses(
     where an instrument is too weak beside what else moves its input (`fieller`).
 
     Args:
-        spectra: of the signals.
         inputs: the m inputs, by their place among the signals.
-        outputs: the l outputs likewise.
         instruments: as many excitations, outside of every feedback; without them the inputs are
             taken for ones that do not follow the outputs.
 
@@ -316,9 +460,7 @@ def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Of matrices (k, m, m); NaN where one is singular but for rounding.
 
     Args:
-        M: cross-spectra.
         rows: densities (k, m) of the signals of the rows.
-        columns: likewise.
     """
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(rows[:, :, None] * columns[:, None, :])
@@ -348,7 +490,6 @@ def weights_by_output(
     Args:
         several: of the same signals and frequencies, of segments of different length.
         inputs: those whose responses decide, by their place among the signals.
-        outputs: likewise.
 
     Raises:
         ValueError: the frequencies differ.
@@ -373,10 +514,6 @@ def weights_by_output(
 def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"]) -> CrossSpectra:
     """One picture of several lengths of segments, their mean. It is for looking: no intervals are
     to be taken from it, since the lengths share the record.
-
-    Args:
-        several: of the same signals and frequencies.
-        weights: of each; where all are zero all count the same.
     """
     omega, total = several[0].omega, np.sum(weights, axis=0)
     # Inputs that move as one have no response that could decide.
@@ -384,3 +521,51 @@ def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"])
     S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
     n = np.stack([np.broadcast_to(s.averages, omega.shape) for s in several])
     return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
+
+
+_STRONG = 0.25
+"""of c S_vv in the mean over an octave, up to which an instrument is strong enough: F of 7.7"""
+
+
+def sd_of_ratio(
+    omega: Float[np.ndarray, " k"],
+    S: Complex[np.ndarray, "k c c"],
+    signals: tuple[list[int], list[int], list[int]],
+    H: Complex[np.ndarray, "k l m"],
+    left: Float[np.ndarray, "k l"],
+    spread: Float[np.ndarray, "k m"],
+    half95: Float[np.ndarray, "k 1"],
+) -> Float[np.ndarray, "k l m"]:
+    """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
+    NaN where these have no end.
+
+    Args:
+        omega: frequencies [rad/s].
+        signals: places of the inputs, of the outputs and of the instruments.
+        left: density of what they leave.
+        spread: density of w_j over the averages.
+        half95: half of a 95 % interval in standard deviations.
+    """
+    u, y, z = signals
+    zz, zu = S[:, z][:, :, z], S[:, z][:, :, u]
+    with np.errstate(all="ignore"):
+        explained = np.real(
+            np.einsum("kzj,kzj->kj", np.conj(zu), np.linalg.pinv(zz, rcond=1e-12) @ zu)
+        )
+        own = np.maximum(np.real(S[:, u, u]) - explained, 0.0)
+        # Of y - H u with each input.
+        crossed = S[:, u][:, :, y] - np.einsum("kja,kla->kjl", S[:, u][:, :, u], H)
+        c = 0.5 * half95**2 * spread
+        # An input that is its own instrument has nothing of its own, but for rounding.
+        direct = np.array([a == b for a, b in zip(u, z, strict=True)])
+        room = np.where(direct, 1.0, 1.0 - c * own)[:, None, :]
+        aside = np.where(direct, 0.0, np.abs(np.swapaxes(crossed, 1, 2)) * c[:, None, :]) / room
+        reach = aside + np.sqrt(c[:, None, :] * left[:, :, None] / room + aside**2)
+        # Among weak ones a single frequency is strong by chance, and has the wrong response by the
+        # same chance: the octave around it has to be strong as well.
+        share = explained / np.maximum(explained + own, 1e-300)
+        around = np.stack([octave_mean(omega, v) for v in share.T], axis=1)
+        # c S_vv again, with the octave's share of the input that instruments explain.
+        likely = 0.5 * Z95**2 * spread
+        strong = direct | (likely * explained * (1.0 - around) < _STRONG * around)
+        return np.where((room > 0) & strong[:, None, :], reach / half95[:, None], np.nan)

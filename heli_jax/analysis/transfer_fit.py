@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.noise_over_lines import independent_shares, student95
+from heli_jax.analysis.window_errors import independent_shares, student95
 
 _ROUNDS = 12
 """of Sanathanan and Koerner's iteration; it settles in a handful"""
@@ -175,7 +175,6 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
         measured: the response; frequencies whose numbers are not finite are left out.
         zeros: order m of the numerator, at most n.
         poles: order n of the denominator, from 1 to 8.
-        delay: whether a delay is fitted too.
 
     Raises:
         ValueError: orders out of range, or too few frequencies for so many coefficients.
@@ -305,10 +304,6 @@ def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
     In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, the more so
     the farther p lies beyond: without a lot of evidence a machine has the pole that does not grow.
     A slow one is another matter: it stands in the band, or an interval about zero holds it.
-
-    Args:
-        best: the optimum, its delay free.
-        freedom: degrees of freedom.
     """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)
@@ -381,10 +376,6 @@ def _deviations(J: np.ndarray) -> np.ndarray:
 def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
     """Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted by
     coherence; NaN where nothing is measured.
-
-    Args:
-        measured: the response.
-        model: at the same frequencies (k,).
 
     Source: Tischler and Remple (2012), section 11.2.
     """

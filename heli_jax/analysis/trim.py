@@ -1,6 +1,8 @@
-"""Trim: the state and the sticks at which a helicopter stays in a steady flight."""
+"""Trim: the state and the sticks at which a helicopter stays in a steady flight.
 
-import warnings
+The search begins at momentum theory in hover.
+"""
+
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -12,7 +14,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
-from heli_jax.analysis.trim_guess import first_guess
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, SteadyFlight, require_constants
 from heli_jax.vehicle import of_helicopter
@@ -35,7 +36,9 @@ _UPRIGHT = 1.5
 """roll and pitch [rad] below which a machine is not on its back"""
 
 
-class _Condition(NamedTuple):
+class Condition(NamedTuple):
+    """A steady flight; speeds over the ground in m/s, along the heading and across it."""
+
     forward_speed: Any = 0.0
     """over the ground along the heading [m/s]"""
     lateral_speed: Any = 0.0
@@ -44,55 +47,6 @@ class _Condition(NamedTuple):
     """[m/s]"""
     heading: Any = 0.0
     """psi [rad]"""
-
-
-class Condition(_Condition):
-    """A steady flight; speeds over the ground in m/s, along the heading and across it.
-
-    The keywords `ahead` and `aside` are deprecated: `forward_speed` and `lateral_speed`.
-    """
-
-    # A named tuple takes no keyword beside its fields: the old ones need a subclass with a __new__.
-    __slots__ = ()
-
-    def __new__(
-        cls,
-        forward_speed: Any = 0.0,
-        lateral_speed: Any = 0.0,
-        climb: Any = 0.0,
-        heading: Any = 0.0,
-        **deprecated: Any,
-    ) -> "Condition":
-        speeds = {"forward_speed": forward_speed, "lateral_speed": lateral_speed}
-        for old, value in deprecated.items():
-            if old not in _RENAMED:
-                raise TypeError(f"Condition: expected {', '.join(cls._fields)}, got {old!r}")
-            _warn_renamed(old)
-            speeds[_RENAMED[old]] = value
-        return super().__new__(cls, **speeds, climb=climb, heading=heading)
-
-    @property
-    def ahead(self) -> Any:
-        """Deprecated: the name that `forward_speed` had."""
-        _warn_renamed("ahead")
-        return self.forward_speed
-
-    @property
-    def aside(self) -> Any:
-        """Deprecated: the name that `lateral_speed` had."""
-        _warn_renamed("aside")
-        return self.lateral_speed
-
-
-_RENAMED = {"ahead": "forward_speed", "aside": "lateral_speed"}
-
-
-def _warn_renamed(old: str) -> None:
-    warnings.warn(
-        f"Condition: {old} is deprecated, expected {_RENAMED[old]}",
-        DeprecationWarning,
-        stacklevel=3,
-    )
 
 
 class Trim(NamedTuple):
@@ -125,9 +79,6 @@ def trim(
     Concrete parameters only: `equilibrium` is what can be differentiated and batched.
 
     Args:
-        model: the full nonlinear model of a helicopter.
-        params: its constants.
-        condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         sticks: the ends of the sticks' travel by name; those of `STICKS` unless given.
         power_off: autorotation: the throttle is zero, and the climb, which is then negative, is
@@ -179,11 +130,8 @@ def equilibrium(
     """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
 
     Args:
-        model: the full nonlinear model of a helicopter.
         params: its constants, concrete or traced.
-        condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
-        power_off: as in `trim`.
 
     Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
     """
@@ -394,3 +342,44 @@ def _words(condition: Condition) -> str:
     )
     speeds = {f"{float(v):g} m/s {n}" for n, v in named if float(v) != 0.0}
     return " and ".join(sorted(speeds)) or "hover"
+
+
+# The constants are a class of the user's, of numbers, arrays or tracers: `Any` below.
+
+
+def first_guess(
+    model: Model, p: Any, climb: Any, power_off: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight.
+
+    Args:
+        climb: [m/s].
+    """
+    # Momentum theory in hover, then blade-element theory solved for the collective pitch.
+    area = jnp.pi * p.R**2
+    vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
+    tip = p.R * p.Omega
+    sigma = 2.0 * p.c / (jnp.pi * p.R)
+    loading = 2.0 * p.m * p.g / (p.rho * area * tip**2 * p.a * sigma)
+    # In autorotation hardly anything goes through the rotor.
+    inflow = 0.0 * tip if power_off else (vi + climb) / tip
+    theta0 = 3.0 / p.B**3 * (loading + 0.5 * p.B**2 * inflow)
+    stick = theta0 / p.K_theta0
+    guess = {
+        "Omega": p.Omega, "vi": vi, "climb": -1.7 * vi,
+        "x_collective": stick, "x_throttle": stick, "x_yaw": -0.5 * stick,
+    }  # fmt: skip
+    sizes = {
+        "Omega": p.Omega, "vi": vi, "climb": vi, "governor": 0.5,
+        "x_collective": stick, "x_throttle": stick, "x_yaw": stick,
+        "x_roll": 0.1 * p.L1, "x_pitch": 0.1 * p.L1,
+    }  # fmt: skip
+    if "x_collective" in naming.names(model.Inputs):
+        # The throttle that carries induced and half as much of other power; the governor's stick
+        # asks for the whole speed.
+        power = 1.5 * p.m * p.g * vi / (p.Ir * p.K_throttle * p.Omega)
+        governed = "governor" in naming.names(model.State)
+        guess |= {"x_throttle": 1.0 if governed else power, "governor": power}
+        guess["governor"] = 0.0 if power_off else power
+        sizes |= {"x_throttle": 0.5}
+    return guess, sizes

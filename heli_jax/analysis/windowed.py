@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.analysis.flight_responses import require_window
+from heli_jax.analysis.flight_responses import one_rate, require_window
 from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.spectra import OWN, leakage
-from heli_jax.analysis.spectral import OVERLAP
+from heli_jax.analysis.spectral import OVERLAP, OWN, leakage
 from heli_jax.flights.flight import Flight
 
 _LONGEST = 30.0
@@ -125,7 +124,6 @@ def window_transforms(
     """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
 
     Args:
-        x: signals (c, N).
         starts: first samples of the W windows.
         length: samples of each.
         lines: the k lines of the window that are kept.
@@ -154,7 +152,6 @@ def windowed(
 
     Args:
         flights: of one rate, with the same inputs; samples of outputs may be missing.
-        options: band, window and points.
         by: inputs that are taken by their instrument (`Flight.instruments`); all that have one in
             every flight unless given.
 
@@ -162,7 +159,7 @@ def windowed(
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has windows enough.
     """
-    dt = _one_rate(flights)
+    dt = one_rate(flights)
     longest = max(f.duration for f in flights) + dt
     seconds = options.window or min(longest / 5.0, _LONGEST)
     require_window(seconds, longest)
@@ -225,8 +222,6 @@ def _complete(
     """The outputs that have windows enough, which windows (W, p), and why others have not.
 
     Args:
-        flights: of one rate.
-        starts: of the windows.
         length: samples of a window.
         asked: the same in seconds, and how many inputs move.
     """
@@ -248,14 +243,6 @@ def _complete(
     each = list(zip(outputs, averages, kept, strict=True))
     left_out = {n: f"{need} {count:.2g} {windows}" for n, count, fine in each if not fine}
     return tuple(n for n, _, fine in each if fine), seen[:, kept], left_out
-
-
-def _one_rate(flights: Sequence[Flight]) -> float:
-    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
-    if len(rates) > 1:
-        listed = ", ".join(f"{r:g}" for r in rates)
-        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return float(flights[0].dt)
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:

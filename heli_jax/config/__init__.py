@@ -9,8 +9,8 @@ from heli_jax.config.problems import (
     disturbed,
     problem,
 )
+from heli_jax.config.run_sections import SimulateConfig, StickConfig
 from heli_jax.config.schema import Config
-from heli_jax.config.simulate_section import SimulateConfig, StickConfig
 
 __all__ = [
     "Config",

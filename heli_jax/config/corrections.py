@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import pydantic
-from pydantic import Field, StrictBool
+from pydantic import Field
 
 from heli_jax import naming, units
 from heli_jax.config.section import Section
@@ -27,7 +27,7 @@ class Conversion(Section):
 
     scale: Finite = 1.0
     offset: Finite = 0.0
-    invert: StrictBool = False
+    invert: bool = False
 
     @property
     def words(self) -> str:
@@ -67,10 +67,6 @@ class Corrections(Section):
 def read_corrections(path: Path, where: str) -> Corrections:
     """A file of corrections.
 
-    Args:
-        path: of the file.
-        where: what errors begin with.
-
     Raises:
         InputError: it cannot be read, or something in it is wrong.
     """
@@ -97,11 +93,7 @@ class Logged(NamedTuple):
 
 
 def logged_signals(flight: Flight) -> Iterator[Logged]:
-    """The signals that a flight has from its logs, inputs first.
-
-    Args:
-        flight: as read; one that a script made has none.
-    """
+    """The signals that a flight has from its logs, inputs first."""
     if flight.source is None:
         return
     for role, signals in (("inputs", flight.source.inputs), ("outputs", flight.source.outputs)):
@@ -117,12 +109,6 @@ def conversion_of(signal: Signal) -> Conversion:
 
 def with_corrections(model: Model, flight: Flight, corrections: Corrections, where: str) -> Flight:
     """The flight without the errors of its sensors; what was done stands in its notes.
-
-    Args:
-        model: of the configuration.
-        flight: as read.
-        corrections: what was found.
-        where: what errors begin with.
 
     Raises:
         InputError: none of its signals is corrected, or a unit is not that of the correction.

@@ -1,6 +1,7 @@
 """An experiment: a configuration read and validated, with what it names at hand."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,17 +11,17 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.keys import expected
 from heli_jax.config.kinematics import completed
-from heli_jax.config.measurement import with_measurement
+from heli_jax.config.measurement import OpenedLogs, with_measurement
 from heli_jax.config.onboard import with_onboard
-from heli_jax.config.opened_logs import OpenedLogs
-from heli_jax.config.quantities import in_si, initial_state
 from heli_jax.config.schema import Config, LinearConfig
+from heli_jax.dynamics.check_model import starting_at
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, VehicleError, nearest, require_kind
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
-from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
+from heli_jax.vehicle import Vehicle, constant, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
 
 
@@ -103,7 +104,7 @@ def from_content(content: dict[str, Any], path: Path) -> Experiment:
     logs = OpenedLogs()
     model = _model(config, path, logs)
     # From here on nobody has to know that numbers may have units.
-    config = in_si(config, model, path)
+    config = _in_si(config, model, path)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle, logs)
 
@@ -141,7 +142,7 @@ def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Mode
     model = with_measurement(model, config.flights, path, logs)
     if not config.initial_state:
         return model
-    return starting_at(model, initial_state(config, model, path))
+    return starting_at(model, _initial_state(config, model, path))
 
 
 def in_wind(experiment: Experiment) -> Experiment:
@@ -219,9 +220,11 @@ def _validated(content: dict[str, Any], where: str) -> Config:
     try:
         config = Config.model_validate(content)
     except pydantic.ValidationError as e:
-        # An unknown key is the likeliest cause of the others (what it was meant for is missing), so
-        # it comes first. One error at a time: a list of twenty is not read.
-        errors = sorted(e.errors(), key=lambda error: error["type"] != "extra_forbidden")
+        # Of a key that may hold one of several kinds pydantic reports each: those of the kind that
+        # stands there say what is wrong. An unknown key is the likeliest cause of the others (what
+        # it was meant for is missing), so it comes first. One error at a time: a list of twenty is
+        # not read.
+        errors = sorted(e.errors(), key=_of_least_use)
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
     # Where a text may stand it would be a channel's name, or a unit.
     if place := next(_still_to_edit(content), None):
@@ -243,6 +246,21 @@ def _edit_words(place: tuple[str | int, ...]) -> str:
     return f"{_place(place)}: is still {EDIT}, expected {expected}"
 
 
+_KIND = re.compile(r"(str|int|float|bool|[A-Z]\w*Config|(list|dict|tuple|literal|constrained)\W.*)")
+"""a member of a union, which stands in pydantic's places as if it were a key"""
+
+
+def _of_least_use(error: ErrorDetails) -> tuple[bool, bool]:
+    """Order errors by how much they say: those of a kind that does not stand there come last."""
+    return _is_of_another_kind(error), error["type"] != "extra_forbidden"
+
+
+def _is_of_another_kind(error: ErrorDetails) -> bool:
+    kinds = [part for part in error["loc"] if isinstance(part, str) and _KIND.fullmatch(part)]
+    # Of the kind that stands there, unless the value as a whole is what is wrong.
+    return bool(kinds) and error["loc"][-1] == kinds[-1] and not error["type"].startswith("value")
+
+
 def _sentence(error: ErrorDetails) -> str:
     place = _place(error["loc"])
     value = error.get("input")
@@ -255,6 +273,9 @@ def _sentence(error: ErrorDetails) -> str:
         return f"{place}: missing"
     if value == EDIT:
         return _edit_words(error["loc"])
+    if _is_of_another_kind(error):
+        kind = expected([part for part in error["loc"] if not _KIND.fullmatch(str(part))])
+        return f"{place}: got {value!r:.60}, expected {kind}"
     # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
@@ -290,9 +311,7 @@ def _place(loc: tuple[int | str, ...]) -> str:
     for part in loc:
         if isinstance(part, int):
             text += f"[{part}]"
-        # The members of a union (`vehicle: str | dict`) stand in pydantic's places as if they were
-        # keys.
-        elif part not in ("str", "dict[str,any]"):
+        elif not _KIND.fullmatch(part):
             text += f".{part}" if text else str(part)
     return text or "the configuration"
 
@@ -428,3 +447,58 @@ def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
         yield design
         for part in design.get("of", []):
             yield from _designs(part)
+
+
+def _in_si(config: Config, model: Model, path: Path) -> Config:
+    """The configuration with plain numbers in SI for the initial state and the disturbance."""
+    changes: dict[str, Any] = {}
+    if config.initial_state:
+        changes["initial_state"] = _initial_state(config, model, path)
+    disturbance = config.disturbance
+    if disturbance is not None and disturbance.has_units:
+        where = f"{path}: disturbance"
+        try:
+            params = with_disturbance(model, disturbance.names, disturbance.poles).Params
+        except ValueError as e:
+            raise InputError(f"{where}: {e}") from e
+        converted = {}
+        for key in ("sigma_w", "tau_w"):
+            # The units are those that the disturbed model gives to its parameters.
+            of_key = {n: _si(n, params) for n in disturbance.parameters if n.startswith(key)}
+            converted[key] = _converted(getattr(disturbance, key), key, of_key, where)
+        changes["disturbance"] = disturbance.model_copy(update=converted)
+    return config.model_copy(update=changes)
+
+
+def _initial_state(config: Config, model: Model, path: Path) -> dict[str, float]:
+    """The configuration's initial state [SI]."""
+    where, states = f"{path}: initial_state", naming.names(model.State)
+    for name in config.initial_state:
+        if name not in states:
+            raise InputError(
+                f"{where}: model {model.name} has no state {name!r}{nearest(name, states)}"
+            )
+    return {
+        name: constant(entry, name, _si(name, model.State), where).value
+        for name, entry in config.initial_state.items()
+    }
+
+
+def _si(name: str, record: type) -> str | None:
+    return naming.unit(record, name)
+
+
+# Any: None, a number, {value, unit}, or one of these for each of several disturbances by name.
+def _converted(value: Any, key: str, si: Mapping[str, str | None], where: str) -> Any:
+    """A disturbance's sizes or time constants, in the shape in which they stand in the file."""
+    if isinstance(value, Mapping) and "value" not in value:
+        return {
+            n: _one(v, f"{key}.{n}", si.get(f"{key}_{n}", si.get(key)), where)
+            for n, v in value.items()
+        }
+    # One number for several may only be a time constant, whose unit is that of all.
+    return None if value is None else _one(value, key, next(iter(si.values())), where)
+
+
+def _one(entry: Any, place: str, si: str | None, where: str) -> float:
+    return constant(entry, place, si, where).value

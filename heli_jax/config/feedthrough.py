@@ -28,9 +28,7 @@ def follows(
     By the linearisation with the free parameters at their starts.
 
     Args:
-        experiment: with its model.
         rate: to which a log is resampled [Hz]; None where it is not, and nobody has to know.
-        inputs: the log's by name; what is linear between samples needs no answer.
     """
     model = experiment.model
     if rate is None or all(s.hold == "linear" for s in inputs.values()):

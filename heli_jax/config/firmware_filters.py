@@ -8,7 +8,7 @@ velocities are estimated by Kalman filters and the like, of which no setting say
 
 import re
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from heli_jax.dynamics.onboard.filters import Filter
 
@@ -27,13 +27,7 @@ class LoggedFilters(NamedTuple):
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
-    """How a channel was filtered; None where the log does not say.
-
-    Args:
-        firmware: as the log names it.
-        settings: of the firmware, by name.
-        channel: of the log.
-    """
+    """How a channel was filtered; None where the log does not say."""
     for pattern, reader in _CHANNELS:
         if re.fullmatch(pattern, channel):
             return reader(_Reading(firmware, settings))
@@ -89,16 +83,21 @@ def _px4_gyro(read: _Reading) -> LoggedFilters | None:
     return read.result
 
 
-def _px4_accel(read: _Reading) -> LoggedFilters | None:
-    if "IMU_ACCEL_CUTOFF" not in read.settings:
-        return None
-    _biquad(read, "IMU_ACCEL_CUTOFF")
-    return read.result
-
-
 def _biquad(read: _Reading, name: str) -> None:
     if read.number(name) > 0:
         read.add(name, Filter("biquad", read.number(name)))
+
+
+def _accel(name: str) -> Callable[[_Reading], LoggedFilters | None]:
+    """The reader of a channel that has one low-pass."""
+
+    def read(reading: _Reading) -> LoggedFilters | None:
+        if name not in reading.settings:
+            return None
+        _biquad(reading, name)
+        return reading.result
+
+    return read
 
 
 def _ardupilot_gyro(read: _Reading) -> LoggedFilters | None:
@@ -113,13 +112,6 @@ def _ardupilot_gyro(read: _Reading) -> LoggedFilters | None:
     # The harmonic notches follow the rotor, its throttle or a spectrum, in most of their modes.
     read.moving("INS_HNTCH_ENABLE", "INS_HNTC2_ENABLE")
     _biquad(read, "INS_GYRO_FILTER")
-    return read.result
-
-
-def _ardupilot_accel(read: _Reading) -> LoggedFilters | None:
-    if "INS_ACCEL_FILTER" not in read.settings:
-        return None
-    _biquad(read, "INS_ACCEL_FILTER")
     return read.result
 
 
@@ -178,7 +170,8 @@ def _decimation(read: _Reading) -> None:
     # The sensor's samples are brought to the loop's rate behind a Bessel filter of fourth order.
     hz = read.number("gyro_decimation_hz")
     if hz > 0:
-        read.add("gyro_decimation_hz", *_bessel_4(hz))
+        first = Filter("biquad", 1.603357516 * hz, 0.805538282)
+        read.add("gyro_decimation_hz", first, Filter("biquad", 1.430171560 * hz, 0.521934582))
 
 
 def _moves(limits: list[float], hz: float, rotorflight: bool) -> bool:
@@ -189,45 +182,28 @@ def _moves(limits: list[float], hz: float, rotorflight: bool) -> bool:
     return limits[0] <= hz <= limits[1] if rotorflight else limits[1] > limits[0]
 
 
-def _bessel_4(hz: float) -> tuple[Filter, Filter]:
-    return (
-        Filter("biquad", 1.603357516 * hz, 0.805538282),
-        Filter("biquad", 1.430171560 * hz, 0.521934582),
-    )
+type _Kinds = Mapping[float, Callable[[float], Filter]]
 
 
-def _bessel(hz: float) -> Filter:
-    return Filter("biquad", 1.272019649 * hz, 0.577350269)
-
-
-def _pt1(hz: float) -> Filter:
-    return Filter("pt1", hz)
-
-
-def _pt2(hz: float) -> Filter:
-    return Filter("pt2", hz)
-
-
-def _pt3(hz: float) -> Filter:
-    return Filter("pt3", hz)
-
-
-def _butterworth(hz: float) -> Filter:
-    return Filter("biquad", hz)
+def _pt(kind: Literal["pt1", "pt2", "pt3"]) -> Callable[[float], Filter]:
+    return lambda hz: Filter(kind, hz)
 
 
 # In the order of the enumerations in their filter.h. Rotorflight 4.6 has PT4 in between, which
 # moves the last four; its types from 6 on are therefore not read.
-_BETAFLIGHT: dict[float, Callable[[float], Filter]] = {0: _pt1, 1: _butterworth, 2: _pt2, 3: _pt3}
-_ROTORFLIGHT: dict[float, Callable[[float], Filter]] = {
-    1: _pt1, 2: _bessel, 3: _pt1, 4: _pt2, 5: _pt3,
+_BETAFLIGHT: _Kinds = {
+    0: _pt("pt1"), 1: lambda hz: Filter("biquad", hz), 2: _pt("pt2"), 3: _pt("pt3"),
+}  # fmt: skip
+_ROTORFLIGHT: _Kinds = {
+    1: _pt("pt1"), 3: _pt("pt1"), 4: _pt("pt2"), 5: _pt("pt3"),
+    2: lambda hz: Filter("biquad", 1.272019649 * hz, 0.577350269),  # Bessel's
 }  # fmt: skip
 
 _CHANNELS: tuple[tuple[str, Callable[[_Reading], LoggedFilters | None]], ...] = (
     (r"vehicle_angular_velocity(\[\d+\])?\.xyz\[[012]\]", _px4_gyro),
-    (r"vehicle_acceleration(\[\d+\])?\.xyz\[[012]\]", _px4_accel),
+    (r"vehicle_acceleration(\[\d+\])?\.xyz\[[012]\]", _accel("IMU_ACCEL_CUTOFF")),
     (r"RATE\.[RPY]|IMU\d?(\[\d+\])?\.Gyr[XYZ]|SIDD\.G[xyz]", _ardupilot_gyro),
-    (r"IMU\d?(\[\d+\])?\.Acc[XYZ]|SIDD\.A[xyz]", _ardupilot_accel),
+    (r"IMU\d?(\[\d+\])?\.Acc[XYZ]|SIDD\.A[xyz]", _accel("INS_ACCEL_FILTER")),
     (r"gyroADC\[[012]\]", _blackbox_gyro),
     (r"gyroRAW\[[012]\]", _rotorflight_raw),
 )

@@ -16,10 +16,6 @@ def asked_handling(
     """Responses whose handling qualities are shown: those that the configuration names, or else
     those of the model's axes.
 
-    Args:
-        experiment: the configuration.
-        logged: outputs of the flights.
-
     Raises:
         InputError: the model has no such input or output, or the output is no angle and no rate.
     """
@@ -29,7 +25,11 @@ def asked_handling(
     check_pairs(experiment, "handling", config.handling)
     unit = units_of(experiment)
     for i, h in enumerate(config.handling):
-        if h.response == "open-loop" or _is(unit[h.output], "rad") or _is(unit[h.output], "rad/s"):
+        if (
+            h.response == "open-loop"
+            or units.fits(unit[h.output], "rad")
+            or units.fits(unit[h.output], "rad/s")
+        ):
             continue
         raise InputError(
             f"{experiment.path}: frequency.handling[{i}].output: {h.output} is in {unit[h.output]},"
@@ -41,28 +41,15 @@ def asked_handling(
             h.input,
             h.output,
             h.response,
-            integrated=_is(unit[h.output], "rad/s") and h.response != "open-loop",
+            integrated=units.fits(unit[h.output], "rad/s") and h.response != "open-loop",
             gain=h.gain,
         )
         for h in config.handling
     )
 
 
-def _is(unit: str, si: str) -> bool:
-    try:
-        units.factor(unit, si)
-    except ValueError:
-        return False
-    return True
-
-
 def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[Finding, ...]:
-    """Why axes that were logged have no handling qualities, where none are asked for by name.
-
-    Args:
-        experiment: the configuration.
-        logged: outputs of the flights.
-    """
+    """Why axes that were logged have no handling qualities, where none are asked for by name."""
     config = experiment.config.frequency or FrequencyConfig()
     gaps = handling_gaps(experiment.model, logged) if config.handling is None else ()
     return tuple(note("responses.no-handling", words) for words in gaps)
@@ -74,9 +61,7 @@ def check_pairs(
     """Refuse pairs of input and output that the model has not.
 
     Args:
-        experiment: the configuration.
         section: of `frequency` that they stand in.
-        pairs: as they stand there.
 
     Raises:
         InputError: one of them.

@@ -1,8 +1,8 @@
 """What may stand in a configuration's section `frequency`: responses of the logs, and their fit."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, StrictBool, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from heli_jax.config.section import Section
 
@@ -10,13 +10,13 @@ _Coherence = Annotated[float, Field(ge=0, lt=1)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-def increasing(band: Any) -> Any:
-    """Two rising frequencies, or what pydantic will say is none."""
-    if isinstance(band, list | tuple) and len(band) == 2:
-        numbers = [b for b in band if isinstance(b, int | float)]
-        if len(numbers) == 2 and not numbers[0] < numbers[1]:
-            raise ValueError(f"expected two increasing frequencies in Hz, got {list(band)}")
+def _increasing(band: tuple[float, float]) -> tuple[float, float]:
+    if not band[0] < band[1]:
+        raise ValueError(f"expected two increasing frequencies in Hz, got {list(band)}")
     return band
+
+
+_Band = Annotated[tuple[_Positive, _Positive], AfterValidator(_increasing)]
 
 
 class TransferConfig(Section):
@@ -30,11 +30,11 @@ class TransferConfig(Section):
     """of the transfer function"""
     poles: Annotated[int, Field(ge=1, le=8)]
     """of the transfer function"""
-    delay: StrictBool = True
+    delay: bool = True
     """whether it has a delay"""
-    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    band: _Band | None = None
     """[Hz]; all frequencies unless given"""
-    coherence: Annotated[float, Field(ge=0, lt=1)] = 0.6
+    coherence: _Coherence = 0.6
     """frequencies of less are left out"""
 
     @model_validator(mode="after")
@@ -53,7 +53,7 @@ class PairConfig(Section):
     """the model's name"""
     output: str
     """the model's name"""
-    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    band: _Band | None = None
     """[Hz]; that of all unless given"""
     coherence: _Coherence | None = None
     """likewise"""
@@ -83,7 +83,7 @@ class HandlingConfig(Section):
 class FrequencyConfig(Section):
     """Which frequencies, in windows of which length."""
 
-    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    band: _Band | None = None
     """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""
     window: _Positive | None = None
     """length [s]; unless given a fifth of the longest flight, 30 s at most"""

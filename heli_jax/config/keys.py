@@ -1,15 +1,9 @@
 """The keys of a configuration, from the classes that check them: for editors and readers."""
 
-import itertools
-import math
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel
-
 from heli_jax.config.schema import Config
-from heli_jax.naming import texts
 
 _URL = "https://json-schema.org/draft/2020-12/schema"
 # Of a mapping the name is the user's: of a signal, a parameter, a state.
@@ -32,15 +26,8 @@ class Key(NamedTuple):
 
 def json_schema() -> dict[str, Any]:
     """The JSON schema of a configuration, by which editors complete and check YAML."""
-    schema = Config.model_json_schema()
-    for name, section in _sections(Config).items():
-        place = schema if section is Config else schema["$defs"].get(name)
-        if place is None:
-            continue
-        for field, words in _meanings(section).items():
-            if field in place["properties"]:
-                place["properties"][field]["description"] = words
-    return {"$schema": _URL, **_finite(schema), "title": "heli_jax configuration"}
+    schema = _plain(Config.model_json_schema())
+    return {"$schema": _URL, **schema, "title": "heli_jax configuration"}
 
 
 def keys() -> list[Key]:
@@ -50,15 +37,29 @@ def keys() -> list[Key]:
 
 
 def matching(pattern: str) -> list[Key]:
-    """The keys whose path holds a text, in any case; else those whose meaning does.
-
-    Args:
-        pattern: the text, blanks at its ends left out.
-    """
+    """The keys whose path holds a text, in any case; else those whose meaning does."""
     text, every = pattern.strip().lower(), keys()
     by_path = [k for k in every if text in k.path.lower()]
     # A word of the meaning finds a key whose name the reader does not know.
     return by_path or [k for k in every if text in k.meaning.lower()]
+
+
+def expected(place: Sequence[str | int]) -> str:
+    """What may stand at a place of a configuration, in words: `number or list of number`."""
+    schema = json_schema()
+    at: Any = schema
+    for part in place:
+        options = [
+            schema["$defs"].get(o.get("$ref", "").rsplit("/", 1)[-1], o) for o in _options(at)
+        ]
+        inner = [
+            o.get("items")
+            if isinstance(part, int)
+            else o.get("properties", {}).get(part, o.get("additionalProperties"))
+            for o in options
+        ]
+        at = next((i for i in inner if isinstance(i, dict)), {})
+    return _kind(schema, at)
 
 
 def _walk(
@@ -115,8 +116,10 @@ def _one_kind(schema: Mapping[str, Any], option: Mapping[str, Any]) -> str:
     if "enum" in option:
         return " | ".join(map(str, option["enum"][:_MOST_CHOICES]))
     match option.get("type"):
+        case "array" if "prefixItems" in option:
+            return f"[{', '.join(_kind(schema, item) for item in option['prefixItems'])}]"
         case "array":
-            return _list_kind(schema, option)
+            return f"list of {_kind(schema, option.get('items', {}))}"
         case "object":
             inner = option.get("additionalProperties")
             return f"{_kind(schema, inner) if isinstance(inner, dict) else 'any'} by name"
@@ -130,12 +133,6 @@ def _one_kind(schema: Mapping[str, Any], option: Mapping[str, Any]) -> str:
             return "any"
         case kind:
             return str(kind)
-
-
-def _list_kind(schema: Mapping[str, Any], option: Mapping[str, Any]) -> str:
-    if "prefixItems" in option:
-        return f"[{', '.join(_kind(schema, item) for item in option['prefixItems'])}]"
-    return f"list of {_kind(schema, option.get('items', {}))}"
 
 
 def _bounds(option: Mapping[str, Any]) -> str:
@@ -159,47 +156,11 @@ def _written(default: Any) -> str:
     return str(default)
 
 
-def _finite(value: Any) -> Any:
-    """The schema without NaN, of which JSON knows nothing: such a default is none."""
+def _plain(value: Any) -> Any:
+    """The schema without NaN, of which JSON knows nothing: such a default is none; each description
+    in one line."""
     if isinstance(value, dict):
-        kept = ((k, v) for k, v in value.items() if not (k == "default" and _is_nan(v)))
-        return {k: _finite(v) for k, v in kept}
-    return [_finite(v) for v in value] if isinstance(value, list) else value
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
-
-
-def _sections(of: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    """The classes of all sections by their names."""
-    sections: dict[str, type[BaseModel]] = {}
-    todo = [of]
-    while todo:
-        section = todo.pop()
-        if section.__name__ not in sections:
-            sections[section.__name__] = section
-            fields = section.model_fields.values()
-            todo += itertools.chain.from_iterable(_classes(f.annotation) for f in fields)
-            todo += itertools.chain.from_iterable(_classes(m) for f in fields for m in f.metadata)
-    return sections
-
-
-def _classes(kind: Any) -> Iterator[type[BaseModel]]:
-    # A validator that takes other forms than the field's type says them beside itself.
-    kind = getattr(kind, "json_schema_input_type", kind)
-    if isinstance(kind, type) and issubclass(kind, BaseModel):
-        yield kind
-    for inner in typing.get_args(kind):
-        yield from _classes(inner)
-
-
-def _meanings(section: type[BaseModel]) -> dict[str, str]:
-    """What stands below each field in the source, by field; own fields over inherited ones."""
-    # Read from the source when it is asked for: pydantic would do so at every import.
-    meanings: dict[str, str] = {}
-    for each in reversed(section.__mro__):
-        if issubclass(each, BaseModel) and each is not BaseModel:
-            meanings |= texts(each)
-    aliases = {n: f.alias for n, f in section.model_fields.items() if f.alias}
-    return {aliases.get(name, name): words for name, words in meanings.items()}
+        return {k: _plain(v) for k, v in value.items() if not (k == "default" and v != v)}
+    if isinstance(value, str):
+        return " ".join(value.split())
+    return [_plain(v) for v in value] if isinstance(value, list) else value

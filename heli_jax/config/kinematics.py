@@ -50,7 +50,6 @@ def errors_of(model: Model, outputs: Iterable[str]) -> dict[str, Free]:
 
     Args:
         model: of `heli_jax.dynamics.kinematics`.
-        outputs: those that are measured.
     """
     measured = set(outputs)
     # An airspeed alone is the only velocity there is: a steady wind is then no part of the motion.
@@ -69,7 +68,6 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
 
     Args:
         content: as read, not validated.
-        where: the file, for errors.
 
     Raises:
         InputError: accelerometers without a velocity to compare them with, or the reverse.
@@ -84,11 +82,13 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
     fit = content.get("fit") or {}
     if not isinstance(fit, dict) or not isinstance(fit.get("nuisance", {}), dict):
         return content  # the validation says what is wrong with it
+    vehicle = content.get("vehicle")
+    given = {str(n) for n in vehicle} if isinstance(vehicle, dict) else set()
     free = {
         n: {"start": f.start, "prior": {"mean": f.prior.mean, "sd": f.prior.sd}}
         for n, f in errors_of(model, outputs).items()
         # Who gives a value knows the error: it is not searched for.
-        if f.prior is not None and n not in _given(content)
+        if f.prior is not None and n not in given
     }
     # A bias of the outputs or an offset of the inputs would be a second name of the same error, and
     # one delay among so many needs no search over its valleys.
@@ -102,10 +102,6 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
 def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Signal]:
     """The inputs of a kinematic model, moving between samples where the configuration says nothing
     of it: a rate is measured, nobody commands it in steps.
-
-    Args:
-        model: any; the inputs of another than a kinematic one stay as they are.
-        inputs: by the model's name.
     """
     if not is_kinematic(model):
         return dict(inputs)
@@ -136,11 +132,6 @@ def _named(signals: dict[str, Any], role: str) -> set[str]:
     if role == "outputs":
         return names | asked
     return names | ({*FORCES} if asked & {*GROUND, *BODY, *POSITION, "V"} else set())
-
-
-def _given(content: dict[str, Any]) -> set[str]:
-    vehicle = content.get("vehicle")
-    return {str(n) for n in vehicle} if isinstance(vehicle, dict) else set()
 
 
 _STRAIGHT_UP = 1.6
@@ -218,7 +209,6 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
 
     Args:
         model: of `heli_jax.dynamics.kinematics`.
-        flights: read.
     """
     known, noise = naming.names(model.Params), {}
     for parameter, names in NOISES.items():
@@ -269,16 +259,14 @@ def sharpened(model: Model, flight: Flight) -> Flight:
     """
     if not is_kinematic(model):
         return flight
+    # Second differences, at the ends those of their neighbours.
     inputs = {
-        n: u - _second_difference(u) / 12.0 if flight.hold.get(n) == "linear" else u
+        n: u - np.pad(np.diff(u, 2), 1, mode="edge") / 12.0
+        if flight.hold.get(n) == "linear" and u.size > 2
+        else u
         for n, u in flight.inputs.items()
     }
     return dataclasses.replace(flight, inputs=inputs)
-
-
-def _second_difference(u: np.ndarray) -> np.ndarray:
-    """(N,), at the ends that of their neighbours."""
-    return np.pad(np.diff(u, 2), 1, mode="edge") if u.size > 2 else np.zeros_like(u)
 
 
 _STEP, _EXPLICIT = 0.005, 0.02
@@ -292,7 +280,6 @@ def substeps_of(model: Model, flights: Sequence[Flight]) -> int:
 
     Args:
         model: of `heli_jax.dynamics.kinematics`, bare or with devices around it.
-        flights: read.
     """
     step = _EXPLICIT if model.explicit else _STEP
     return max(1, *(math.ceil(f.dt / step - 1e-9) for f in flights))

@@ -2,25 +2,30 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.config.corrections import read_corrections, with_corrections
-from heli_jax.config.doubts import OFFSET_AND_SCALE, pulse_width_doubts
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
-from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
-from heli_jax.config.measurement import coloured_noise_cautions, filter_cautions
+from heli_jax.config.measurement import (
+    coloured_noise_cautions,
+    filter_cautions,
+    unfiltered_cautions,
+)
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
     AlsoConfig,
     FlightConfig,
     InputConfig,
     OutputConfig,
+    SignalsConfig,
     TimeConfig,
 )
-from heli_jax.config.unfiltered_noise import unfiltered_cautions
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -35,6 +40,24 @@ from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.row_clock import by_rate
 from heli_jax.flights.table import Table
 from heli_jax.identification.methods import estimator_of
+
+_PULSE = (800.0, 2200.0)
+"""us; what receivers and servos know"""
+_OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
+
+
+def with_log(experiment: Experiment, log: str) -> Experiment:
+    """The configuration with a log in place of its own, read as its first flight's is.
+
+    Raises:
+        InputError: the configuration has no flight.
+    """
+    config = experiment.config
+    if not config.flights:
+        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
+    whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
+    flights = [config.flights[0].model_copy(update=whole)]
+    return experiment._replace(config=config.model_copy(update={"flights": flights}))
 
 
 def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight, ...]:
@@ -78,11 +101,11 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     # Of all logs together: what one lacks may stand in another.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
-    instruments = instrument_signals(model, f.signals, f"{where}.signals")
+    instruments = _instrument_signals(model, f.signals, f"{where}.signals")
     try:
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         runs = (time.runs if time is not None else None) or ""
-        flights = (read_parts if f.gaps == "split" or runs else _read_one)(
+        flights = (read_parts if f.gaps == "split" or runs else read_flight)(
             path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=_clock(time),
@@ -102,14 +125,15 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
+    flights = (flights,) if isinstance(flights, Flight) else flights
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
-    flights = tuple(with_instruments(flight, instruments) for flight in flights)
+    flights = tuple(_with_instruments(flight, instruments) for flight in flights)
     first, *others = _treated(experiment, flights, f, where)
     cautions = (
         *filter_cautions(first.source, everything.outputs),
         *unfiltered_cautions(first, everything.outputs),
         *(coloured_noise_cautions(first, experiment.model) if _noise_given(experiment) else ()),
-        *pulse_width_doubts(first),
+        *_pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),
     )
     return (_with_notes(first, notes, cautions), *others)
@@ -204,7 +228,6 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
     """What is taken of a log where a configuration's first flight says what its signals are.
 
     Args:
-        experiment: the configuration.
         selection: goes before what the configuration says of rate, flight and clock. Without
             signals of its own the columns are the model's inputs and outputs, in SI.
 
@@ -266,10 +289,6 @@ def _columns(experiment: Experiment) -> NamedBy:
         return Named(signals, tuple(notes))
 
     return named
-
-
-def _read_one(path: Any, **request: Any) -> tuple[Flight, ...]:
-    return (read_flight(path, **request),)
 
 
 def first_signals(experiment: Experiment) -> Resolved:
@@ -395,6 +414,7 @@ def signals(
         unit = config.unit if config.unit is not None else (si or "1")
         # Inputs have a hold and no sd, outputs the reverse.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
+        missing = [] if config.missing is None else config.missing
         out[name] = Signal(
             config.signal or "",
             unit,
@@ -404,16 +424,10 @@ def signals(
             getattr(config, "repeats", "auto"),
             **config.conversion,
             constant=getattr(config, "constant", None),
-            missing=_listed(getattr(config, "missing", None)),
+            missing=tuple(missing if isinstance(missing, list) else [missing]),
             assumed=config.unit is None and si is not None,
         )
     return out
-
-
-def _listed(numbers: float | list[float] | None) -> tuple[float, ...]:
-    if numbers is None:
-        return ()
-    return tuple(map(float, numbers if isinstance(numbers, list) else [numbers]))
 
 
 def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
@@ -432,7 +446,7 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
         # A receiver's pulse width is a time, and no stick of any model is one.
         if role == "inputs" and si is not None and units.is_time(unit):
-            example = f'{OFFSET_AND_SCALE}, unit: "1"'
+            example = f'{_OFFSET_AND_SCALE}, unit: "1"'
             if not units.is_plain(si):
                 example = f"such as offset: 1500, scale in {si} per {unit.strip()}, unit: {si}"
             hint = (
@@ -440,3 +454,83 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
             )
         raise InputError(f"{place}: {e}{hint}") from e
     return si
+
+
+def _pulse_width_doubts(flight: Flight) -> tuple[Finding, ...]:
+    """A doubt for each input whose numbers look like pulse widths and are taken as something
+    else.
+    """
+    doubts = []
+    for name, signal in (flight.source.inputs if flight.source else {}).items():
+        # A rotor's speed in rpm has such numbers too.
+        if signal.constant is not None or signal.offset or signal.si in ("rad/s", "1/s", "Hz"):
+            continue
+        numbers = signal.from_si(flight.inputs[name])
+        low, high = float(np.min(numbers)), float(np.max(numbers))
+        if low < _PULSE[0] or high > _PULSE[1]:
+            continue
+        taken = "plain numbers" if units.is_plain(signal.unit) else signal.unit
+        if signal.scale != 1.0:
+            taken = f"{signal.scale:g} {taken} each"
+        words = (
+            f"{name}: {low:.4g} to {high:.4g} in the log look like pulse widths in us, and are "
+            f"taken as {taken}, with no offset: state offset and scale, {_OFFSET_AND_SCALE}"
+        )
+        doubts.append(Finding("units.unlikely", "doubt", words, high, "largest number", (name,)))
+    return tuple(doubts)
+
+
+_PREFIX = "instrument of "
+
+
+def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict[str, Signal]:
+    """The instruments as further inputs of the log, by a name that says which input they excite.
+
+    Raises:
+        InputError: an input that the model lacks, a constant, or a unit that is unknown.
+    """
+    signals = {}
+    for name, stated in config.instruments.items():
+        place = f"{where}.instruments.{name}"
+        known = naming.names(model.Inputs)
+        if name not in known:
+            raise InputError(
+                f"{place}: model {model.name} has no input {name!r}{nearest(name, known)}"
+            )
+        if stated.signal is None:
+            raise InputError(f"{place}: expected a signal of the log, got a constant")
+        unit = stated.unit or "1"
+        try:
+            # Its size does not matter: a response by instrument is a quotient of two.
+            si = units.si_of(unit)
+        except ValueError as e:
+            raise InputError(f"{place}.unit: {e}") from e
+        signals[_PREFIX + name] = Signal(
+            stated.signal, unit, si, hold=stated.hold, **stated.conversion
+        )
+    return signals
+
+
+def _with_instruments(flight: Flight, instruments: Mapping[str, Signal]) -> Flight:
+    """The flight with its instruments apart from its inputs.
+
+    Args:
+        instruments: as `_instrument_signals` named them.
+    """
+    if not instruments:
+        return flight
+
+    def apart(by_input: dict) -> dict:
+        return {n: v for n, v in by_input.items() if n not in instruments}
+
+    source = flight.source
+    if source is not None:
+        source = dataclasses.replace(source, inputs=apart(dict(source.inputs)))
+    return dataclasses.replace(
+        flight,
+        inputs=apart(flight.inputs),
+        hold=apart(flight.hold),
+        hold_reason=apart(flight.hold_reason),
+        instruments={n.removeprefix(_PREFIX): flight.inputs[n] for n in instruments},
+        source=source,
+    )

@@ -1,25 +1,86 @@
 """What stands between motion and log according to the flights' outputs: filters and delays."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from heli_jax import naming
 from heli_jax.config.firmware_filters import LoggedFilters, logged_filters
 from heli_jax.config.onboard import FROM_LOG
-from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.onboard.filters import Filter, cutoff, with_filters
+from heli_jax.dynamics.onboard.filters import Filter, cutoff, gain, with_filters
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.table import shown
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.signal_facts import quantum
+from heli_jax.flights.table import Table, shown
 from heli_jax.identification.filtered_noise import filtered_noise
+from heli_jax.numbers import percent
 
 type _Channel = tuple[tuple[Filter, ...], float]
+
+
+_MOST = 2 * 10**8
+"""bytes of all files that are kept open: a larger one is parsed again, which spares the memory"""
+
+type _Key = tuple[str, int | None, int, int]
+
+
+class OpenedLogs:
+    """Logs of one configuration, each parsed once until the flights are read: for the firmware's
+    settings, which are part of the model, and for the flights."""
+
+    def __init__(self) -> None:
+        self._logs: dict[_Key, Table | ChannelLog] = {}
+
+    def __reduce__(self) -> tuple:
+        # An experiment that goes to another process has its logs read there.
+        return OpenedLogs, ()
+
+    def open(self, path: Path, number: int | None) -> Table | ChannelLog:
+        """The log, opened now or before.
+
+        Args:
+            number: which flight of several, from 1.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        key = _key(path, number)
+        if key not in self._logs:
+            log = open_log(path, number)
+            if log.size + sum(kept.size for kept in self._logs.values()) > _MOST:
+                return log
+            self._logs[key] = log
+        return self._logs[key]
+
+    def get(self, path: Path, number: int | None) -> Table | ChannelLog | None:
+        """The log if it is open.
+
+        Args:
+            number: which flight of several, from 1.
+        """
+        return self._logs.get(_key(path, number))
+
+    def close(self) -> None:
+        """Keep none any longer."""
+        self._logs.clear()
+
+
+def _key(path: Path, number: int | None) -> _Key:
+    # With time and size: a log that was written anew is another one.
+    try:
+        stat = path.stat()
+    except OSError:  # the reader says what is wrong with it
+        return str(path.absolute()), number, 0, 0
+    return str(path.absolute()), number, stat.st_mtime_ns, stat.st_size
 
 
 def with_measurement(
@@ -29,9 +90,6 @@ def with_measurement(
 
     Args:
         model: with the devices of `onboard` around it.
-        flights: of the configuration.
-        path: the configuration; logs are found from its folder.
-        logs: those that are open; one whose settings are asked for is among them then.
 
     Raises:
         InputError: two flights state different ones, a log does not say what it is asked, or the
@@ -39,7 +97,8 @@ def with_measurement(
     """
     channels: dict[str, tuple[_Channel, int]] = {}
     for i, flight in enumerate(flights):
-        for part, name, output in _outputs(flight):
+        parts = (flight, *flight.also)
+        for part, name, output in ((p, n, o) for p in parts for n, o in p.signals.outputs.items()):
             if name not in naming.names(model.Outputs):
                 continue  # refused where the log is read, with the names that there are
             channel = _channel(part, f"flights[{i}].signals.outputs.{name}", output, path, logs)
@@ -61,14 +120,6 @@ def with_measurement(
         raise InputError(f"{path}: flights.signals.outputs: {e}") from e
 
 
-def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
-    """The outputs of a flight with the section that names their log, which has `log`, `flight` and
-    `signals`: the flight itself, or a further log of it."""
-    for part in (flight, *flight.also):
-        for name, output in part.signals.outputs.items():
-            yield part, name, output
-
-
 def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: OpenedLogs) -> _Channel:
     """The filters and the delay of one output."""
     filters: list[Filter] = []
@@ -78,7 +129,9 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             continue
         log = logs.open(path.parent / part.log, part.flight)
         # First, or a misspelt channel would be taken for one of which the log says nothing.
-        if not _is_derived(output.signal) and output.signal not in log.names:
+        # What is computed from channels stands in no log.
+        derived = "(" in output.signal or output.signal.startswith("ccpm.")
+        if not derived and output.signal not in log.names:
             near = nearest(output.signal[:60], {n[:60] for n in log.names})
             raise InputError(
                 f"{path}: {where}.signal: {part.log} has no channel {shown(output.signal)}{near}"
@@ -93,11 +146,6 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             )
         filters += logged.filters
     return tuple(filters), output.delay or 0.0
-
-
-def _is_derived(signal: str) -> bool:
-    """Whether it is computed from channels, and so stands in no log."""
-    return "(" in signal or signal.startswith("ccpm.")
 
 
 def _words(channel: _Channel) -> str:
@@ -117,12 +165,7 @@ def filter_words(filter: Filter) -> str:
 def filter_cautions(
     source: Source | None, outputs: Mapping[str, OutputConfig]
 ) -> tuple[Finding, ...]:
-    """What the log's settings say of an output's filter and the configuration does not model.
-
-    Args:
-        source: of the flight that was read.
-        outputs: what is stated of each, or its preset says.
-    """
+    """What the log's settings say of an output's filter and the configuration does not model."""
     if source is None:
         return ()
     said = []
@@ -146,10 +189,6 @@ def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]
     where filter error is told the measurement noise and so estimates no other.
 
     The noise is then taken for a disturbance or a faster machine.
-
-    Args:
-        flight: as it is fitted.
-        model: with the filters of its outputs.
     """
     return tuple(
         Finding(
@@ -174,7 +213,8 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     late = 1e3 * sum(f.delay for f in filters)
     # All of the line: of an output that a preset supplies the configuration has none.
     line = [f'signal: "{output.signal}"', *([f"unit: {output.unit}"] if output.unit else [])]
-    line += [f"{key}: {value:g}" for key, value in _changed(output).items()]
+    line += [f"scale: {output.scale:g}"] * (output.scale != 1.0)
+    line += [f"offset: {output.offset:g}"] * (output.offset != 0.0)
     line += ["invert: true"] * output.invert
     # The inputs were not: were both filtered alike, the machine would look the same.
     words = (
@@ -186,12 +226,80 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
 
 
-def _changed(output: OutputConfig) -> dict[str, float]:
-    """Scale and offset where they do something."""
-    return {
-        k: v for k, v, d in (("scale", output.scale, 1.0), ("offset", output.offset, 0.0)) if v != d
-    }
-
-
 def _short(setting: str) -> str:
     return setting if len(setting) <= 48 else f"{setting[:45]}..."
+
+
+_BANDS = 12
+"""of equal width in the logarithm"""
+_LOWEST, _HIGHEST = 0.05, 0.4
+"""of the rate, between which noise is looked for: slower is motion, and resampling takes what is
+faster"""
+_LEFT, _THERE = 0.25, 0.6
+"""of its power, what the filter leaves from one band to a faster one at most, and what is there at
+least"""
+_FOLDS = 20
+"""multiples of the rate from which noise folds down"""
+_ROUNDED = 10.0
+"""times the power of the log's rounding, which is white behind any filter, that is there"""
+_SEGMENT, _FEWEST = 256, 1500
+"""samples of a spectrum, and of a record to have one: its bands are known to a tenth then"""
+
+
+def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> tuple[Finding, ...]:
+    """A doubt for each output whose noise did not come through its filter."""
+    said = []
+    for name, output in outputs.items():
+        filters = [f for f in _stated(flight, output) if f.kind != "notch"]
+        y = flight.outputs.get(name)
+        if not filters or y is None or y.size < _FEWEST or not np.isfinite(y).all():
+            continue
+        found = _not_taken(y, flight.dt, filters)
+        if found is not None:
+            slow, fast, there, left = found
+            words = (
+                f"{name}: its noise at {fast:.3g} Hz has {percent(there, 0)} of its power at "
+                f"{slow:.3g} Hz, of which the stated low-pass of {cutoff(filters):.3g} Hz leaves "
+                f"{percent(left, 0)}: was it logged before the filter? Then the lag of a filter "
+                "that is not there is taken off the machine's; leave the filter out and compare"
+            )
+            said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
+    return tuple(said)
+
+
+def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
+    filters: list[Filter] = []
+    for config in output.filter or ():
+        if config.kind != FROM_LOG:
+            filters.append(config.filter)
+        elif flight.source is not None:
+            source = flight.source
+            logged = logged_filters(source.firmware, source.parameters, output.signal)
+            filters += logged.filters if logged else ()
+    return filters
+
+
+def _not_taken(
+    y: np.ndarray, dt: float, filters: list[Filter]
+) -> tuple[float, float, float, float] | None:
+    """Of the pair of bands that says most: their frequencies [Hz], how much of the slower one's
+    power the faster one has, and how much the filters leave; None where noise falls off."""
+    from scipy.signal import welch
+
+    rate = 1.0 / dt
+    hz, power = welch(y, rate, nperseg=_SEGMENT)
+    edges = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1) * rate
+    folds = np.arange(-_FOLDS, _FOLDS + 1) * rate
+    # Medians, since vibration stands in lines.
+    rows = [(hz >= low) & (hz < high) for low, high in pairwise(edges)]
+    measured = np.array([np.median(power[row]) for row in rows if row.any()])
+    centre = np.array([np.mean(hz[row]) for row in rows if row.any()])
+    passed = np.array([np.sum(gain(filters, np.abs(c + folds)) ** 2) for c in centre])
+    rounding = quantum(y) ** 2 / 12.0 * 2.0 * dt
+    best = None
+    for i, j in zip(*np.triu_indices(centre.size, 1), strict=True):
+        there, left = measured[j] / measured[i], passed[j] / passed[i]
+        sure = left <= _LEFT and there >= _THERE and measured[j] >= _ROUNDED * rounding
+        if sure and (best is None or left < best[3]):
+            best = (float(centre[i]), float(centre[j]), float(there), float(left))
+    return best

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, StrictBool, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
 
 from heli_jax.config.section import Section
 from heli_jax.dynamics.model import Model
@@ -16,43 +16,12 @@ from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.errors import InputError
 
 
-def _names(value: object) -> object:
-    if isinstance(value, list) and all(isinstance(v, str) for v in value):
-        return value
-    raise ValueError(f"expected a list of names such as [lat, lon], got {value!r:.60}")
-
-
-def _names_or_pairs(value: object) -> object:
-    # By hand: of a union pydantic would report every member.
-    pairs = isinstance(value, dict) and all(
-        isinstance(k, str) and isinstance(v, str) for k, v in value.items()
-    )
-    if pairs or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
-        return value
-    raise ValueError(
-        f"expected a list of names such as [lat] or pairs such as {{lat: p}}, got {value!r:.60}"
-    )
-
-
-def _chosen(value: object) -> object:
-    # An editor writes null for what may be left out.
-    return None if value is None else _names_or_pairs(value)
-
-
 def _one_or_several(value: object) -> object:
-    # One kind of servo is the usual case and needs no list.
-    return [value] if isinstance(value, dict) else value
+    # One is the usual case and needs no list.
+    return [value] if isinstance(value, dict | Section) else value
 
 
-# Any, since the validator before it has said what it may be.
-# What an editor is told of it is the type beside the validator.
-Names = Annotated[Any, BeforeValidator(_names, json_schema_input_type=list[str])]
-NamesOrPairs = Annotated[
-    Any, BeforeValidator(_names_or_pairs, json_schema_input_type=list[str] | dict[str, str])
-]
-Chosen = Annotated[
-    Any, BeforeValidator(_chosen, json_schema_input_type=list[str] | dict[str, str] | None)
-]
+NamesOrPairs = list[str] | dict[str, str]
 # The most states that `with_delays` takes: refused here, where the key has a place.
 Order = Annotated[int, Field(ge=1, le=8)]
 
@@ -60,13 +29,13 @@ Order = Annotated[int, Field(ge=1, le=8)]
 class ServosConfig(Section):
     """Equal servos on some inputs (`with_servos`)."""
 
-    on: Names
+    on: list[str]
     """inputs that these servos move"""
     # Off unless asked for: it is the one device here that makes a linear model nonlinear, which
     # costs the exact step.
-    rate_limit: StrictBool = False
+    rate_limit: bool = False
     """whether their speed is limited (rate_servo)"""
-    delay: StrictBool = False
+    delay: bool = False
     """whether they act late (delay_servo)"""
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9_]*$")] = "servo"
     """ends the names of its parameters: omega_servo, ..."""
@@ -75,37 +44,37 @@ class ServosConfig(Section):
 class RateLoopConfig(Section):
     """A flybarless unit (`with_rate_loop`)."""
 
-    on: Chosen = None
+    on: NamesOrPairs | None = None
     """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
-    integral: StrictBool = True
+    integral: bool = True
     """whether it has the term Ki"""
-    feedforward: StrictBool = True
+    feedforward: bool = True
     """whether it has the term Kff"""
-    lag: StrictBool = False
+    lag: bool = False
     """whether its gyro is a first-order lag (tau_gyro)"""
 
 
 class GyroConfig(Section):
     """A gyro on the tail (`with_gyro`)."""
 
-    on: Chosen = None
+    on: NamesOrPairs | None = None
     """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
-    heading_hold: StrictBool = True
+    heading_hold: bool = True
     """whether the pedal commands a rate that is held; otherwise it damps alone"""
-    lag: StrictBool = True
+    lag: bool = True
     """whether its gyro is a first-order lag (tau_gyro)"""
 
 
 class SensorsConfig(Section):
     """What the log's sensors do (`with_sensors`)."""
 
-    imu: StrictBool = False
+    imu: bool = False
     """adds the specific forces ax, ay, az at the place of the accelerometer"""
-    angular_acceleration: StrictBool = False
+    angular_acceleration: bool = False
     """adds the derivatives of the rates"""
-    airspeed: StrictBool = False
+    airspeed: bool = False
     """adds the airspeed and its components at the probe"""
-    lowpass: Names = []
+    lowpass: list[str] = []
     """outputs behind a first-order lag (tau_lowpass)"""
     delay: NamesOrPairs = []
     """outputs that are late, or by output the parameter that is its delay"""
@@ -166,21 +135,10 @@ class FilterConfig(Section):
 
 
 def _filters(value: object) -> object:
-    if value == FROM_LOG:
-        return [{"kind": FROM_LOG}]
-    # One filter is the usual case and needs no list.
-    value = [value] if isinstance(value, dict | FilterConfig) else value
-    if isinstance(value, list) and all(isinstance(v, dict | FilterConfig) for v in value):
-        return value
-    raise ValueError(
-        f"expected {FROM_LOG}, a filter such as {{kind: pt1, hz: 150}}, or a list of these, got "
-        f"{value!r:.60}"
-    )
+    return [{"kind": FROM_LOG}] if value == FROM_LOG else _one_or_several(value)
 
 
-def _seconds(value: object) -> object:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"expected a number of seconds, got {value!r:.60}")
+def _delay(value: float) -> float:
     check_delay(value, "delay")
     return value
 
@@ -191,21 +149,8 @@ Filters = Annotated[
         _filters, json_schema_input_type=Literal["from log"] | FilterConfig | list[FilterConfig]
     ),
 ]
-Delay = Annotated[float, BeforeValidator(_seconds)]
-
-
-def _notches(value: object) -> object:
-    numbers = isinstance(value, list) and all(
-        isinstance(v, int | float) and not isinstance(v, bool) for v in value
-    )
-    if numbers or value is None:
-        return value
-    raise ValueError(
-        f"expected a list of frequencies in Hz such as [25.1, 50.2], got {value!r:.60}"
-    )
-
-
-Notches = Annotated[list[_Positive], BeforeValidator(_notches)]
+Delay = Annotated[float, AfterValidator(_delay)]
+Notches = list[_Positive]
 
 
 class VibrationConfig(Section):
@@ -239,9 +184,7 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
     """The model with the devices of a configuration around it.
 
     Args:
-        model: bare.
         config: the section, or None.
-        path: the configuration, for errors.
 
     Raises:
         InputError: a device that the model cannot have.

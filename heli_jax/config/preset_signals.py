@@ -1,6 +1,6 @@
 """From a preset to the signals of a model: which channel of this log is which input and output."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from heli_jax import naming
@@ -55,13 +55,7 @@ def resolve(
     """The signals that a configuration states, completed by its preset.
 
     Args:
-        model: what inputs and outputs are of.
         stated: the section `signals`.
-        where: what a sentence about it begins with.
-        onboard: the devices around the model: an input behind a rate loop or a gyro is the pilot's
-            stick, any other what the autopilot commands.
-        log: whose channels decide; without one each signal is the first that the preset names.
-        elsewhere: the inputs and outputs that further logs of the flight hold.
 
     Raises:
         InputError: an input that neither the configuration nor the preset supplies, or an output
@@ -203,13 +197,9 @@ class _Search(NamedTuple):
             return ""
         names = list(self.log.names)
         if isinstance(self.log, ChannelLog):
-            names = _distinct(t.name for t in self.log.topics)
+            # Topics without the numbers of their instances.
+            names = list(dict.fromkeys(t.name.split("[")[0] for t in self.log.topics))
         more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         listed = ", ".join(shown(name)[1:-1] for name in names[:_MOST_NAMES])
         # `wrong` takes out what a terminal would obey: names come from the file.
         return str(wrong(f"; {self.log.path} holds", f"{listed}{more}"))
-
-
-def _distinct(names: Iterable[str]) -> list[str]:
-    """Topics without the numbers of their instances."""
-    return list(dict.fromkeys(name.split("[")[0] for name in names))

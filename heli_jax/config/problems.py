@@ -2,7 +2,8 @@
 
 import dataclasses
 import importlib.util
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +14,20 @@ from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
-from heli_jax.config.schema import FitConfig, FreeConfig
-from heli_jax.config.starts import first_guesses, instrument_for, started_in_frequency
+from heli_jax.config.schema import FitConfig, LinearConfig
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.read import require_moving_outputs, require_some_time
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
+from heli_jax.linear_models.read import is_shipped
 from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
+    from heli_jax.identification.equation_error.first_guess import EquationErrorStart
     from heli_jax.identification.model_selection import Alternatives
 
 
@@ -48,40 +50,34 @@ def problem(experiment: Experiment) -> Problem:
         if not flight.hold_out:  # which is simulated, and not fitted
             require_some_time(flight)
             require_moving_outputs(flight)
-    free = {name: _free(f) for name, f in config.fit.free.items()}
-    free, guess = first_guesses(experiment, flights, free)
-    # Output error gets the bare model, whatever `disturbance` says: that section is then for
-    # simulation and for the candidate models alone.
-    model, params, fixed = experiment.model, experiment.vehicle.params, ()
+    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
+    free = {
+        name: Free(**{**dict(f), "prior": None if f.prior is None else Prior(**dict(f.prior))})
+        for name, f in config.fit.free.items()
+    }
+    free, guess = _first_guesses(experiment, flights, free)
     if config.fit.method == "filter-error":
         _require_disturbance(experiment, "fit.method")
-        model, params = disturbed(experiment)
-        free = {**free_noise(model, params, flights), **free}
-        fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
+    of_method = _of_method(experiment, config.fit.method, flights, free)
+    model = of_method["model"]
+    # One number for all flights, since they share one compiled program: the slowest log's.
+    substeps = max(substeps_for(f.dt, model.fastest) for f in flights)
     try:
         whole = Problem(
-            model,
-            params,
+            **of_method,
             # Not before the noise of the inputs is known, which it makes larger.
-            tuple(sharpened(model, f) for f in flights),
-            free,
-            nuisance,
-            # One number for all flights, since they share one compiled program: the slowest log's.
-            substeps=_substeps(model, flights),
+            flights=tuple(sharpened(model, f) for f in flights),
+            nuisance=nuisance,
+            substeps=substeps_of(model, flights) if is_kinematic(model) else substeps,
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
-            method=config.fit.method,
-            fixed_noise=fixed,
-            window=None if config.fit.shooting is None else config.fit.shooting.window,
-            continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
-            instrument=instrument_for(config.fit, config.fit.method),
             frequency=_responses(experiment),
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:
         raise experiment.wrong("fit", e) from e
     # Of the flights that are fitted: by now their windows are chosen.
-    return started_in_frequency(experiment, whole)
+    return _started_in_frequency(experiment, whole)
 
 
 def _require_disturbance(experiment: Experiment, place: str) -> None:
@@ -95,10 +91,6 @@ def _require_disturbance(experiment: Experiment, place: str) -> None:
 
 def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Problem | str]:
     """By method of `fit.also` the same problem for it, or why the method refuses it.
-
-    Args:
-        experiment: the configuration.
-        fitted: the problem by its own method.
 
     Raises:
         InputError: filter error is asked for without a disturbance.
@@ -118,34 +110,41 @@ def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Probl
 def by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
     """The same problem for another method.
 
-    Args:
-        experiment: the configuration.
-        fitted: the problem by its own method.
-        method: the other one.
-
     Raises:
         ValueError: the method refuses it.
     """
+    assert experiment.config.fit is not None
+    free = {n: fitted.free[n] for n in experiment.config.fit.free}
+    return dataclasses.replace(fitted, **_of_method(experiment, method, fitted.flights, free))
+
+
+# Any: fields of a `Problem`.
+def _of_method(
+    experiment: Experiment, method: str, flights: Sequence[Flight], free: dict[str, Free]
+) -> dict[str, Any]:
+    """What of a problem depends on the method that solves it."""
     config = experiment.config
     assert config.fit is not None
+    # Output error gets the bare model, whatever `disturbance` says: that section is then for
+    # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
-    free = {n: fitted.free[n] for n in config.fit.free}
     if method == "filter-error":
         model, params = disturbed(experiment)
-        free = {**free_noise(model, params, fitted.flights), **free}
+        free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
-    shooting = config.fit.shooting if estimator_of(method).windows else None
-    return dataclasses.replace(
-        fitted,
-        model=model,
-        vehicle=params,
-        free=free,
-        method=method,
-        fixed_noise=fixed,
-        window=None if shooting is None else shooting.window,
-        continuity=None if shooting is None else shooting.continuity,
-        instrument=instrument_for(config.fit, method),
-    )
+    # A fit that is asked for with windows says itself where its method has none.
+    asked = method == config.fit.method or estimator_of(method).windows
+    shooting = config.fit.shooting if asked else None
+    return {
+        "model": model,
+        "vehicle": params,
+        "free": free,
+        "method": method,
+        "fixed_noise": fixed,
+        "window": None if shooting is None else shooting.window,
+        "continuity": None if shooting is None else shooting.continuity,
+        "instrument": _instrument_for(config.fit, method),
+    }
 
 
 def _responses(experiment: Experiment) -> ResponseOptions:
@@ -188,23 +187,11 @@ def with_chosen_windows(problem: Problem) -> Problem:
     return dataclasses.replace(problem, flights=tuple(flights))
 
 
-def _substeps(model: Model, flights: Sequence[Flight]) -> int:
-    if is_kinematic(model):
-        return substeps_of(model, flights)
-    return max(substeps_for(f.dt, model.fastest) for f in flights)
-
-
 def _nuisance(config: FitConfig) -> Nuisance:
     stated = config.nuisance.model_dump()
     if isinstance(stated["input_offset"], list):  # YAML has no tuples
         stated["input_offset"] = tuple(stated["input_offset"])
     return Nuisance(**stated)
-
-
-def _free(config: FreeConfig) -> Free:
-    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
-    prior = None if config.prior is None else Prior(**dict(config.prior))
-    return Free(**{**dict(config), "prior": prior})
 
 
 def _check_intervals(config: FitConfig, path: Path) -> None:
@@ -292,3 +279,109 @@ def _gain_units(experiment: Experiment) -> dict[str, str]:
         plain = signal.unit is not None and units.is_plain(signal.unit)
         out[name] = si if si and plain and not units.is_plain(si) else "1"
     return out
+
+
+def _first_guesses(
+    experiment: Experiment, flights: Sequence[Flight], free: Mapping[str, Free]
+) -> "tuple[dict[str, Free], EquationErrorStart | None]":
+    """The free parameters with their starts, and how these were found; None where they are given.
+
+    Args:
+        free: as the configuration has them; NaN where a start is left out.
+    """
+    config, path = experiment.config.fit, experiment.path
+    assert config is not None
+    # Before its start is asked for: of what the model does not have there is none.
+    known = naming.names(experiment.model.Params)
+    for name, f in free.items():
+        if name not in known and (config.start.method == "equation-error" or math.isnan(f.start)):
+            raise InputError(
+                f"{path}: fit.free: model {experiment.model.name} has no parameter {name!r}"
+                f"{nearest(name, known)}"
+            )
+    # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
+    # In frequency a fit begins where it is told to; what it finds takes the place of that later.
+    if config.start.method != "equation-error":
+        free = _from_vehicle(experiment, free)
+        missing = [n for n, f in free.items() if math.isnan(f.start)]
+        if missing:
+            raise InputError(
+                f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with"
+                f"{_shipped_value(experiment, missing[0])}, a value in the vehicle file or the "
+                "model's own, or fit.start: equation-error, which finds one for linear models"
+            )
+        return dict(free), None
+    # Not before it is needed: it takes a second to import.
+    from heli_jax.identification.equation_error.start import equation_error_start
+
+    # Without stepwise selection every term stays in: to leave one out is a change of the model,
+    # which has to be asked for.
+    limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
+    try:
+        guess = equation_error_start(
+            experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
+        )
+    except ValueError as e:
+        raise experiment.wrong("fit", e) from e
+    # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
+    # they were stated.
+    return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
+
+
+def _shipped_value(experiment: Experiment, name: str) -> str:
+    """What a linear model that ships has of a parameter, in SI; nothing of other models."""
+    model = experiment.config.model
+    if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
+        return ""
+    value = float(getattr(experiment.vehicle.params, name))
+    return f" ({value:.4g} is that of the machine that the model was taken from)"
+
+
+def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:
+    """Starts that are left out, from the vehicle file."""
+    # The numbers of a linear model that ships are those of some other machine.
+    model = experiment.config.model
+    if isinstance(model, LinearConfig) and is_shipped(model.linear):
+        return free
+    stated = experiment.vehicle.constants
+    return {
+        n: f._replace(start=stated[n].value) if math.isnan(f.start) and n in stated else f
+        for n, f in free.items()
+    }
+
+
+def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
+    """The inputs that a method takes by their instrument, as `Problem.instrument` has them.
+
+    Args:
+        config: whose `instrument` may be meant for the start, or for a method of `also`.
+    """
+    others = [m for m in (config.start.method, *config.also) if m in METHODS]
+    if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
+        return config.by_instrument
+    return None
+
+
+def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
+    """The problem with the starts that `fit.start: frequency-error` finds; else as it is."""
+    config = experiment.config.fit
+    if config is None or config.start.method != "frequency-error":
+        return problem
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.frequency_start import frequency_error_start, started
+
+    known = naming.names(experiment.model.Params)
+    bare = {
+        "model": experiment.model,
+        "vehicle": experiment.vehicle.params,
+        "free": {n: f for n, f in problem.free.items() if n in known},
+        "method": "frequency-error",
+        "instrument": config.by_instrument,
+    }
+    whole = {"fixed_noise": (), "window": None, "continuity": None}
+    try:
+        base = dataclasses.replace(problem, **bare, **whole)
+        guess = frequency_error_start(base, max_steps=config.max_steps)
+    except ValueError as e:
+        raise experiment.wrong("fit.start", e) from e
+    return started(problem, guess)

@@ -3,17 +3,14 @@
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StrictBool, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from heli_jax.config.design_section import SweepConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
-from heli_jax.config.flight_values import one_log, window_choice
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
+from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
-from heli_jax.config.simulate_section import SimulateConfig
-from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.limits import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
@@ -32,21 +29,6 @@ class LinearConfig(Section):
 
     linear: str
     """its path, or the name of a shipped one"""
-
-
-def _model_choice(value: Any) -> Any:
-    if isinstance(value, str | LinearConfig):
-        return value
-    if not isinstance(value, dict):
-        raise ValueError(f"expected a model's name or {{linear: FILE}}, got {value!r:.60}")
-    # By hand: of a union pydantic would report every member, a model's name that is no text among
-    # them.
-    for key in value:
-        if key != "linear":
-            raise ValueError(f"unknown key {key!r:.40}{nearest(str(key), ['linear'])}")
-    if not isinstance(value.get("linear"), str):
-        raise ValueError(f"linear: expected the name of a file, got {value.get('linear')!r:.60}")
-    return LinearConfig(**value)
 
 
 class TimeConfig(Section):
@@ -119,7 +101,7 @@ class AlignConfig(Section):
     """a signal of the first log, by the model's name"""
     to: str
     """the same motion in this log, in any unit"""
-    reverse: StrictBool = False
+    reverse: bool = False
     """whether it has the opposite sign"""
 
 
@@ -146,8 +128,18 @@ class AlsoConfig(Section):
     """which flight of a log that holds several, from 1"""
 
 
+def _one_log(value: Any) -> Any:
+    # A study takes the list away before: what still has one is read by another command.
+    if isinstance(value, list):
+        raise ValueError(
+            "expected one log, got a list, which makes a study of fits (heli-jax fit, "
+            "heli_jax.run_study)"
+        )
+    return value
+
+
 class FlightConfig(Section):
-    log: Annotated[str, BeforeValidator(one_log, json_schema_input_type=str | list[str])]
+    log: Annotated[str, BeforeValidator(_one_log, json_schema_input_type=str | list[str])]
     """the file; its path begins at the configuration. A list is a study with a fit for each
     (docs/studies.md)"""
     signals: SignalsConfig
@@ -159,9 +151,7 @@ class FlightConfig(Section):
     rate: Positive | None = None
     """samples a second [Hz] to resample to; the log's own unless given"""
     # Increasing is checked where logs are read, for configurations and scripts alike.
-    window: Annotated[
-        tuple[Finite, Finite] | Literal["auto"] | None, BeforeValidator(window_choice)
-    ] = None
+    window: tuple[Finite, Finite] | Literal["auto"] | None = None
     """[s] from the log's beginning; auto: the windows that say most of what is free"""
     gaps: Literal["fail", "split"] = "fail"
     """what to do about gaps too long to be bridged: refuse them, or make flights of the parts"""
@@ -203,17 +193,6 @@ class FreeConfig(Section):
     helicopter's parameters keep theirs and those of a model of one's own may have any"""
 
 
-def _offset_choice(value: object) -> object:
-    # By hand: of a union pydantic would report every member, and take "yes" and 1 for true.
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, list) and all(isinstance(v, str) for v in value):
-        return value
-    raise ValueError(
-        f"expected true, false or a list of inputs such as [x_roll], got {value!r:.60}"
-    )
-
-
 class NuisanceConfig(Section):
     initial_state: bool = True
     """whether the state at the first sample is estimated, of each flight"""
@@ -223,23 +202,9 @@ class NuisanceConfig(Section):
     """whether a delay [s] of all inputs is, below zero where they were logged late"""
     input_gain: bool = False
     """whether a factor of each input is"""
-    # Any, since the validator before it has said what it may be.
-    input_offset: Annotated[
-        Any, BeforeValidator(_offset_choice, json_schema_input_type=bool | list[str] | None)
-    ] = None
+    input_offset: bool | list[str] | None = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
     the sticks of a machine in free flight"""
-
-
-def _instrument_choice(value: object) -> object:
-    # By hand, as above: a name (of which `none` is one that no input has), or a list of them.
-    if value is None or isinstance(value, str):
-        return value
-    if isinstance(value, list) and value and all(isinstance(v, str) for v in value):
-        return value
-    raise ValueError(
-        f"expected an input, a list of inputs such as [lat, lon], or none, got {value!r:.60}"
-    )
 
 
 class IntervalsConfig(Section):
@@ -313,10 +278,7 @@ class FitConfig(Section):
         BeforeValidator(_start_method, json_schema_input_type=StartMethod | StartMethodConfig),
     ] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
-    # Any, since the validator before it has said what it may be.
-    instrument: Annotated[
-        Any, BeforeValidator(_instrument_choice, json_schema_input_type=str | list[str] | None)
-    ] = None
+    instrument: str | Annotated[list[str], Field(min_length=1)] | None = None
     """in frequency: inputs that are taken by their instrument, or none; unless given, all of
     which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
@@ -378,12 +340,12 @@ class ReportConfig(Section):
 class Config(Section):
     """One experiment."""
 
-    model: Annotated[str | LinearConfig, BeforeValidator(_model_choice)]
+    model: str | LinearConfig
     """a model's name, package.module:name, or {linear: FILE}"""
     # A file, or constants as in one: checked by the readers of vehicle files, with their messages.
     vehicle: str | dict[str, Any] | None = None
     """may be left out where the model is a file: its own values are a vehicle"""
-    corrections: dict[str, StrictBool] | None = None
+    corrections: dict[str, bool] | None = None
     """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
     off in place of what the model has; for the whole helicopter only"""
     onboard: OnboardConfig | None = None

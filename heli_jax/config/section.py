@@ -12,7 +12,8 @@ class Section(BaseModel):
 
     # An unknown key is an error: a misspelt `lower` would leave a parameter without a bound, a
     # misspelt device its lag to the machine.
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # What stands below a field is its meaning, in the JSON schema and for `heli-jax keys`.
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     @field_validator("*", mode="wrap")
     @classmethod

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, StrictBool, model_validator
+from pydantic import Field, model_validator
 
 from heli_jax.config.section import Section
 from heli_jax.flights.ccpm import Swashplate
@@ -20,7 +20,7 @@ class ScaledConfig(Section):
     """factor of the number in the log, after offset"""
     offset: _Finite = 0.0
     """in the log's own numbers"""
-    invert: StrictBool = False
+    invert: bool = False
     """whether the sign is turned"""
 
     @model_validator(mode="after")
@@ -55,26 +55,7 @@ class LoggedInputConfig(ScaledConfig):
         return self
 
 
-def _numbers(value: object) -> object:
-    # By hand: of a union pydantic would report every member.
-    each = value if isinstance(value, list) else [value]
-    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in each):
-        return value
-    raise ValueError(f"expected a number or a list of numbers, got {value!r:.60}")
-
-
-# Any, since the validator before it has said what it may be.
-# What an editor is told of it is the type beside the validator.
-Numbers = Annotated[Any, BeforeValidator(_numbers, json_schema_input_type=float | list[float])]
-
-
-def _booleans(value: object) -> object:
-    if all(isinstance(v, bool) for v in (value if isinstance(value, list) else [value])):
-        return value
-    raise ValueError(f"expected true, false or a list of them, got {value!r:.60}")
-
-
-_Booleans = Annotated[Any, BeforeValidator(_booleans, json_schema_input_type=bool | list[bool])]
+Numbers = float | list[float]
 
 
 class CcpmConfig(Section):
@@ -90,7 +71,7 @@ class CcpmConfig(Section):
     """of each at rest, in the log's numbers"""
     scale: Numbers = 1.0
     """lift for a unit of the log"""
-    invert: _Booleans = False
+    invert: bool | list[bool] = False
     """whether a servo moves the other way"""
     phase: _Finite = 0.0
     """[deg] by which the plate leads the blades"""

@@ -86,7 +86,6 @@ def read_study(
     """The study that a configuration or its overrides ask for; None where they ask for one fit.
 
     Args:
-        path: the configuration.
         overrides: as of `load`; a key that is set several times by texts takes each value.
         over: values by key, or as on the command line, `fit.free.a.start=4,5,6`: what stands behind
             = is a list of YAML without its brackets.

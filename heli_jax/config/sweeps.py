@@ -1,6 +1,6 @@
 """The sweep that a configuration describes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,18 +9,17 @@ import numpy as np
 from heli_jax import naming, units
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition
-from heli_jax.config.design_section import AxisConfig, DesignConfig, ReduceConfig, SweepConfig
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
 from heli_jax.config.problems import disturbed
+from heli_jax.config.run_sections import AxisConfig, DesignConfig, ReduceConfig, SweepConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.open_log import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
-from heli_jax.sweeps.axes import Range, whole_seeds
-from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.design import Design, Range, whole_seeds
 from heli_jax.sweeps.reducers import LINEAR, REDUCERS, Reduce, Streaming
 from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_unit, job
 
@@ -54,10 +53,8 @@ def sweep_job(
     """The sweep of a configuration, checked; its logs and tables are read.
 
     Args:
-        experiment: the configuration, with its model and vehicle.
         made: the flight that `simulate` makes; the logs are read unless given.
         trimmed: the steady flight in which each run of `made` begins.
-        pilot: who holds the attitude in it.
 
     Raises:
         InputError: something of it cannot be; the sentence says what and where.
@@ -160,7 +157,10 @@ def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> D
     parts = []
     for i, part in enumerate(section.of):
         try:
-            parts.append(_design(part, model, path, _seed_of_part(seed, i)))
+            # No two parts, however deep, draw the same; not seed + i: the second part of one seed
+            # would be the first of the next.
+            own = np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0]
+            parts.append(_design(part, model, path, int(own)))
         except InputError:
             raise
         except ValueError as e:  # the place grows from the inside out: of[0].of[1].axes.a
@@ -169,12 +169,6 @@ def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> D
         section.design
     ]
     return combine(*parts)
-
-
-def _seed_of_part(seed: int, i: int) -> int:
-    """A seed for the i-th part of a design: no two parts, however deep, draw the same."""
-    # Not seed + i: the second part of one seed would then be the first part of the next.
-    return int(np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0])
 
 
 # Said, not ignored: who gives a key that is not used believes that it acts.
@@ -206,11 +200,7 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
     for key in ("lower", "upper", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}: expected values, or lower and upper, not both")
-    return _as_column(name, np.asarray(axis.values) * _scale(name, axis, model, path))
-
-
-def _as_column(name: str, values: np.ndarray) -> np.ndarray:
-    """Seeds are whole numbers."""
+    values = np.asarray(axis.values) * _scale(name, axis, model, path)
     return whole_seeds(values) if name == "seed" else values
 
 
@@ -229,10 +219,12 @@ def _table(section: DesignConfig, model: Model, path: Path) -> Design:
     columns = {name: axis.column or name for name, axis in section.axes.items()}
     # Each column once, though two axes may share one.
     numbers = source.numbers(list(dict.fromkeys(columns.values())))
-    scaled: Mapping[str, np.ndarray] = {
-        name: _as_column(name, numbers[columns[name]] * _scale(name, axis, model, path))
+    scaled: dict[str, np.ndarray] = {
+        name: numbers[columns[name]] * _scale(name, axis, model, path)
         for name, axis in section.axes.items()
     }
+    if "seed" in scaled:
+        scaled["seed"] = whole_seeds(scaled["seed"])
     return designs.table(scaled)
 
 

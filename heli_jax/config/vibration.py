@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.config.doubts import rotor_doubt
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.onboard import VibrationConfig
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note
@@ -30,6 +30,8 @@ _LEFT = 0.5
 """part of an output's samples that notches have to leave"""
 _NAMED = 3
 """lines that are told of an output"""
+_FASTEST_ROTOR = 500.0
+"""rad/s, or 4800 rpm: the smallest machines stay below"""
 
 
 def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Flight:
@@ -41,9 +43,7 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
     and each lag is at most 3 % of its own step.
 
     Args:
-        flight: as read.
         frequencies: [Hz]; none leaves it as it is.
-        where: what a sentence about a wrong one begins with.
 
     Raises:
         InputError: a frequency that the samples do not have, or an output with so many gaps that
@@ -120,19 +120,13 @@ def vibration_notes(
 ) -> tuple[Finding, ...]:
     """A note for each output with strong lines in its spectrum.
 
-    Args:
-        experiment: whose vehicle may know the rotor's speed, Omega.
-        flight: as read.
-        config: of the flight, which may state it.
-        where: the flight's place in the configuration.
-
     Raises:
         InputError: the stated speed has a unit that is none of a rotor.
     """
     rotor = _rotor_hz(experiment, flight, config, where)
     rates = flight.source.rates if flight.source else {}
     stated = config.vibration
-    notes = [] if stated is None or rotor is None else [*rotor_doubt(stated, 2 * math.pi * rotor)]
+    notes = [] if stated is None or rotor is None else [*_rotor_doubt(stated, 2 * math.pi * rotor)]
     for name, y in flight.outputs.items():
         vibration = lines(y, flight.dt, rotor, rates.get(name))
         if vibration:
@@ -160,3 +154,22 @@ def _rotor_hz(
     else:
         return None
     return speed / (2.0 * math.pi) if math.isfinite(speed) and speed > 0 else None
+
+
+def _rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[Finding, ...]:
+    """A finding where a rotor's stated speed is none, or its unit is not stated.
+
+    Args:
+        speed: what it states [rad/s].
+    """
+    if speed > _FASTEST_ROTOR:
+        words = (
+            f"vibration: a rotor of {speed:.4g} rad/s turns at {speed * 30 / np.pi:.0f} rpm, "
+            f"expected less than {_FASTEST_ROTOR:g} rad/s; was unit: rpm meant?"
+        )
+        criterion = f"rad/s, {_FASTEST_ROTOR:g}"
+        return (Finding("units.unlikely", "doubt", words, speed, criterion),)
+    if "unit" not in vibration.model_fields_set:
+        words = f"vibration: rotor: no unit stated, {speed:g} taken as rad/s"
+        return (note("units.assumed", words, value=speed),)
+    return ()

@@ -2,20 +2,29 @@
 
 A model's functions are called with tracers, which stand for numbers that are not known yet. What
 works on numbers may not work on them: NumPy's functions, `if x > 0`, `float(x)`.
+
+What a model states by name (delays, axes, positive parameters) has to be there: a wrong name is no
+error of Python, but an axis would be ignored, and a delay fail in the middle of a fit.
+
+`cannot_start` says whether a model can begin at its initial state, `starting_at` moves that.
 """
 
+import dataclasses
 import functools
 import traceback
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import core
+from jaxtyping import Array
 
-from heli_jax import naming
-from heli_jax.dynamics.check_names import check_names
-from heli_jax.dynamics.model import Model
+from heli_jax import naming, units
+from heli_jax.dynamics.model import Axis, Model, field_and_output, plain
+from heli_jax.errors import nearest
+from heli_jax.naming import Record
 
 _RECORDS = ("Params", "State", "Inputs", "Outputs")
 
@@ -26,10 +35,6 @@ _RECORDS = ("Params", "State", "Inputs", "Outputs")
 
 def check_params(params: type, vehicle: Any) -> None:
     """Refuse what has not the parameters of a model.
-
-    Args:
-        params: the model's class of parameters.
-        vehicle: should be one of these.
 
     Raises:
         TypeError: saying what to pass.
@@ -50,7 +55,6 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     else than is expected. A model is looked at once; later calls cost a look-up.
 
     Args:
-        model: what should be a Model.
         traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
             Without it only the return values are checked: parameters that stay plain numbers may
             be branched on.
@@ -84,11 +88,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
 
 
 def what_instead(value: Any) -> str:
-    """What stands where a Model was expected, for the end of a sentence.
-
-    Args:
-        value: anything but a Model.
-    """
+    """What stands where a Model was expected, for the end of a sentence."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     function = _bare(value)
@@ -239,13 +239,7 @@ class _Function:
         self.traced(check)
 
     def check_fields(self, returned: Any, record: type, role: str) -> None:
-        """Refuse a return value that is no such record.
-
-        Args:
-            returned: what the function gave, of tracers.
-            record: the class that was expected.
-            role: its role in the model.
-        """
+        """Refuse a return value that is no such record."""
         fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])
         more = ", ..." if len(naming.names(record)) > 4 else ""
         expected = f"expected the model's {role}, as `return {record.__name__}({fields}{more})`"
@@ -378,3 +372,185 @@ def _line(function: Any, cause: BaseException | None) -> str:
         ]
         line = inside[-1] if inside else line
     return f" (line {line})"
+
+
+# The model is anyone's, and its fields are whatever a user has passed.
+
+
+def check_names(model: Any) -> None:
+    """Refuse delays, axes and positive parameters that name what the model has not.
+
+    Args:
+        model: whose classes `Params`, `State`, `Inputs` have been checked, with `name`, `delays`,
+            `axes` and `positive`.
+
+    Raises:
+        ValueError: naming the place, what was expected and what was got.
+    """
+    _check_delays(model)
+    for axis in _tuple(model, "axes", model.axes if model.axes is not None else ()):
+        if not isinstance(axis, Axis):
+            _refuse(model, "axes", f"expected every one an Axis, got {axis!r:.60}")
+        for key, role, name in _names_of(model, axis):
+            _known(model, f"axes: {axis.name!s:.30}.{key}", role, name)
+    for name in _tuple(model, "positive", model.positive):
+        _known(model, "positive", "Params", name)
+
+
+def _check_delays(model: Any) -> None:
+    late = set()
+    for pair in _tuple(model, "delays", model.delays):
+        if not (isinstance(pair, tuple) and len(pair) == 2):
+            _refuse(model, "delays", f"expected pairs (input, parameter), got {pair!r:.60}")
+        stick, parameter = pair
+        _known(model, "delays", "Inputs", stick)
+        _known(model, f"delays of {stick}", "Params", parameter)
+        # A delay is taken as seconds, whatever its field says.
+        unit = naming.unit(model.Params, parameter)
+        if unit is not None and not _is_second(unit):
+            problem = f"expected {parameter} in s, got {unit!r}"
+            _refuse(model, f"delays of {stick}", problem)
+        # Two would be two readings of one record at different times, and later code keeps them by
+        # input: the second would replace the first without a word.
+        if stick in late:
+            _refuse(model, "delays", f"expected one delay of {stick}, got two")
+        late.add(stick)
+
+
+def _is_second(unit: str) -> bool:
+    try:
+        # Milliseconds are refused as well: the parameter's value would be taken for seconds as it
+        # stands, a delay a thousand times too long.
+        return units.factor(unit, "s") == 1.0
+    except ValueError:
+        return False
+
+
+def _names_of(model: Any, axis: Axis) -> Iterator[tuple[str, str, Any]]:
+    """(field, role, name) of what an axis names."""
+    yield "rate", "State", axis.rate
+    optional = (
+        ("angle", "State"), ("inertia", "Params"), ("added_inertia", "Params"), ("stick", "Inputs"),
+    )  # fmt: skip
+    for key, role in optional:
+        if getattr(axis, key) is not None:
+            yield key, role, getattr(axis, key)
+    for name in _tuple(model, f"axes: {axis.name!s:.30}.flybar", axis.flybar):
+        yield "flybar", "State", name
+
+
+def _tuple(model: Any, place: str, value: Any) -> tuple[Any, ...]:
+    """The value, which has to be a tuple: a model is compiled, so nothing in it may change."""
+    # An Axis is a tuple itself: `axes=(Axis(...))` without its comma would pass for a tuple of
+    # names.
+    if not isinstance(value, tuple) or isinstance(value, Axis):
+        example = _EXAMPLES.get(place, '("c", "d")')
+        _refuse(model, place, f"expected a tuple, as {example}, got {value!r:.60}")
+    return value
+
+
+_EXAMPLES = {
+    "delays": '(("pedal", "tau_pedal"),)',
+    "axes": '(Axis("roll", rate="p"),)',
+    "positive": '("tau",)',
+}
+_KINDS = {"State": "state", "Params": "parameter", "Inputs": "input"}
+
+
+def _known(model: Any, place: str, role: str, name: Any) -> None:
+    known = naming.names(getattr(model, role))
+    if not isinstance(name, str) or name not in known:
+        problem = f"no {_KINDS[role]} {name!r:.40} in {role}{nearest(str(name), known)}"
+        _refuse(model, place, problem)
+
+
+def _refuse(model: Any, place: str, problem: str) -> NoReturn:
+    raise ValueError(f"model {model.name!r}: {place}: {problem}")
+
+
+def starting_at(model: Model, values: Mapping[str, float]) -> Model:
+    """The model with an initial state that has the given values [SI] of some states.
+
+    Raises:
+        ValueError: a state that the model does not have.
+    """
+    for name in values:
+        if name not in naming.names(model.State):
+            raise ValueError(f"model {model.name} has no state {name!r}")
+
+    def start(params: Record) -> Record:
+        # The values take the dtype of what they replace, or a float32 run would become a mixed one.
+        state = naming.asdict(model.initial_state(params))
+        changed = {n: jnp.asarray(v, jnp.asarray(state[n]).dtype) for n, v in values.items()}
+        return model.State(**{**state, **changed})
+
+    return dataclasses.replace(model, start=start)
+
+
+def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | None = None) -> str:
+    """Why a model cannot begin at its initial state, with the remedy; empty where it can.
+
+    Rates and outputs have to be finite there, and their derivatives by the states.
+
+    Args:
+        params: the model's Params, SI; concrete numbers.
+        inputs: at the first sample; zero where not given.
+    """
+    params = plain(params)
+    names = naming.names(model.State)
+    state = naming.asdict(model.initial_state(params))
+    x = {n: np.float64(state[n]) for n in names}
+    u = model.Inputs(
+        **{n: np.float64((inputs or {}).get(n, 0.0)) for n in naming.names(model.Inputs)}
+    )
+    # In NumPy's numbers, outside of jit: a model is asked at one point, and compiling it would take
+    # longer.
+    bad = _not_finite(model, params, x, u)
+    if not bad:
+        return ""
+    # A model that divides by an airspeed cannot begin at rest, and what JAX says of it is an array
+    # of NaN. So each state at zero is moved to one, to see which of them is the cause: first alone,
+    # then all together, as where two of them make up a speed.
+    zero = [n for n in names if x[n] == 0.0]
+    cause = [n for n in zero if len(_not_finite(model, params, {**x, n: _ONE}, u)) < len(bad)]
+    if not cause and not _not_finite(model, params, {**x, **dict.fromkeys(zero, _ONE)}, u):
+        cause = zero
+    verb = "is" if len(bad) == 1 else "are"
+    what = f"model {model.name}: {' and '.join(bad)} {verb} not finite at the initial state"
+    if not cause:
+        where = ", ".join(f"{n} = {x[n]:g}" for n in names)
+        return f"{what} ({where}); expected another Model.start, other parameters or inputs"
+    where = ", ".join(f"{n} = 0" for n in cause)
+    example = ", ".join(f"{n}: 1.0" for n in cause)
+    return (
+        f"{what}, where {where}; expected a Model.start that begins elsewhere, or in a "
+        f"configuration initial_state: {{{example}}} with the value of the record"
+    )
+
+
+_ONE = np.float64(1.0)
+
+
+def _not_finite(model: Model, params: Record, x: dict[str, Any], u: Record) -> tuple[str, ...]:
+    """The rates and outputs that are not finite at a point, or whose derivatives are not."""
+    with np.errstate(all="ignore"):
+        rates, outputs = field_and_output(model, params, model.State(**x), u)
+    values = {f"the rate of {n}": v for n, v in naming.asdict(rates).items()}
+    values |= {f"output {n}": v for n, v in naming.asdict(outputs).items()}
+    bad = tuple(n for n, v in values.items() if not np.isfinite(float(v)))
+    # Derivatives only where the values are finite: those of a value that is none say nothing more.
+    return bad or _no_slope(model, params, x, u)
+
+
+def _no_slope(model: Model, params: Record, x: dict[str, Any], u: Record) -> tuple[str, ...]:
+    """The rates whose derivatives by the states are not finite, such as that of a root at zero."""
+
+    def rates(x: Array) -> Array:
+        return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u))
+
+    # By JAX, not by differences: sqrt(V2) at rest is finite and so are its differences, but a fit's
+    # gradient through it is not.
+    slopes = jax.jacfwd(rates)(naming.ravel(model.State(**x), jnp.result_type(float)))
+    finite = np.isfinite(np.asarray(slopes)).all(axis=1)
+    names = naming.names(model.State)
+    return tuple(f"the slope of the rate of {names[i]}" for i in np.flatnonzero(~finite))

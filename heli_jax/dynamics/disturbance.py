@@ -1,4 +1,7 @@
-"""Disturbances as part of the model: random pushes on derivatives, each with a memory."""
+"""Disturbances as part of the model: random pushes on derivatives, each with a memory.
+
+Noise of sensors before an on-board low-pass is not white in the log, but white on its state.
+"""
 
 import dataclasses
 import functools
@@ -9,7 +12,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Disturbance, Model, axes_of, plain
+from heli_jax.dynamics.model import Disturbance, LowPass, Model, axes_of, plain
 from heli_jax.naming import Record, Scalar
 
 
@@ -63,7 +66,6 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
     process noise stays as it is.
 
     Args:
-        model: without a disturbance on those states.
         on: what is disturbed: axes (`disturbable`: the push is an acceleration) or states
             (`disturbable_states`), by name.
         poles: 1 or 2, the order of the filter that colours the noise.
@@ -280,13 +282,7 @@ class _Disturbed(NamedTuple):
         return self.model.State(**{n: getattr(state, n) for n in states})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's derivatives with the pushes on them, and those of the pushes.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The model's derivatives with the pushes on them, and those of the pushes."""
         # It adds to the derivative, as a gust's moment over the inertia would: a disturbance of
         # the angle itself would jump, and one of the output would not act back through the flybar.
         rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
@@ -298,11 +294,6 @@ class _Disturbed(NamedTuple):
     def output(self, p: Record, s: Record, u: Record) -> Record:
         """The model's outputs: a push shows in them by the motion, and in those that are the
         derivative that it adds to.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
         """
         outputs = self.model.output(p, self.undisturbed(s), u)
         # Left out of an accelerometer's reading, a gust would be taken for noise that has a memory,
@@ -313,13 +304,7 @@ class _Disturbed(NamedTuple):
         return naming.replace(outputs, **pushed) if pushed else outputs
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The model's limits, by name.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The model's limits, by name."""
         assert self.model.limits is not None
         return self.model.limits(p, self.undisturbed(s), u)
 
@@ -378,3 +363,53 @@ def _filtered(d: Disturbance, p: Record, s: Record) -> dict[str, Scalar]:
         # is which.
         rates[name], before = pull / getattr(p, d.tau), w
     return rates
+
+
+def sensor_noise(output: str) -> str:
+    """The parameter that is the sd of an output's noise from before its filters, as it is behind
+    them."""
+    return f"sigma_n_{output}"
+
+
+@functools.cache
+def with_sensor_noise(model: Model, outputs: tuple[str, ...]) -> Model:
+    """The model with white noise of the sensors of some outputs before their low-passes.
+
+    Each brings a parameter `sigma_n_OUTPUT`, the standard deviation behind the filters, in the
+    output's unit. Noise that is white at the filter's input is process noise on the filter's state.
+
+    Args:
+        model: with `Model.low_passes` for these outputs.
+    """
+    if not outputs:
+        return model
+    added = tuple(p for p in model.low_passes if p.output in outputs)
+    more = {}
+    for p in added:
+        unit = naming.unit(model.Outputs, p.output) or "1"
+        meaning = f"sd of the noise of {p.output} that came through its filters"
+        more[sensor_noise(p.output)] = (Annotated[Scalar, unit, meaning], 0.0)
+    noisy = _Noisy(model, added)
+    return dataclasses.replace(
+        model,
+        Params=naming.extended(model.Params, f"{model.Params.__name__}SensorNoise", more),
+        noise_intensity=noisy.noise_intensity,
+    )
+
+
+class _Noisy(NamedTuple):
+    """A model with the noise of sensors beside its own process noise."""
+
+    model: Model
+    added: tuple[LowPass, ...]
+
+    def noise_intensity(self, p: Record) -> Record:
+        own = self.model.noise_intensity
+        # Zeros made of a parameter have its type and its batch axis.
+        zero = 0.0 * getattr(p, sensor_noise(self.added[0].output))
+        intensity = dict.fromkeys(naming.names(self.model.State), zero)
+        intensity |= naming.asdict(own(p)) if own is not None else {}
+        for low_pass in self.added:
+            sd = getattr(p, sensor_noise(low_pass.output))
+            intensity[low_pass.state] = low_pass.intensity * sd
+        return self.model.State(**intensity)

@@ -18,7 +18,6 @@ def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
     $$\theta_{cyc} L_1 = \frac{L_3}{L_2+L_3} x_{cyc} + \frac{L_2 L_4}{L_2+L_3} \beta$$
 
     Args:
-        p: vehicle, SI.
         x_cyc: cyclic input displacement [m].
         beta: flapping angle of the flybar [rad].
     """
@@ -69,11 +68,9 @@ def flapping_acceleration(
       \left(\frac{x_{cyc}}{L_5} - \frac{\dot\beta + \omega}{\Omega}\right)(R_2^4 - R_1^4)$$
 
     Args:
-        p: vehicle, SI.
         Omega: rotor speed [rad/s].
         x_cyc: cyclic input displacement [m].
         beta: flapping angle [rad], and its derivative `dbeta` [rad/s].
-        dbeta: see `beta`.
         omega: rate of the body about the same axis [rad/s].
     """
     # The text of the paper reads beta + omega/Omega in the bracket (dots over symbols get lost in
@@ -99,7 +96,6 @@ def flybar_rate(p: Helicopter, Omega: Scalar, x_cyc: Scalar, beta: Scalar, omega
     In place of eq. 12, with the time constant of `flybar_time_constant`.
 
     Args:
-        p: vehicle, SI.
         Omega: rotor speed [rad/s].
         x_cyc: cyclic input displacement [m].
         beta: tilt of the bar's plane [rad].

@@ -22,16 +22,8 @@ import jax.numpy as jnp
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
+from heli_jax.dynamics.aerodynamics import mass_flow
 from heli_jax.dynamics.helicopter_equations import (
-    accelerations,
-    angular_accelerations,
-    body_rates,
-    flow,
-    main_rotor,
-    motion,
-    once,
-)
-from heli_jax.dynamics.helicopter_records import (
     COLLECTIVE,
     GOVERNOR,
     INFLOW,
@@ -43,11 +35,16 @@ from heli_jax.dynamics.helicopter_records import (
     HelicopterState,
     Moments,
     Motion,
+    accelerations,
+    angular_accelerations,
+    body_rates,
+    flow,
+    main_rotor,
+    motion,
+    once,
 )
-from heli_jax.dynamics.inflow import mass_flow
-from heli_jax.dynamics.loads import Rotors, drive, flapping, moments, rigid_hub_moments
+from heli_jax.dynamics.loads import Rotors, drive, flapping, moments, rigid_hub_moments, tail_rotor
 from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
-from heli_jax.dynamics.tail_rotor import tail_rotor
 from heli_jax.dynamics.tip_path_plane import Tilt, hub_loads
 from heli_jax.naming import Record, Scalar
 from heli_jax.pickled import by_value

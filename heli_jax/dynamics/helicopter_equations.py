@@ -1,23 +1,172 @@
-r"""The equations of the whole helicopter, one after another: eqs 2-9, 11 and 18 with corrections.
+"""The equations of the whole helicopter, one after another: eqs 2-9, 11 and 18 with corrections.
 
-What the rotors and the motor do to the body is in `loads`, and what goes beyond the paper has files
-of its own: `tip_path_plane`, `tail_rotor`, `governor`, `inflow`.
+What the rotors and the motor do to the body is in `loads`, the induced velocity in `aerodynamics`,
+flapping in `tip_path_plane`.
 
 Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right.
 Body axes are forward, right and down. `helicopter` puts the equations together.
 """
 
-from typing import NamedTuple
+import math
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
-from heli_jax.dynamics.helicopter_records import Attitude, Corrections, Moments, Motion
 from heli_jax.naming import Record, Scalar
-from heli_jax.numerics.sincos import sincos
 from heli_jax.vehicle import Helicopter
+
+
+class HelicopterState(NamedTuple):
+    x: Annotated[Scalar, "m", "position forward of the origin"]
+    y: Annotated[Scalar, "m", "position to the right"]
+    z: Annotated[Scalar, "m", "height"]
+    phi: Annotated[Scalar, "rad", "roll angle, right side down"]
+    theta: Annotated[Scalar, "rad", "pitch angle, nose up"]
+    psi: Annotated[Scalar, "rad", "yaw angle, nose right"]
+    dx: Annotated[Scalar, "m/s", "velocity along x"]
+    dy: Annotated[Scalar, "m/s", "velocity along y"]
+    dz: Annotated[Scalar, "m/s", "velocity upwards"]
+    dphi: Annotated[Scalar, "rad/s", "derivative of phi"]
+    dtheta: Annotated[Scalar, "rad/s", "derivative of theta"]
+    dpsi: Annotated[Scalar, "rad/s", "derivative of psi"]
+    beta_roll: Annotated[Scalar, "rad", "flybar angle, roll"]
+    dbeta_roll: Annotated[Scalar, "rad/s", "flybar rate, roll"]
+    beta_pitch: Annotated[Scalar, "rad", "flybar angle, pitch"]
+    dbeta_pitch: Annotated[Scalar, "rad/s", "flybar rate, pitch"]
+    Omega: Annotated[Scalar, "rad/s", "rotor speed"]
+
+
+class HelicopterInputs(NamedTuple):
+    x_roll: Annotated[Scalar, "m", "cyclic input displacement, roll"]
+    x_pitch: Annotated[Scalar, "m", "cyclic input displacement, pitch"]
+    x_yaw: Annotated[Scalar, "1", "yaw stick"]
+    x_throttle: Annotated[Scalar, "1", "throttle stick"]
+
+
+# Beyond the paper, which has one stick for throttle and collective: fields that a variant adds are
+# kept apart, so that its records have those of its equations and no others.
+COLLECTIVE = Annotated[Scalar, "1", "collective stick"]
+"""an input of its own where collective and throttle are apart"""
+ROTOR_SPEED = Annotated[Scalar, "rad/s", "rotor speed, measured"]
+"""an input where the rotor's speed is measured and no motor is modelled"""
+TILT = {
+    "a1": Annotated[Scalar, "rad", "tip-path plane, back"],
+    "b1": Annotated[Scalar, "rad", "tip-path plane, right"],
+}
+"""the states of flapping"""
+GOVERNOR = Annotated[Scalar, "1", "governor: integral part of the throttle"]
+"""the state of the governor"""
+INFLOW = Annotated[Scalar, "m/s", "induced velocity of the main rotor"]
+"""the state of dynamic inflow"""
+
+
+class HelicopterOutputs(NamedTuple):
+    roll: Annotated[Scalar, "rad", "roll angle"]
+    pitch: Annotated[Scalar, "rad", "pitch angle"]
+    yaw: Annotated[Scalar, "rad", "yaw angle"]
+    roll_rate: Annotated[Scalar, "rad/s", "roll rate"]
+    pitch_rate: Annotated[Scalar, "rad/s", "pitch rate"]
+    yaw_rate: Annotated[Scalar, "rad/s", "yaw rate"]
+    x: Annotated[Scalar, "m", "position forward of the origin"]
+    y: Annotated[Scalar, "m", "position to the right"]
+    z: Annotated[Scalar, "m", "height"]
+    dx: Annotated[Scalar, "m/s", "velocity along x"]
+    dy: Annotated[Scalar, "m/s", "velocity along y"]
+    dz: Annotated[Scalar, "m/s", "velocity upwards"]
+    rotor_speed: Annotated[Scalar, "rad/s", "rotor speed"]
+
+
+# Switches and not subclasses: each departure from the paper can be tried by itself, and its effect
+# told from that of the others. A NamedTuple of booleans is static to jit, so a switch that is off
+# costs nothing.
+class Corrections(NamedTuple):
+    """What of the paper is corrected or added; each for itself."""
+
+    direction: bool = False
+    """eqs 2-3: thrust along the mast at any heading (printed, they hold near psi = 0)"""
+    rigid_body: bool = False
+    """eqs 5-7: body rates, their kinematics and the inertia coupling"""
+    reaction: bool = False
+    """eq. 7: the motor's torque counts once (printed, T_m and -Ir dOmega both act)"""
+    edgewise: bool = False
+    """eq. 8: speed in the plane of the rotor as a norm, in the shaft's frame"""
+    descent: bool = False
+    """eq. 9: flow through the rotor by exact kinematics (printed, one sign is wrong)"""
+    cyclic: bool = False
+    """eqs 10, 13: the cyclic pitch of eq. 11 in place of (x_roll + x_pitch)/L1"""
+    first_order_bar: bool = False
+    """eq. 12: the flybar averaged over a turn; its state has no rate"""
+    rotor_moment: bool = False
+    """eqs 14-15: blade-element theory's 1/8, and damping by the body's rate"""
+    tail: bool = False
+    """eq. 16: inflow of the tail rotor, and with it yaw damping"""
+    tied_torque: bool = False
+    """eqs 18-19: K_Tm is Ir K_throttle, so that rotor and fuselage agree about the motor"""
+    drag: bool = False
+    """eqs 2-4: drag of the fuselage by its equivalent areas Sx, Sy, Sz"""
+    dynamic_inflow: bool = False
+    """momentum theory with the inertia of the air (Carpenter and Fridovich, 1953): a state vi"""
+    flapping: bool = False
+    """eqs 14-15: the rotor tilts first (states a1, b1); its stiffness and in-plane forces act; a
+    seesaw, whose blades do not cone"""
+    speed_stability: bool = False
+    """the first harmonic of the lift in a speed: the rotor tilts back from where it flies to"""
+    tip_loss: bool = False
+    """eqs 14-15: the lift ends at B R, as in eqs 10 and 13"""
+    tail_force: bool = False
+    """eqs 2-3, 5: the tail rotor's thrust is a force at its place, not a moment alone"""
+    tail_power: bool = False
+    """eqs 7, 10: the tail rotor takes its power from the main rotor's shaft"""
+    collective: bool = False
+    """eqs 18-19: an input x_collective for the pitch; x_throttle is left with the motor"""
+    governor: bool = False
+    """eq. 10: the throttle is a governor's, which holds the speed that x_throttle asks for"""
+    measured_speed: bool = False
+    """in place of eq. 10: the rotor's speed is an input Omega, and no motor is modelled"""
+    flybarless: bool = False
+    """eqs 11-12: no flybar; all of the cyclic stick goes to the blades"""
+
+
+class Attitude(NamedTuple):
+    """Sines and cosines of the angles."""
+
+    sphi: Scalar
+    cphi: Scalar
+    sth: Scalar
+    cth: Scalar
+    spsi: Scalar
+    cpsi: Scalar
+
+
+class Motion(NamedTuple):
+    """How the body turns and meets the air; body axes are forward, right, down."""
+
+    at: Attitude
+    dx: Scalar
+    """velocity relative to the air along x, y and z (up) [m/s]"""
+    dy: Scalar
+    dz: Scalar
+    u: Scalar
+    """the same in body axes [m/s]"""
+    v: Scalar
+    w: Scalar
+    p: Scalar
+    """rates of roll, pitch and yaw [rad/s]"""
+    q: Scalar
+    r: Scalar
+
+
+class Moments(NamedTuple):
+    """About the centre of gravity [N m]: roll right, nose up, nose right."""
+
+    roll: Scalar
+    pitch: Scalar
+    yaw: Scalar
+
 
 # Behind a barrier a number is computed once: without it XLA computes it again for each of the
 # derivatives that need it, the inflow's iteration included.
@@ -33,8 +182,6 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
     angles' derivatives, as the paper has it.
 
     Args:
-        corrections: the switches of the variant.
-        s: state, with the names of HelicopterState.
         u: inputs; wind_x, wind_y and wind_z [m/s] where there is wind.
     """
     at = once(Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi)))
@@ -58,11 +205,7 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
 
 
 def body_rates(s: Record) -> dict[str, Scalar]:
-    """p, q and r [rad/s] by name, as gyros on the body measure them.
-
-    Args:
-        s: state, with the names of HelicopterState.
-    """
+    """p, q and r [rad/s] by name, as gyros on the body measure them."""
     at = Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi))
     return dict(zip("pqr", _turned(s, at), strict=True))
 
@@ -95,13 +238,7 @@ class Cyclic(NamedTuple):
 
 
 def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
-    """Eq. 11 for both axes.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-    """
+    """Eq. 11 for both axes."""
     if not hasattr(s, "beta_roll"):
         # Without a bar all of the stick is Bell's path: eq. 11 with L2 = 0.
         return Cyclic((1.0 / p.L1) * u.x_roll, (1.0 / p.L1) * u.x_pitch)
@@ -112,22 +249,12 @@ def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
 
 
 def collective(p: Helicopter, u: Record) -> Scalar:
-    """theta0 [rad], eq. 18: of the collective stick where there is one, else of the throttle.
-
-    Args:
-        p: vehicle, SI.
-        u: inputs, with the names of HelicopterInputs.
-    """
+    """theta0 [rad], eq. 18: of the collective stick where there is one, else of the throttle."""
     return p.K_theta0 * (u.x_collective if hasattr(u, "x_collective") else u.x_throttle)
 
 
 def hub_speed(p: Helicopter, m: Motion) -> tuple[Scalar, Scalar]:
-    """The hub's speed through the air, forward and to the right [m/s].
-
-    Args:
-        p: vehicle, SI.
-        m: the `motion` of the body.
-    """
+    """The hub's speed through the air, forward and to the right [m/s]."""
     # omega x r at r = (-lr, 0, -hr), of which forward and right count here.
     return m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
 
@@ -144,13 +271,6 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
     behind the centre of gravity. The cyclic pitch then meets the air by direction: that of pitch
     has its largest blade angle on the right, where the blade advances in forward flight, that of
     roll at the nose, where it advances in flight to the left.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
     """
     # The hub is h_r above the centre of gravity: a nose that rises carries it backwards, a right
     # side that sinks carries it to the right.
@@ -190,14 +310,7 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
 
 
 def main_rotor(p: Helicopter, s: Record, u: Record, air: aero.Flow) -> aero.RotorForce:
-    """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        air: the `flow` at the hub.
-    """
+    """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state."""
     return once(aero.thrust(p, s.Omega, collective(p, u), air, getattr(s, "vi", None)))
 
 
@@ -219,9 +332,6 @@ def accelerations(
     $\tfrac12\rho V (S_x u, S_y v, S_z w)/m$ in body axes.
 
     Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        m: the `motion` of that state.
         T: thrust of the main rotor [N].
         aside: forces of the rotors forward and to the right, beside T [N].
     """
@@ -262,13 +372,6 @@ def angular_accelerations(
     the body rates, $I\dot\omega = M - \omega\times I\omega$, and the derivative of
     $\dot\phi = p + \dot\psi s_\theta$, $\dot\theta = q c_\phi - r s_\phi$,
     $\dot\psi = (q s_\phi + r c_\phi)/c_\theta$.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        m: the `motion` of that state.
-        M: the `moments`.
     """
     # The body's axes are taken for principal ones: neither the paper nor a vehicle has Ixz. What is
     # bolted on is rigid with the body, so it adds to the inertias and nowhere else.
@@ -288,3 +391,55 @@ def angular_accelerations(
     ddpsi = once(turn / at.cth)
     ddphi = dp + ddpsi * at.sth + s.dpsi * s.dtheta * at.cth
     return ddphi, ddtheta, ddpsi
+
+
+_RIGHT_ANGLE = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624871116645580e-21)
+"""pi/2 in three parts; the first two have so few digits that their multiples are exact (fdlibm)."""
+_TERMS = 10
+"""of Taylor's series of the sine beyond x: the last digit up to a right angle"""
+
+
+@jax.custom_jvp
+def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
+    """Sine and cosine of x [rad], to the last digit up to 1e6 rad.
+
+    Each is the sine of what is left of x after the nearest half turn, or for the cosine the
+    nearest half turn and right angle, with its sign. In double precision this takes a fraction of
+    the time of jnp.sin and jnp.cos; in any other it is them.
+    """
+    x = jnp.asarray(x)
+    if x.dtype != jnp.float64:
+        return jnp.sin(x), jnp.cos(x)
+    # Only sines are summed: the cosine is a sine a right angle away, with the same series, and both
+    # are evaluated where |r| <= pi/2. Half turns k and m + 1/2 are the nearest ones.
+    k = jnp.round(x * (1.0 / math.pi))
+    m = jnp.round(x * (1.0 / math.pi) - 0.5)
+    return _sign(k) * _sine_past(x, 2.0 * k), -_sign(m) * _sine_past(x, 2.0 * m + 1.0)
+
+
+def _sign(k: Scalar) -> Scalar:
+    """1 for even k and -1 for odd."""
+    # Without integers: a conversion is slow, and k may be past what an int32 holds.
+    half = 0.5 * k
+    return 1.0 - 4.0 * (half - jnp.floor(half))
+
+
+def _sine_past(x: Scalar, right_angles: Scalar) -> Scalar:
+    """The sine of x less so many right angles, which is a right angle or less."""
+    # Part by part (Cody and Waite): one product with pi/2 would lose what x and it have in common.
+    r = x
+    for part in _RIGHT_ANGLE:
+        r = r - right_angles * part
+    r2, total = r * r, 0.0
+    for n in range(_TERMS, 0, -1):
+        total = total * r2 + (-1.0) ** n / math.factorial(2 * n + 1)
+    return r + (r * r2) * total
+
+
+@sincos.defjvp
+def _sincos_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
+    # The derivative is there already; that of the rounding would be zero almost everywhere.
+    s, c = sincos(*primals)
+    return (s, c), (c * tangents[0], -s * tangents[0])

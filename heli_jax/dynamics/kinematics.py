@@ -149,7 +149,6 @@ def corrected(p: Record, u: Record, names: tuple[str, str, str]) -> Vector:
     Args:
         p: the errors, SI.
         u: what they showed, SI.
-        names: the inputs, such as p, q, r.
     """
     first, second, third = (
         (getattr(u, n) - getattr(p, f"b_{n}")) / (1.0 + getattr(p, f"lambda_{n}")) for n in names
@@ -339,10 +338,6 @@ position = Model(
 
 def kinematics(inputs: set[str], outputs: set[str]) -> Model:
     """The kinematic model that a log's signals allow.
-
-    Args:
-        inputs: names of what gyros and accelerometers logged.
-        outputs: names of what they are compared with.
 
     Raises:
         ValueError: accelerometers without a velocity or position, or the reverse.

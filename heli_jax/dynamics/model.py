@@ -1,7 +1,6 @@
 """Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
 
 import copy
-import warnings
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
@@ -153,24 +152,6 @@ class Model(eqx.Module):
     )
     """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
     are derivatives of Euler angles; None: the axes' rates are those of the body"""
-    noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
-    """deprecated: the name that `noise_intensity` had"""
-    spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
-    """deprecated: the name that `initial_sd` had"""
-
-    def __post_init__(self) -> None:
-        # The old keywords are emptied, so that dataclasses.replace does not give them again.
-        for old, new in (("noise", "noise_intensity"), ("spread", "initial_sd")):
-            if (function := getattr(self, old)) is not None:
-                warnings.warn(
-                    f"Model: the keyword {old} is deprecated, expected {new}",
-                    DeprecationWarning,
-                    stacklevel=3,
-                )
-                setattr(self, new, function)
-                setattr(self, old, None)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return by_value(self)
@@ -248,13 +229,7 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
 
 
 def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array, " n"]:
-    """The standard deviations (n,) of all states at the first sample; zero where not random.
-
-    Args:
-        model: with n states.
-        params: the model's Params.
-        dtype: of the result.
-    """
+    """The standard deviations (n,) of all states at the first sample; zero where not random."""
     # Zero where a state is not named: its first value is then known, or an unknown of the fit, and
     # not something that the filter may correct.
     random = model.initial_sd(params) if model.initial_sd is not None else {}
@@ -264,11 +239,6 @@ def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array
 
 def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
     """The correlation matrix (n, n) of all states at the first sample.
-
-    Args:
-        model: with n states.
-        params: the model's Params.
-        dtype: of the result.
 
     Raises:
         ValueError: the model correlates a state that is not random there.
@@ -322,7 +292,6 @@ def require_linear(model: Model, params: Record) -> None:
     wrong without any sign of it.
 
     Args:
-        model: any.
         params: the model's Params, SI, concrete.
 
     Raises:
@@ -338,14 +307,7 @@ def require_linear(model: Model, params: Record) -> None:
 def field_and_output(
     model: Model, params: Record, state: Record, inputs: Record
 ) -> tuple[Any, Any]:
-    """The model's rates and outputs at one point.
-
-    Args:
-        model: of one machine.
-        params: the model's Params, SI.
-        state: the model's State.
-        inputs: the model's Inputs.
-    """
+    """The model's rates and outputs at one point."""
     return (
         model.vector_field(params, state, inputs),
         model.output(params, state, inputs),
@@ -383,9 +345,7 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
     """Refuse parameters that lack what the model reads.
 
     Args:
-        model: of one machine.
         params: the model's Params; concrete numbers, NaN where not given.
-        given: parameters that come from elsewhere.
 
     Raises:
         VehicleError: one is missing.
@@ -401,9 +361,7 @@ def reads(model: Model, params: Record, name: str) -> bool:
     an input is late by it.
 
     Args:
-        model: of one machine.
         params: the model's Params; concrete numbers.
-        name: of the parameter.
     """
     if name in dict(model.delays).values():
         return True

@@ -73,7 +73,6 @@ def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
       (L_3 x_{roll} + L_2 L_4 \beta)$$
 
     Args:
-        p: vehicle, SI.
         x_roll: cyclic input displacement [m].
         beta: flapping angle of the flybar about the same axis [rad].
     """
@@ -86,7 +85,6 @@ def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
     """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll.
 
     Args:
-        p: vehicle, SI.
         x_pitch: cyclic input displacement [m].
         beta: flapping angle of the flybar about the same axis [rad].
     """
@@ -171,13 +169,7 @@ def on_stand(model: Model) -> Model:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
     def vector_field(p: Record, s: Record, u: Record) -> Record:
-        """The model's derivatives, slowed by the stand.
-
-        Args:
-            p: the model's Params, SI.
-            s: the model's State.
-            u: the model's Inputs.
-        """
+        """The model's derivatives, slowed by the stand."""
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)
@@ -252,7 +244,6 @@ def ratios_from_denominator(
     Args:
         p: vehicle, SI, of which the stand's zeta, the geometry and Omega are taken.
         den: (1, p1, p2, p3, p4), highest power of s first.
-        angle: `roll` or `pitch`.
     """
     # Five unknowns are not in four coefficients: zeta is taken as known, kappa is read from
     # p4 = kappa c2, and Omega is measured. What p2 = c2 + zeta c1 + kappa should be is then left

@@ -46,7 +46,6 @@ def flapping_rate_constant(p: Helicopter, Omega: Scalar, B: Scalar) -> Scalar:
     r"""$1/\tau_f = \gamma B^4\Omega/16$ [1/s].
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         B: tip loss factor, 1 for lift up to the tip.
     """
@@ -62,7 +61,6 @@ def speed_lift(p: Helicopter, Omega: Scalar, theta0: Scalar, inflow: Scalar, B: 
     $\tfrac12\rho a c R^2 V$ times this.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
         theta0: collective pitch [rad].
         inflow: lambda R Omega [m/s].
@@ -83,7 +81,6 @@ def flap_back(p: Helicopter, Omega: Scalar, lift: Scalar, B: Scalar) -> Scalar:
     Args:
         p: vehicle, SI; K_mu is 1 in blade-element theory.
         Omega: main rotor speed [rad/s].
-        lift: `speed_lift`.
         B: tip loss factor, 1 for lift up to the tip.
     """
     # The plane tilts until the lift that its flapping takes off is the lift that the speed adds.
@@ -96,10 +93,6 @@ def first_harmonic_moment(p: Helicopter, lift: Scalar) -> Scalar:
 
     $\tfrac12\rho a c V\Omega R^3(\tfrac23\theta_0 - \tfrac12\lambda)$, which eqs 14-15 leave out;
     like the cyclic pitch it acts with the lag of a quarter of a turn.
-
-    Args:
-        p: vehicle, SI.
-        lift: `speed_lift`.
     """
     return (0.5 * p.K_mu * p.rho * p.a * p.c * p.R**2) * lift
 
@@ -110,10 +103,7 @@ def flapping_rates(
     """da1/dt and db1/dt [rad/s], the equations of the module's text.
 
     Args:
-        p: vehicle, SI.
         Omega: main rotor speed [rad/s].
-        tilt: of the tip-path plane.
-        driven: where cyclic pitch and speed would hold it.
         m: the `Motion` of the body, of which p and q [rad/s] count.
         B: tip loss factor, 1 for lift up to the tip.
     """
@@ -147,7 +137,6 @@ def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
     Args:
         p: vehicle, SI; k_beta is the stiffness of the whole hub.
         T: thrust of the main rotor [N].
-        tilt: of the tip-path plane.
     """
     # The hub's spring and the thrust's arm turn the body by the same tilt: the moments of one
     # flight state show their sum. k_beta by itself takes a known hr or several thrusts.

@@ -29,8 +29,6 @@ _SHARE = 0.3
 _FEWEST = 40
 """common samples at least"""
 _STEPS = 30
-_DRIFTS = 3.0
-"""standard deviations by which the lags of both halves differ before a drift is stated"""
 
 
 class Lag(NamedTuple):
@@ -43,8 +41,6 @@ class Lag(NamedTuple):
     correlation: float
     overlap: float
     """[s]"""
-    drift: tuple[float, float] | None
-    """rate of the second clock against the first, less one, and its sd, where it shows"""
 
 
 class NotAligned(ValueError):
@@ -74,8 +70,7 @@ def lag_between(a: Timed, b: Timed) -> Lag:
     x, t = even_a[first:last], at_a + step * np.arange(first, last)
     y = _Smooth(at_b, even_b, step)
     lag, sd = _refined(t, x, y, lag, step)
-    drift = _drift(t, x, y, lag, step)
-    return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step, drift)
+    return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step)
 
 
 def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:
@@ -269,24 +264,3 @@ def _long_run(v: np.ndarray) -> float:
     window = np.where(lags < 0.5, 1 - 6 * lags**2 * (1 - lags), 2 * (1 - lags) ** 3)
     # Few windows fit into a short record, and what least squares fits is missing in the rest.
     return max(float(c[0] + 2.0 * np.sum(window[1:] * c[1:])), 0.1 * float(c[0]))
-
-
-def _drift(
-    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
-) -> tuple[float, float] | None:
-    """How much faster the second clock is, from the lags of both halves, and its sd; None where
-    that is less than chance makes, or one half does not tell."""
-    middle = t.size // 2
-    halves = []
-    for part in (slice(0, middle), slice(middle, t.size)):
-        try:
-            halves.append(_refined(t[part], x[part], y, lag, step))
-        except NotAligned:
-            return None
-    (early, sd_early), (late, sd_late) = halves
-    span = float(t[-1] - t[0]) / 2.0
-    change, sd = late - early, float(np.hypot(sd_early, sd_late))
-    if abs(change) < _DRIFTS * sd:
-        return None
-    # A second clock that runs fast has the larger stamps, and less has to be added to them.
-    return -change / span, sd / span

@@ -12,7 +12,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
 from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
-from heli_jax.flights.row_clock import rate_cautions, rate_of
+from heli_jax.flights.row_clock import contradicted_rate
 from heli_jax.flights.table import Table, listed, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
@@ -20,20 +20,16 @@ _LEVEL = re.compile(r"[./]")
 
 
 class _Clock(NamedTuple):
-    """An array of times: its name, the group that it stands in, and the words before `time`."""
+    """An array of times: its name, the group that it stands in, and its samples."""
 
     name: str
     group: tuple[str, ...]
-    stem: tuple[str, ...]
     size: int
 
 
 def by_clocks(table: ArrayTable) -> ChannelLog | None:
     """Arrays as topics, each with the times of its group or of the nearest above that has some of
     its length; None where all have one clock.
-
-    Args:
-        table: of arrays.
     """
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
     clocks = [c for name, x in arrays.items() if (c := _clock(name, x)) is not None]
@@ -48,11 +44,11 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     topics = tuple(_topic(table, arrays, c, seconds[c], names) for c, names in of_clock.items())
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
+    steps = [float(np.median(np.diff(t.times))) for t in topics]
     cautions = [
         caution
-        for t in topics
-        for rate in [1.0 / float(np.median(np.diff(t.times)))]
-        for caution in rate_cautions(_stated(t.clock, clocks, arrays), t.clock, rate)
+        for t, step in zip(topics, steps, strict=True)
+        for caution in contradicted_rate(table, t.clock, 1.0 / step)
     ]
     return ChannelLog(
         table.path,
@@ -65,33 +61,8 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     )
 
 
-def _stated(
-    clock: str, clocks: Sequence[_Clock], arrays: Mapping[str, np.ndarray]
-) -> dict[float, str]:
-    """What states the rate of a clock, by rate [Hz]: a number in its group, called as it is."""
-    own = next(c for c in clocks if c.name == clock)
-    beside = {c.stem for c in clocks if c.group == own.group}
-    stated = {}
-    for name, values in arrays.items():
-        *group, leaf = _LEVEL.split(name)
-        words = words_in(leaf)
-        # p_fs beside p_t, and fs beside t where that is alone.
-        rest = tuple(w for w in own.stem if w in words)
-        if tuple(group) != own.group or (rest != own.stem and len(beside) > 1):
-            continue
-        plain = "_".join(w for w in words if w not in own.stem)
-        rate = rate_of(plain, values.astype(np.float64))
-        if rate is not None:
-            stated[rate] = f"{shown(name)} = {values.ravel()[0]:g}"
-    return stated
-
-
 def clock_notes(table: Table) -> tuple[Finding, ...]:
-    """That arrays have clocks of their own, where they have.
-
-    Args:
-        table: of rows or arrays.
-    """
+    """That arrays have clocks of their own, where they have."""
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()
@@ -103,12 +74,10 @@ def clock_notes(table: Table) -> tuple[Finding, ...]:
 def _clock(name: str, values: np.ndarray) -> _Clock | None:
     *group, leaf = _LEVEL.split(name)
     words = words_in(split_unit(leaf)[0])
-    at = next((i for i in (0, len(words) - 1) if words and words[i] in TIME_NAMES), None)
     increases = values.size > 1 and bool(np.all(values[1:] > values[:-1]))
-    if at is None or not increases:
+    if not words or not TIME_NAMES & {words[0], words[-1]} or not increases:
         return None
-    # t_imu as well as imu_time.
-    return _Clock(name, tuple(group), words[:at] + words[at + 1 :], values.size)
+    return _Clock(name, tuple(group), values.size)
 
 
 def _clock_of(
@@ -116,24 +85,18 @@ def _clock_of(
 ) -> _Clock | None:
     """The clock of an array; None where its group has none of its length, or several of which not
     one alone shares the other groups' time."""
-    *group, leaf = _LEVEL.split(name)
+    group = tuple(_LEVEL.split(name)[:-1])
     for depth in range(len(group), -1, -1):
-        level = tuple(group[:depth])
-        near = [c for c in clocks if c.group == level and c.size == size]
-        if not near:
-            continue
-        # At one level by the word before: imu_t is the time of imu_gx.
-        words = (*group[depth:], *words_in(leaf))
-        own = [c for c in near if c.stem and tuple(words[: len(c.stem)]) == c.stem]
-        near = own or near
-        others = [c for c in clocks if c.group != level]
+        near = [c for c in clocks if c.group == group[:depth] and c.size == size]
+        others = [c for c in clocks if c.group != group[:depth]]
         if len(near) > 1 and others:
             # GPS time of week beside the board's time.
             times = seconds[max(others, key=lambda c: c.size).name]
             shared = (float(times[0]), float(times[-1]))
             on_it = sharing_clocks({c.name: seconds[c.name] for c in near}, shared)
             near = [c for c in near if c.name in on_it]
-        return near[0] if len(near) == 1 else None
+        if near:
+            return near[0] if len(near) == 1 else None
     return None
 
 

@@ -1,16 +1,17 @@
-"""Logs of named arrays: MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5).
+"""Logs of named arrays: MATLAB (.mat), NetCDF (.nc), HDF5 (.h5, .hdf5) and NumPy (.npy, .npz).
 
 An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 """
 
-import copy
 import hashlib
 import importlib.util
+import io
 import json
 import signal
 import subprocess
 import sys
 import threading
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,7 @@ from heli_jax import import_path
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import mat_file, packed, stacked
-from heli_jax.flights.mat_labels import labelled
-from heli_jax.flights.mat_references import References
-from heli_jax.flights.named_columns import NamedColumns, as_lists
+from heli_jax.flights.array_names import as_lists, labelled, named_columns
 from heli_jax.flights.stacked import unstacked
 from heli_jax.flights.table import (
     Budget,
@@ -43,8 +42,10 @@ _SECONDS, _RATE = 20, 10**7
 """processor time [s] that an HDF5 file may take, and bytes for which it has a second more"""
 _PATIENCE = 10
 """times as long by the clock"""
+_MOST_ARRAYS = 1000
 _MOST_ELEMENTS = 100
 """columns of a matrix: more are data of another shape than a log's"""
+NUMPY_MAGIC = b"\x93NUMPY"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -68,18 +69,6 @@ class ArrayTable:
         if not arrays:
             raise wrong(path, "holds no rows of numbers, expected a log")
         require_few_columns(path, len(arrays))
-
-    def lengths(self) -> dict[int, tuple[str, ...]]:
-        """The arrays' names by their number of samples, the longest first."""
-        sizes = sorted({x.size for x in self._arrays.values()}, reverse=True)
-        return {size: tuple(n for n, x in self._arrays.items() if x.size == size) for size in sizes}
-
-    def only(self, names: Sequence[str]) -> "ArrayTable":
-        """The same file with some of its arrays."""
-        part = copy.copy(self)
-        part.names = tuple(names)
-        part._arrays = {name: self._arrays[name] for name in names}
-        return part
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The arrays as float64 (N,).
@@ -130,30 +119,21 @@ def open_mat(path: Path) -> ArrayTable:
     # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
+    sets = DataSets(Budget(str(path), len(data)))
     try:
-        read = mat_file.read_mat(data, Budget(str(path), len(data)))
-        whole, units = labelled(read.arrays, read.texts)
+        read = mat_file.read_mat(data, sets.budget)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
-    notes: tuple[Finding, ...] = ()
     if read.objects:
-        _require_arrays(path, whole, read.objects)
+        _require_arrays(path, read.arrays, read.objects)
         each = listed(f"{shown(n)} ({kind})" for n, kind in read.objects.items())
-        notes = (note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects),)
-    real, of_stacks = unstacked({name: np.real(array) for name, array in whole.items()})
-    named = NamedColumns(real, as_lists(read.texts))
-    arrays, of_parts = {}, {}
-    for name, array in real.items():
-        for i, (part, vector) in enumerate(_vectors(name, array)):
-            called = named.name(name, i) or part
-            arrays[called] = vector
-            of_parts[called] = named.unit(name, i) or units.get(name, "")
-    notes = (*notes, *of_stacks)
-    if complex_ones := [n for n, array in whole.items() if array.dtype.kind == "c"]:
-        words = "complex numbers, of which the real part is read: "
-        words += listed(map(shown, complex_ones))
-        notes = (*notes, note("channels.complex", words, *complex_ones))
-    return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
+        sets.note(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects))
+    for name, array in read.arrays.items():
+        sets.add(name, array, {})
+    sets.labels |= read.texts
+    for name, texts in as_lists(read.texts).items():
+        sets.add_texts(name, texts)
+    return sets.table(str(path), "mat", data)
 
 
 _WAYS = {
@@ -205,8 +185,6 @@ def open_netcdf(path: Path) -> ArrayTable:
         return _from_hdf5(path, "netcdf", data)
     if not data.startswith((b"CDF\x01", b"CDF\x02")):
         raise wrong(str(path), "is no NetCDF file, expected one that begins with its mark")
-    import io
-
     import xarray
 
     def read() -> DataSets:
@@ -223,18 +201,89 @@ def open_netcdf(path: Path) -> ArrayTable:
     return guarded(path, "NetCDF file", read).table(str(path), "netcdf", data)
 
 
+def open_numpy(path: Path) -> ArrayTable:
+    """A file of NumPy: one array (.npy), or several by name (.npz).
+
+    Without pickle, which would run what a file says: arrays of Python's objects are passed over.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    where = str(path)
+    data = read_regular(path, "a file of NumPy", _LARGEST)
+    sets, objects = DataSets(Budget(where, len(data))), []
+
+    def read() -> None:
+        for name, content in _arrays(data, sets.budget):
+            file = io.BytesIO(content)
+            version = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+            shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
+            if dtype.hasobject:
+                objects.append(name)
+            # What is claimed beyond the bytes that there are would be allocated.
+            elif np.prod(shape, dtype=object) * dtype.itemsize > len(content) or not dtype.itemsize:
+                raise ValueError("cut off")
+            else:
+                _add(sets, name, np.load(io.BytesIO(content), allow_pickle=False))
+
+    guarded(path, "file of NumPy", read)
+    if objects:
+        words = f"objects of Python, which are not read: {listed(map(shown, objects))}"
+        if not sets.names:
+            problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
+            raise wrong(where, problem)
+        sets.note(note(LEFT_OUT, words, *objects))
+    return sets.table(where, "numpy", data)
+
+
+def _arrays(data: bytes, budget: Budget) -> Iterator[tuple[str, bytes]]:
+    """The arrays of a file by name, each as a .npy file has it."""
+    if data.startswith(NUMPY_MAGIC):
+        yield "data", data
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()[:_MOST_ARRAYS]
+        budget.take(sum(m.file_size for m in members))
+        for member in members:
+            if member.filename.endswith(".npy"):
+                yield member.filename.removesuffix(".npy"), archive.read(member)
+
+
+def _add(sets: "DataSets", name: str, array: np.ndarray) -> None:
+    kind = array.dtype.kind
+    if array.dtype.names is not None:
+        for field in array.dtype.names:
+            _add(sets, f"{name}.{field}" if name != "data" else field, array[field])
+    elif kind in "US" and 0 < array.size <= _MOST_ELEMENTS:
+        sets.add_texts(name, [str(x)[:1000] for x in array.astype(str).ravel()])
+    elif kind in "mM":
+        unit, count = np.datetime_data(array.dtype)
+        if unit in ("s", "ms", "us", "ns") and count == 1:
+            ticks = array.astype(np.int64).astype(np.float64)
+            sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
+    elif holds_numbers(array.dtype, array.ndim):
+        # In the machine's own order of bytes.
+        sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
+    else:
+        sets.leave_out(name, array.dtype, array.shape)
+
+
 class DataSets:
     """What is read of a file whose data sets have attributes."""
 
     def __init__(self, budget: Budget) -> None:
         self.budget = budget
+        self.labels: dict[str, str] = {}
+        """texts by path"""
         self._stored: dict[str, np.ndarray] = {}
+        self._complex: list[str] = []
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
         self._missing: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._notes: list[Finding] = []
-        self.references = References()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -248,6 +297,9 @@ class DataSets:
     def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
         self.budget.take_numbers(stored.size, stored.nbytes)
+        if stored.dtype.kind == "c":
+            self._complex.append(name)
+            stored = np.real(stored)
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
             values, missing = packed.unpack(stored, packing)
@@ -275,21 +327,30 @@ class DataSets:
 
     def vectors(self) -> tuple[dict[str, np.ndarray], dict[str, str], tuple[Finding, ...]]:
         """Arrays (N,) and units by name, and notes."""
-        notes = packed.notes_of(self._missing, self._left_out)
-        paths = {name: self.references.path(name) for name in self._stored}
-        whole = labelled(
-            {paths[name]: values for name, values in self._stored.items()}, self.references.texts
-        )
-        stated = {paths[name]: unit for name, unit in self._units.items()} | whole.units
-        flat, of_stacks = unstacked(whole.arrays)
-        named = NamedColumns(flat, self._texts)
+        notes = list(self._notes)
+        if self._missing:
+            each = listed(f"{shown(name)} ({n})" for name, n in self._missing.items())
+            words = f"the file's marks for no value are taken as missing samples: {each}"
+            total = sum(self._missing.values())
+            notes.append(note("samples.marks", words, *self._missing, value=total))
+        if self._left_out:
+            words = listed(f"{shown(n)}, {why}" for n, why in self._left_out.items())
+            notes.append(note(LEFT_OUT, f"left out: {words}", *self._left_out))
+        if self._complex:
+            words = "complex numbers, of which the real part is read: "
+            words += listed(map(shown, self._complex))
+            notes.append(note("channels.complex", words, *self._complex))
+        whole, units_beside = labelled(self._stored, self.labels)
+        stated = self._units | units_beside
+        flat, of_stacks = unstacked(whole)
         arrays, units = {}, {}
         for name, values in flat.items():
+            names, beside = named_columns(name, values, self._texts)
             for i, (part, vector) in enumerate(_vectors(name, values)):
-                called = named.name(name, i) or part
+                called = f"{name}.{names[i]}" if names else part
                 arrays[called] = vector
-                units[called] = named.unit(name, i) or stated.get(name, "")
-        return arrays, units, (*notes, *self._notes, *of_stacks)
+                units[called] = (beside[i] if beside else "") or stated.get(name, "")
+        return arrays, units, (*notes, *of_stacks)
 
 
 def open_hdf5(path: Path) -> ArrayTable:

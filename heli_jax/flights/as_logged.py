@@ -19,7 +19,6 @@ from heli_jax.flights.marks import (
     at_marks,
     counted,
     mark_words,
-    suspect_notes,
     without_marks,
 )
 from heli_jax.flights.onto_grid import FEWEST, Key
@@ -194,7 +193,6 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
         words = f"{name} has {mark_words(counted(numbers[at]), size)}: taken as missing"
         notes.append(note("samples.marks", words, value=int(np.count_nonzero(at))))
         numbers = np.where(at, np.nan, numbers)
-    notes += suspect_notes(name, numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]
         if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
@@ -213,12 +211,7 @@ def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:
 
 
 def is_wrapped(values: np.ndarray, turn: float) -> bool:
-    """Whether an angle (N,) jumps by a turn at the ends of its range, and never leaves it.
-
-    Args:
-        values: NaN where one is missing.
-        turn: in their unit.
-    """
+    """Whether an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
     y = values[np.isfinite(values)]
     if y.size < FEWEST or not np.ptp(y) <= _TURN * turn:
         return False

@@ -12,19 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding, note
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import progress
-from heli_jax.flights.blackbox_columns import narrowed
-from heli_jax.flights.blackbox_frames import Frames, find_frames
-from heli_jax.flights.blackbox_header import (
-    HOME,
-    LAST_TIME,
+from heli_jax.flights.blackbox_fields import (
     MARK,
     FrameLayout,
     Header,
+    narrowed,
     read_header,
 )
-from heli_jax.flights.blackbox_main import MainFrames, main_frames, other_frames
+from heli_jax.flights.blackbox_frames import Frames, find_frames
+from heli_jax.flights.blackbox_main import MainFrames, constant, main_frames
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
@@ -96,9 +94,8 @@ def _flight(
     layout = head.layouts["I"]
     units = _units(layout, head)
     topics = [Topic("main", main.times * 1e-6, main.columns, units, "time")]
-    # H frames make no topic: they hold the origin that the positions of G frames are told from, and
-    # are added to these.
-    topics += [t for letter in "SG" if (t := _other(frames, letter, head, main)) is not None]
+    if (slow := _slow(frames, head, main)) is not None:
+        topics.append(slow)
     return ChannelLog(
         path=path,
         format="blackbox",
@@ -124,74 +121,33 @@ def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
     return {name: unit for name, unit in units.items() if name in layout.names}
 
 
-def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic | None:
-    """Slow frames (S) or positions (G) as a topic; None where there are none."""
-    if letter not in head.layouts or not frames.starts[letter].size:
+def _slow(frames: Frames, head: Header, main: MainFrames) -> Topic | None:
+    """Settings that change in flight (S frames) as a topic; None where there are none."""
+    if "S" not in head.layouts or not frames.starts["S"].size:
         return None
-    layout, home = head.layouts[letter], None
-    if LAST_TIME in layout.predictors:
-        _keep(frames, letter, _follows(frames, letter, main))
-    if HOME in layout.predictors:
-        home, known = _home(frames, head, main)
-        if not known.all():  # a position is the distance from a home that is not known yet
-            _keep(frames, letter, known)
-            home = home[known]
-    if not frames.starts[letter].size:
-        return None
-    values = other_frames(frames, letter, head, main, home)
-    # They stand between main frames: the time of the one before, where they have none.
-    last = np.maximum(np.searchsorted(main.starts, frames.starts[letter]) - 1, 0)
-    times, clock = main.times[last], "time of the main frame before"
-    if "time" in layout.names:
-        # 32 bits, of which the main frames know the turns: the time nearest to theirs.
-        stamps, clock = values[:, layout.names.index("time")], "time"
-        times = times + ((stamps - times + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
-    names = {"S": "slow", "G": "GPS"}
+    layout = head.layouts["S"]
+    values = frames.rows["S"] + np.array([constant(p, head) for p in layout.predictors], np.int64)
+    # They stand between main frames: the time of the one before.
+    last = np.maximum(np.searchsorted(main.starts, frames.starts["S"]) - 1, 0)
+    # A field may stand in several kinds of frames; a channel's name has to be one topic's alone.
     columns = {
-        name: narrowed(values[:, i].astype(np.int32 if has_sign else np.uint32))
+        f"slow.{name}" if name in main.columns else name: narrowed(
+            (values[:, i] & 0xFFFFFFFF).astype(np.uint32).view(np.int32 if has_sign else np.uint32)
+        )
         for i, (name, has_sign) in enumerate(zip(layout.names, layout.signed, strict=True))
     }
-    # A field such as time may stand in several kinds of frames, but a channel's name has to be one
-    # topic's alone.
-    taken = set(head.layouts["I"].names)
-    columns = {k if k not in taken else f"{names[letter]}.{k}": v for k, v in columns.items()}
-    return Topic(names[letter], times * 1e-6, columns, {}, clock)
-
-
-def _follows(frames: Frames, letter: str, main: MainFrames) -> np.ndarray:
-    """Whether the main frame before each frame (M,) is known: its time is told from that one's."""
-    starts = frames.starts[letter].astype(np.int64)
-    places = (frames.starts["I"], frames.starts["P"], np.asarray(frames.damage, np.int64))
-    before = [np.append(-1, at)[np.searchsorted(at, starts)] for at in places]
-    kept = np.append(-1, main.starts)[np.searchsorted(main.starts, starts)]
-    return np.max(before, axis=0) <= kept
-
-
-def _keep(frames: Frames, letter: str, which: np.ndarray) -> None:
-    frames.rows[letter] = frames.rows[letter][which]
-    frames.starts[letter] = frames.starts[letter][which]
-
-
-def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, np.ndarray]:
-    """By G frame the home position (M, 2) before it, and whether there is one (M,)."""
-    count = frames.starts["G"].size
-    if "H" not in head.layouts or not frames.starts["H"].size:
-        return np.zeros((count, 2), np.int64), np.zeros(count, bool)
-    homes = other_frames(frames, "H", head, main, None)[:, :2]
-    # The header decides how many fields there are. Whoever adds a home indexes two columns,
-    # latitude and longitude, so a damaged header must not leave one alone.
-    if homes.shape[1] < 2:
-        homes = np.repeat(homes, 2, axis=1)
-    # The home can be set anew in flight, so the last H frame in front of each position counts.
-    before = np.searchsorted(frames.starts["H"], frames.starts["G"]) - 1
-    return homes[np.maximum(before, 0)], before >= 0
+    return Topic("slow", main.times[last] * 1e-6, columns, {}, "time of the main frame before")
 
 
 def _losses(frames: Frames, main: MainFrames) -> tuple[Finding, ...]:
-    if not frames.damage and not main.dropped:
-        return ()
-    places = len(frames.damage)
-    words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
-    if main.dropped:
-        words += f", {main.dropped} more frames lost that were differences from a lost one"
-    return (note("damage.skipped", words, value=places + main.dropped),)
+    notes = []
+    if "G" in frames.starts and (count := frames.starts["G"].size):
+        words = f"left out: {count} positions of GPS, as differences from a home that is set anew"
+        notes.append(note(LEFT_OUT, words, value=count))
+    if frames.damage or main.dropped:
+        places = len(frames.damage)
+        words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
+        if main.dropped:
+            words += f", {main.dropped} more frames lost that were differences from a lost one"
+        notes.append(note("damage.skipped", words, value=places + main.dropped))
+    return tuple(notes)

@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from heli_jax.flights.blackbox_columns import Rows
-from heli_jax.flights.blackbox_encodings import decode
-from heli_jax.flights.blackbox_header import FrameLayout
+from heli_jax.flights.blackbox_fields import FrameLayout, Rows, decode
 
 MAIN = "IP"
 """letters of the control loop's frames"""

@@ -1,76 +1,34 @@
-"""The frames of a blackbox log in their order, and which of them can be believed.
+"""The numbers of a blackbox log: what its frames hold plus what the firmware predicted, and which
+frames can be believed.
 
-Those of the control loop are nearly all of a log. They stay packed as they were written, about as
-large as the file, and a channel is computed when it is asked for: as 32 bits they take five times
-the file.
+An I frame stands alone; each P frame holds differences from what the frames before it let expect.
+So a run is an I frame with the P frames up to the next, and runs do not depend on each other: the
+k-th frames of all runs are computed at once. Nor does a field depend on another, save a motor on
+the first.
+
+All arithmetic is that of the firmware: 32 bits that overflow silently, division towards zero. A
+field without a sign has the same bits.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights import blackbox_header as header
-from heli_jax.flights.blackbox_columns import narrowed
+from heli_jax.flights import blackbox_fields as header
+from heli_jax.flights.blackbox_fields import Header, narrowed
 from heli_jax.flights.blackbox_frames import Frames
-from heli_jax.flights.blackbox_header import FrameLayout, Header
-from heli_jax.flights.blackbox_predictors import Runs, add_predictions, constant, uses_motor
 
 _LONGEST_JUMP = 10_000_000
 """us between frames, as firmware's own tools have it: what jumps further was misread"""
 
 
-class MainColumns(Mapping[str, np.ndarray]):
-    """Numbers (N,) of the control loop by name, in the fewest bits, each computed when it is asked
-    for."""
+class Runs(NamedTuple):
+    """Where runs `begin` (R,), of `length` (R,), in frames of the file's order."""
 
-    def __init__(self, frames: Frames, head: Header, runs: Runs, is_first: np.ndarray) -> None:
-        self._first, self._differences = frames.packed["I"], frames.packed["P"]
-        self._head, self._runs, self._is_first = head, runs, is_first
-        self._place = {name: i for i, name in enumerate(head.layouts["I"].names)}
-        self._kept: np.ndarray | None = None
-        self._last: tuple[str, np.ndarray] = ("", np.zeros(0, np.int8))
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        # Whoever describes a channel asks for it several times in turn.
-        if self._last[0] != name:
-            numbers = self._of_all_frames(self._place[name])
-            kept = numbers if self._kept is None else numbers[self._kept]
-            has_sign = self._head.layouts["I"].signed[self._place[name]]
-            column = narrowed(kept if has_sign else kept.view(np.uint32))
-            column.flags.writeable = False
-            self._last = name, column
-        return self._last[1]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._place)
-
-    def __len__(self) -> int:
-        return len(self._place)
-
-    def __contains__(self, name: object) -> bool:  # Mapping's own computes the channel
-        return name in self._place
-
-    def stamps(self) -> np.ndarray:
-        """Times (M,) uint32 [us] of all frames."""
-        return self._of_all_frames(self._place["time"]).view(np.uint32)
-
-    def keep(self, frames: np.ndarray) -> None:
-        """Leave all frames out but these (N,), which may be believed."""
-        self._kept = frames
-
-    def _of_all_frames(self, i: int) -> np.ndarray:
-        """The numbers (M,) int32 of the i-th field, those of frames in no run included."""
-        numbers = np.empty(self._is_first.size, np.int32)
-        numbers[self._is_first] = self._first.column(i)
-        numbers[~self._is_first] = self._differences.column(i)
-        # A motor that is told from itself, as no firmware writes, stays as it is.
-        motor = self._place.get("motor[0]", i)
-        told = np.zeros_like(numbers)
-        if motor != i and uses_motor(i, self._head):
-            told = self._of_all_frames(motor)
-        add_predictions(numbers, i, self._runs, self._is_first, told, self._head)
-        return numbers
+    begin: np.ndarray
+    length: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -79,19 +37,14 @@ class MainFrames:
     firmware's start, `starts` (N,) [bytes]; `dropped` frames could not be computed or have
     impossible times."""
 
-    columns: MainColumns
+    columns: Mapping[str, np.ndarray]
     times: np.ndarray
     starts: np.ndarray
     dropped: int
 
 
 def main_frames(frames: Frames, head: Header) -> MainFrames:
-    """The frames I and P with predictions added, in the order of the file.
-
-    Args:
-        frames: what was found.
-        head: the flight's header.
-    """
+    """The frames I and P with predictions added, in the order of the file."""
     # The finder keeps each kind apart. A difference needs the frame that stood before it in the
     # file, so the two kinds are merged by their positions.
     intra, inter = frames.starts["I"], frames.starts["P"]
@@ -100,12 +53,30 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
     starts = np.empty(is_first.size, intra.dtype)
     starts[is_first], starts[~is_first] = intra, inter
     runs = _runs(starts, is_first, np.asarray(frames.damage, np.int64))
-    columns = MainColumns(frames, head, runs, is_first)
-    keep, times = _plausible(columns.stamps(), runs, frames, starts)
-    if keep is None:
-        return MainFrames(columns, times, starts, 0)
-    columns.keep(keep)
-    return MainFrames(columns, times, starts[keep], starts.size - keep.size)
+    layout = head.layouts["I"]
+    stamps = _numbers(frames, layout.names.index("time"), runs, is_first, head)
+    keep, times = _plausible(stamps.view(np.uint32), runs, frames, starts)
+    columns = {}
+    for i, (name, has_sign) in enumerate(zip(layout.names, layout.signed, strict=True)):
+        numbers = _numbers(frames, i, runs, is_first, head)
+        kept = numbers if keep is None else numbers[keep]
+        columns[name] = narrowed(kept if has_sign else kept.view(np.uint32))
+    dropped = 0 if keep is None else starts.size - keep.size
+    return MainFrames(columns, times, starts if keep is None else starts[keep], dropped)
+
+
+def _numbers(frames: Frames, i: int, runs: Runs, is_first: np.ndarray, head: Header) -> np.ndarray:
+    """The numbers (M,) int32 of the i-th field of all frames, those in no run included."""
+    numbers = np.empty(is_first.size, np.int32)
+    numbers[is_first] = frames.packed["I"].column(i)
+    numbers[~is_first] = frames.packed["P"].column(i)
+    names, told = head.layouts["I"].names, np.zeros_like(numbers)
+    # A motor that is told from itself, as no firmware writes, stays as it is.
+    motor = names.index("motor[0]") if "motor[0]" in names else i
+    if motor != i and _uses_motor(i, head):
+        told = _numbers(frames, motor, runs, is_first, head)
+    add_predictions(numbers, i, runs, is_first, told, head)
+    return numbers
 
 
 def _runs(starts: np.ndarray, is_first: np.ndarray, damage: np.ndarray) -> Runs:
@@ -186,36 +157,113 @@ def _goes_on(before: int, stamp: int) -> bool:
     return ((stamp - before) & 0xFFFFFFFF) < _LONGEST_JUMP
 
 
-def other_frames(
-    frames: Frames, letter: str, head: Header, main: MainFrames, home: np.ndarray | None
-) -> np.ndarray:
-    """Frames S, G or H (M, F) int64: settings that change, positions, and where home is.
+def constant(predictor: int, head: Header) -> int:
+    """What a predictor expects that is one number for a whole flight; 0 for others."""
+    match predictor:
+        case header.MIN_THROTTLE:
+            return head.integer("minthrottle", 1150)
+        case header.FIFTEEN_HUNDRED:
+            return 1500
+        case header.VBAT_REFERENCE:
+            return head.integer("vbatref", 4095)
+        case header.MIN_MOTOR:
+            return head.integer("motorOutput", 0)
+    return 0
+
+
+def add_predictions(
+    values: np.ndarray, i: int, runs: Runs, is_first: np.ndarray, motor: np.ndarray, head: Header
+) -> None:
+    """Make the numbers of a field, as written, those that were logged.
 
     Args:
-        frames: what was found.
-        letter: the kind.
+        values: (N,) int32 of all frames in the file's order; changed in place. Those of frames in
+            no run come out as anything.
+        i: the field's place.
+        runs: of these frames.
+        is_first: which (N,) are I frames.
+        motor: what the first motor was told (N,) int32, where a predictor of this field is that.
         head: the flight's header.
-        main: the frames of the control loop, of which the last one's time may be a prediction.
-        home: by G frame, the home position (M, 2) in the log's unit; None where it has none.
     """
-    layout, values = head.layouts[letter], frames.rows[letter].astype(np.int64)
-    coordinate = 0
-    last = np.searchsorted(main.starts, frames.starts[letter]) - 1
-    for column, predictor in enumerate(layout.predictors):
-        if predictor == header.HOME:
-            if home is not None:
-                values[:, column] += home[:, min(coordinate, 1)]
-            coordinate += 1
-        # The time is a difference from the last main frame in the file, which is why those are
-        # computed before all others.
-        elif predictor == header.LAST_TIME and main.times.size:
-            values[:, column] += main.times[np.maximum(last, 0)]
-        else:
-            values[:, column] += constant(predictor, head)
-    return _wrapped(values, layout)
+    # Nothing stands before an I frame, so of the predictors only constants and the first motor can
+    # be meant in it.
+    for letter, rows in (("I", is_first), ("P", ~is_first)):
+        predictor = head.layouts[letter].predictors[i]
+        if predictor == header.MOTOR_0:
+            values[rows] += motor[rows]
+        elif number := constant(predictor, head):
+            values[rows] += np.int64(number).astype(np.int32)
+    has_sign = head.layouts["I"].signed[i]
+    match head.layouts["P"].predictors[i]:
+        case header.PREVIOUS:
+            _add_up(values, runs)
+        case header.STRAIGHT_LINE:
+            # A line through the two frames before: what is written is the change of the step. An
+            # I frame counts as both of those before the first P frame.
+            at_first = values[runs.begin]
+            values[runs.begin] = 0
+            _add_up(values, runs)
+            values[runs.begin] = at_first
+            _add_up(values, runs)
+        case header.AVERAGE:
+            _step(values, runs, lambda last, earlier: _mean(last, earlier, has_sign))
+        case header.INCREMENT:
+            ahead = _iterations_ahead(head)
+            _step(values, runs, lambda last, _: ahead[last.view(np.uint32) % ahead.size] + last)
 
 
-def _wrapped(values: np.ndarray, layout: FrameLayout) -> np.ndarray:
-    """As numbers of 32 bits, with a sign or without."""
-    half = np.where(layout.signed, 1 << 31, 0)
-    return ((values + half) & 0xFFFFFFFF) - half
+def _uses_motor(i: int, head: Header) -> bool:
+    """Whether the numbers of a field are differences from the first motor's."""
+    return any(head.layouts[letter].predictors[i] == header.MOTOR_0 for letter in "IP")
+
+
+def _add_up(values: np.ndarray, runs: Runs) -> None:
+    """Each number (N,) plus all before it in its run, in place."""
+    before = values[runs.begin]
+    np.cumsum(values, dtype=values.dtype, out=values)
+    # What the runs before have added up to, the frames behind them that are in no run included.
+    np.subtract(before, values[runs.begin], out=before)
+    if runs.begin.size:
+        until = np.diff(runs.begin, append=values.size)
+        values[runs.begin[0] :] += np.repeat(before, until)
+
+
+def _step(
+    values: np.ndarray, runs: Runs, expected: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> None:
+    """Add to each P frame what is `expected` of the one before it and the one before that."""
+    longest_first = np.argsort(-runs.length, kind="stable")
+    begin, length = runs.begin[longest_first], runs.length[longest_first]
+    # An I frame counts as both frames before the first P frame.
+    last = earlier = values[begin]
+    going_on = begin.size
+    for k in range(1, int(length.max(initial=0))):
+        going_on = int(np.searchsorted(-length[:going_on], -k))
+        last, earlier = last[:going_on], earlier[:going_on]
+        rows = begin[:going_on] + k
+        now = values[rows] + expected(last, earlier)
+        values[rows] = now
+        last, earlier = now, last
+
+
+def _mean(last: np.ndarray, earlier: np.ndarray, has_sign: bool) -> np.ndarray:
+    """The mean (R,) int32 of numbers (R,) int32 whose top bit is a sign or not."""
+    kind = np.int32 if has_sign else np.uint32
+    both = last.view(kind).astype(np.int64) + earlier.view(kind)
+    # Division in C goes towards zero, NumPy's towards minus infinity: odd negative sums would be
+    # off by one, and each frame would hand the error on to the next.
+    return ((both + (both < 0)) >> 1).astype(np.int32)
+
+
+def _iterations_ahead(head: Header) -> np.ndarray:
+    """By the phase of an iteration between two I frames, how many there are to the next that the
+    firmware logs: int32."""
+    between, part, whole = head.intervals
+    # The condition is the one by which the firmware leaves iterations out. The count is not in the
+    # frame, so it has to be made up in the same way.
+    phase = np.arange(between)
+    logged = (phase + part - 1) % whole < part
+    logged[0] = True  # an I frame
+    # From each phase, the steps to the next that is logged: at most to the next I frame.
+    ahead = np.flatnonzero(np.append(logged, True))
+    return (ahead[np.searchsorted(ahead, phase, side="right")] - phase).astype(np.int32)

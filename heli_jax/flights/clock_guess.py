@@ -1,17 +1,23 @@
-"""Which column of a table is its clock, where nobody says so."""
+"""The clock of a table: as a user states it, as the file does, or as its columns look; and what is
+wrong with its times, in words."""
 
+import math
 import re
 from collections.abc import Sequence
+from pathlib import PurePath
 
 import numpy as np
 
+from heli_jax import units
+from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.px4_commands import are_commands
-from heli_jax.flights.runs import restarts
-from heli_jax.flights.table import Survey, Table, shown
-from heli_jax.flights.time_units import LETTERS, likely_unit, split_unit, time_unit
+from heli_jax.flights.grid import not_increasing, shared_stamps
+from heli_jax.flights.log import holds_commands
+from heli_jax.flights.row_clock import by_rate, restarts, stated_rate
+from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
+from heli_jax.flights.time_units import LETTERS, SECONDS, likely_unit, split_unit, time_unit
 
 TIME_NAMES = {
     "zeit",
@@ -30,8 +36,6 @@ COUNTS_ROWS = "clock.counts-rows"
 _STAMP = ("header", "stamp")
 _SAMPLED = "timestamp_sample"
 """of a topic of PX4, beside `timestamp`, when it was published"""
-_ARRIVALS = ("%time", "__time", "rosbagTimestamp", "Time", "timestamp")
-"""as tools for logs of ROS and of PX4 call the column of arrival"""
 _COUNTERS = {
     *(
         "frame",
@@ -101,29 +105,6 @@ def is_called_time(name: str) -> bool:
     return re.split(r"[./]", stem)[-1].strip("%_ ").casefold() in TIME_NAMES
 
 
-def arrival_notes(table: Table, clock: str) -> tuple[Finding, ...]:
-    """Which of two clocks was taken, and why, where one is that of a message's arrival.
-
-    Args:
-        table: of rows.
-        clock: the column that is taken.
-    """
-    if not _is_of_sample(clock):
-        sampled = clock + "_sample"
-        if sampled not in table.names or not are_commands(table.path, sampled, table.names):
-            return ()
-        why = "commands act from when they are published"
-        beside = f"{shown(sampled)} is of the gyro's sample they answer"
-    else:
-        other = next((name for name in table.names if name in _ARRIVALS), None)
-        if other is None:
-            return ()
-        why = "it says when a sample was taken"
-        beside = f"{shown(other)} says when its message arrived"
-    words = f"{shown(clock)} is taken for the clock, since {why}; {beside}"
-    return (note("clock.of-several", words, clock),)
-
-
 def _says_when_sampled(table: Table, name: str) -> bool:
     """Whether a column is a clock before all others, since it is that of the samples themselves."""
     if not _is_of_sample(name):
@@ -132,7 +113,14 @@ def _says_when_sampled(table: Table, name: str) -> bool:
         return True
     # `convert` has put the clock of the topic beside what it copied. And a command acts from when
     # it was published, 0.4 to 3 ms behind the gyro's sample: as in a ULog itself.
-    return "time" not in table.names and not are_commands(table.path, name, table.names)
+    return "time" not in table.names and not _are_commands(table, name)
+
+
+def _are_commands(table: Table, stamps: str) -> bool:
+    """True where a column of times is that of commands of PX4, by the topic before it
+    (`/actuator_motors/timestamp`) or by the name of the file, as ulog2csv gives it."""
+    topic = re.split(r"[./]", stamps)[:-1]
+    return holds_commands(topic[-1] if any(topic) else PurePath(table.path).name)
 
 
 def _is_of_sample(name: str) -> bool:
@@ -154,11 +142,7 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
 
 
 def counter_of(surveys: Sequence[Survey]) -> str | None:
-    """The column that counts rows or frames, some of which may be lost; None without one.
-
-    Args:
-        surveys: of a table's columns.
-    """
+    """The column that counts rows or frames, some of which may be lost; None without one."""
     with_numbers = [(s.name, s.values) for s in surveys if s.values is not None]
     return next((n for n, x in with_numbers if _increases(x) and _is_counter(n, x)), None)
 
@@ -198,3 +182,105 @@ def _with_unit(table: Table, name: str, stamps: np.ndarray) -> tuple[Signal, boo
     if stated:
         return Signal(name, stated, "s"), False
     return Signal(name, likely_unit(stamps), "s"), True
+
+
+def table_clock(
+    table: Table,
+    surveys: Sequence[Survey],
+    time: str | Signal | None,
+    unit: str | None,
+    rate: float | None,
+) -> tuple[Signal | None, bool, str]:
+    """The clock, None without one, whether its unit or rate is a guess, and what the file says of
+    its rate.
+
+    Args:
+        table: of rows.
+        surveys: of its columns.
+        time: the column of time stamps, where it is stated.
+        unit: of the time stamps.
+        rate: samples a second [Hz], of rows or of what `time` counts.
+
+    Raises:
+        InputError: there is no such column, or the unit or the rate is none.
+    """
+    said = ""
+    if rate is not None:
+        if not (rate > 0 and np.isfinite(rate)):
+            raise wrong(table.path, f"expected a positive number of samples a second, got {rate:g}")
+        name = time.name if isinstance(time, Signal) else time
+        name = counter_of(surveys) if name is None else asked_time(table, surveys, name).name
+        signal, guessed, unit = by_rate(rate, name), False, None
+    elif time is None:
+        # A rate in the file goes before what merely increases, as a distance may.
+        stated = stated_rate(surveys)
+        signal, guessed = guess_clock(table, surveys, by_name=stated is not None)
+        if signal is None and stated is not None:
+            (clock, said), unit = stated, None
+            signal, guessed = by_rate(clock, counter_of(surveys)), True
+    else:
+        signal, guessed = asked_time(table, surveys, time), False
+    # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
+    # guess.
+    if signal is not None and unit is not None:
+        signal, guessed = asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    return signal, guessed, said
+
+
+def asked_time(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
+    """A column of times as a user names it.
+
+    Raises:
+        InputError: there is none, or its unit is none of time.
+    """
+    signal = Signal(time, "s", "s") if isinstance(time, str) else time
+    require_columns(table.path, table.names, [signal.name])
+    if all(s.values is None for s in surveys if s.name == signal.name):
+        raise wrong(table.path, "holds text, expected times", column(signal.name))
+    if signal.unit not in SECONDS:
+        if not units.is_unit(signal.unit):
+            # Of the units of time alone: the nearest of all units may be one of capacity.
+            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, SECONDS)}"
+            raise wrong(table.path, problem, column(signal.name))
+        try:
+            units.factor(signal.unit, "s")
+        except ValueError as e:
+            raise wrong(table.path, str(e), column(signal.name)) from e
+    return signal
+
+
+def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
+    """A note where the file, or the name of its clock, says another unit than the configuration."""
+    named = split_unit(time.name)[1]
+    factor = units.factor(time.unit, "s")
+    if stated and not math.isclose(units.factor(stated, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
+        return (note("units.contradicted", f"{words}, and not in {time.unit}"),)
+    if not stated and named and not math.isclose(units.factor(named, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
+        words += f": if that is right, state unit: {named} beside it"
+        return (note("units.contradicted", words),)
+    return ()
+
+
+def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
+    """Refuse a clock of which a stamp is not later than the one before it."""
+    back = not_increasing(stamps)
+    if back is None:
+        return
+    row, fault = back
+    after, now = table.cell_text(name, row - 1), table.cell_text(name, row)
+    problem = f"the time {fault}, got {now} after {after}, expected increasing times"
+    words = f"{problem}; {_remedy(table, stamps, row)}"
+    raise wrong(table.path, words, table.place(row), column(name))
+
+
+def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
+    """What to do about a stamp that is not later than the one before it, in words."""
+    # Where the one before is left out the times go on: it is the wrong one.
+    if row > 1 and stamps[row - 2] < stamps[row] and stamps[row] < stamps[row - 1]:
+        return f"{table.place(row - 1)} is out of order with those around it: leave it out"
+    if (starts := restarts(stamps)).size:
+        runs = f"{starts.size + 1} runs in one file"
+        return f"there are {runs}: gaps: split beside log: makes a flight of each"
+    return shared_stamps(stamps) or "sort the rows by time, or leave out those that go back"

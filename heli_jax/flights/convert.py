@@ -9,12 +9,14 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.flights.array_clocks import by_clocks
+from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import at_marks, counted, mark_words, suspect_notes
+from heli_jax.flights.marks import at_marks, counted, mark_words
 from heli_jax.flights.named import NamedBy
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
@@ -22,9 +24,8 @@ from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
 from heli_jax.flights.table import listed, require_few_columns, shown, wrong
 from heli_jax.flights.table_topics import (
-    as_channels,
     matching,
-    require_clocks,
+    one_topic,
     without_joins,
 )
 
@@ -96,10 +97,12 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     named = None if selection.named is None else selection.named(log)
     notes = [] if named is None else list(named.notes)
     if isinstance(log, DerivedTable):
-        channels, clockless = as_channels(
-            log.table, selection.time, selection.time_unit, notes, selection.time_rate
-        )
-        require_clocks(channels, clockless, selection.signals, notes)
+        stated = (selection.time, selection.time_unit, selection.time_rate)
+        channels = None
+        if isinstance(log.table, ArrayTable) and stated == (None, None, None):
+            channels = by_clocks(log.table)
+        if channels is None:
+            channels = one_topic(log.table, *stated, notes)
         # Without a rate the rows are copied as they are, empty cells and all.
         rate = selection.rate
         channels = channels if rate is None else without_joins(channels, notes)
@@ -198,9 +201,8 @@ def _clocks(
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
         # All channels of a topic share its stamps, so any one of them tells the clock.
         times, _ = log.channel(next(iter(topic.columns)))
-        elapsed = times - log.first_time
         try:
-            clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, window)
+            clocks[topic.name] = topic_clock(log, topic.name, times, window)
         except InputError as e:
             # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
             # there is.
@@ -269,7 +271,6 @@ def _as_logged(
             done = "taken as missing" if converted else "kept; with --rate they are missing"
             words = f"{shown(name)} has {words}: {done}"
             notes.append(note("samples.marks", words, name, value=int(np.count_nonzero(at))))
-        notes += suspect_notes(shown(name), np.where(at, np.nan, values))
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns
 
@@ -328,10 +329,6 @@ def require_output(out: Path, log: str | Path) -> None:
 
 def write_converted(out: Path, converted: Converted) -> None:
     """Write the columns; what is missing is an empty cell, or NaN in NetCDF.
-
-    Args:
-        out: ends in one of `ENDINGS`.
-        converted: what to write.
 
     Raises:
         InputError: a signal has a name that NetCDF does not allow.

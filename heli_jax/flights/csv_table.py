@@ -1,48 +1,32 @@
-"""Logs in delimited text: fast through pyarrow, and line by line where something is wrong.
+"""Logs in delimited text, of which pyarrow reads the numbers.
 
-pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes. So a clean file
-takes the fast way, and `Body.records` walks the text again to say where an error is.
+A clean file takes the fast way, all columns through pyarrow. Where anything is not plain - a quote,
+a row of another number of cells, a cell that is no number - cells are looked at as text, and
+`CsvTable._records` walks the lines again to say where an error is.
 """
 
-from collections.abc import Mapping, Sequence
+import codecs
+import csv
+import gzip
+import io
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
-from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
-from heli_jax.flights.csv_cells import row_of_units
-from heli_jax.flights.csv_comments import without_comments
-from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
-from heli_jax.flights.csv_encoding import as_utf8
-from heli_jax.flights.csv_lines import Head
-from heli_jax.flights.csv_on_disk import plain_beginning
-from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
-from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
-from heli_jax.flights.csv_text import (
-    LONGEST_HEADER,
-    Body,
-    check_text,
-    first_row,
-    header_names,
-    is_of_blanks,
-    require_short_lines,
-    tabs_for_blanks,
-)
-from heli_jax.flights.csv_texts import (
-    CELLS_AT_ONCE,
-    compute,
-    few_strays,
-    filled_cells,
-    text_floats,
-)
+from heli_jax.flights.csv_dates import is_date, seconds_of_dates
 from heli_jax.flights.digest import Digest
-from heli_jax.flights.gzipped import inner_ending, is_gzipped, unpacked
 from heli_jax.flights.table import (
+    Budget,
     Survey,
     column,
+    listed,
     require_columns,
     require_few_columns,
     shown,
@@ -56,96 +40,362 @@ from heli_jax.regular_file import read_regular, size_words
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_LARGEST = 16 * 10**9
+_LARGEST = 8 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
-_SOUGHT = "no line of names stands right above rows of as many cells, most of them numbers"
-"""of a file in whose first 1 MB a table was sought"""
-_FIRST = 100
-"""rows in which a column's first filled cell is looked for"""
-_LARGEST_SEARCHED = 250 * 10**6
-"""bytes of rows among which comments are looked for, which needs them twice in memory"""
 _LARGEST_TEXT = 2 * 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
+_LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
+"""bytes and lines in which a table is sought"""
+_FEWEST = 3
+"""rows that make a table"""
+_LONGEST_LINE = 10_000_000
+"""bytes of a row, in which a cell may hold a text"""
+_FOREIGN = 0.1
+"""part of the bytes that are none of ASCII, from which on they are no text of a log"""
+_FIRST = 100
+"""rows in which a column's first filled cell is looked for"""
+_SAMPLE = 1 << 20
+"""bytes by which the decimal sign and the columns of numbers are told"""
+_CELLS_AT_ONCE = 1 << 16
+_DELIMITERS = ("\t", "|", ";", ",")
+"""the surest first: a tab stands in no number and in hardly any name, a comma may be decimal"""
+_MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
+"""of a comment. A name may begin with a percent sign"""
+_SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
+MISSING = (
+    *("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A", "--", "---", "?", "missing"),
+    *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
+)
+"""cells that say that there is no value, beside NaN, which is a number"""
+_SIGN = "[+\u2212-]?"
+_NUMBER = re.compile(
+    rf"{_SIGN}(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD]{_SIGN}[0-9]+)?|{_SIGN}(?:nan|inf|infinity)",
+    re.IGNORECASE,
+)
+"""float() would also take 1_000, and digits of any script"""
+_WITH_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eEdD][+-]?[0-9]+)?")
+_OF_NO_MODEL = {
+    *("degc", "°c", "celsius", "degf", "°f", "kelvin", "bar", "mbar", "hpa", "psi", "inhg", "mmhg"),
+    *("gauss", "mgauss", "mg", "ut", "µt", "nt", "tesla", "db", "dbm", "mah", "ah", "wh", "ppm"),
+    *("raw", "counts", "count", "adc", "lsb", "bool", "boolean", "enum", "flag", "flags", "bits"),
+    *("norm", "normalized", "none", "nd", "n-d", "non-dim", "unitless", "ratio", "pwm", "us"),
+    *("gs", "g's", "m/s/s", "ft/s/s", "ft/sec^2", "m/sec^2", "m/s2", "ft/s2", "kts"),
+}
+"""units that stand in rows of units too, and no model asks for"""
+
+
+class _Head(NamedTuple):
+    """The names of a table, and where its rows begin."""
+
+    names: tuple[str, ...]
+    number: int
+    """of the line of names, from 1"""
+    delimiter: str
+    begin: int
+    """of the rows [bytes]"""
+    first_line: int
+    """of the rows, from 1"""
+    units: tuple[str, ...] = ()
+    is_fitting: bool = True
+    """False where no rows of as many cells were found right below"""
+
+
+class _Line(NamedTuple):
+    number: int
+    text: str
+    """without the mark of a comment"""
+    after: int
+    """where the next begins [bytes]"""
+    is_comment: bool
 
 
 def open_csv(path: Path) -> "CsvTable":
     """Read a text file, find its delimiter and its header.
 
     Raises:
-        InputError: it is no UTF-8 text, or holds no header or no rows.
+        InputError: it is no text, or holds no header or no rows.
         OSError: it cannot be read.
     """
     where = str(path)
-    plain = None if is_gzipped(path) else plain_beginning(path, _LARGEST)
-    # Of a plain file the beginning stands for all of it in what follows.
-    data = plain.data if plain else read_regular(path, "a log in CSV", _LARGEST)
-    digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
-    if is_gzipped(path):
-        data = unpacked(where, data)
-    data = as_utf8(where, data)
-    check_text(where, data)
+    packed = read_regular(path, "a log in CSV", _LARGEST)
+    digest, size = Digest(packed), len(packed)
+    data = as_text(where, unpacked(where, packed) if is_gzipped(path) else packed)
     blanks = inner_ending(path) not in (".csv", ".tsv")
-    head = find_head(where, data, blanks)
-    if head is None:
-        raise wrong(where, "holds no header, expected names of columns and rows of numbers")
-    (header, number, after), delimiter = head.header, head.delimiter
-    line = f"line {number}"
-    first = first_row(data, after)
-    if first is None:
+    head = _find_head(where, data, blanks)
+    line = f"line {head.number}"
+    rows = memoryview(data)[head.begin :]
+    if not data[head.begin : head.begin + _LOOKED_AT].strip() and not bytes(rows).strip():
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
-    if len(header) > LONGEST_HEADER:
-        raise wrong(where, "is longer than a line of a log can be", line)
-    require_short_lines(where, data, after, head.first_line)
-    rows = plain.rows(after) if plain else memoryview(data)[after:]
-    if blanks and is_of_blanks(header, first):
-        text = Body(where, rows, delimiter, 1, False).text
-        header, delimiter = tabs_for_blanks(header), "\t"
-        rows = memoryview(tabs_for_blanks(text).encode())
-    # Before the names are parsed, so that a line of commas makes no million names.
-    require_few_columns(where, header.count(delimiter) + 1, line)
-    names = header_names(where, header, delimiter, number)
-    require_names(where, names, delimiter, line)
-    quotes = data.find(b'"', after) >= 0
-    body = Body(where, rows, delimiter, head.first_line, quotes)
-    groups = [header_names(where, text, delimiter, number) for text in head.above]
-    names = as_wide(qualified(names, groups), body)
-    body, cut = body.filled().whole(len(names))
-    notes, units = cut, _units_below(body, names)
-    if units is None:
-        stated = dict(zip(names[1:], head.units, strict=False))
-        return CsvTable(size, digest, names, body, head, notes, stated)
-    body, number_of_line = _below(body)
-    listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
-    words = f"line {number_of_line} was taken for units and not for a sample: {listed}"
-    notes = (*notes, note("text.units-line", words, value=number_of_line))
-    stated = dict(zip(names, units, strict=True))
-    return CsvTable(size, digest, names, body, head, notes, stated)
+    _require_short_lines(where, data, head)
+    if head.delimiter == " ":
+        lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
+        head, rows = head._replace(delimiter="\t"), memoryview(b"\n".join(lines))
+    require_few_columns(where, len(head.names), line)
+    _require_names(where, head)
+    rows, notes = _whole(rows, head)
+    if any(head.units):
+        each = listed(f"{n} [{u}]" for n, u in zip(head.names, head.units, strict=True))
+        words = f"a line of units stands beside {line} and is no sample: {each}"
+        notes = (*notes, note("text.units-line", words, value=head.first_line - 1))
+    quotes = data.find(b'"', head.begin) >= 0
+    return CsvTable(where, size, digest, rows, head, notes, quotes)
 
 
-def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
-    """The units in the first row of the body; None where it holds none."""
-    first = first_row(body.beginning(LONGEST_HEADER), 0) or ""
-    cells = first.split(body.delimiter)
-    return row_of_units(cells) if len(cells) == len(names) else None
+def is_gzipped(path: Path) -> bool:
+    """True if a file's name says so."""
+    return path.suffix.lower() == ".gz"
 
 
-def _below(body: Body) -> tuple[Body, int]:
-    """The body without its first row, and that row's line."""
-    data = body.beginning(LONGEST_HEADER)
-    lines, at = 0, 0
-    while not data[at : (end := _end_of_line(data, at))].strip():
-        lines, at = lines + 1, end
-    end = _end_of_line(data, at)
-    if end >= body.size:
-        raise wrong(body.path, "holds a header and units alone, expected rows of numbers")
-    return body.below(end, lines + 1), body.first_line + lines
+def inner_ending(path: Path) -> str:
+    """What a file would end in if it were not packed: `.csv` of `log.csv.gz`, of `log.csv` too."""
+    return Path(path.stem if is_gzipped(path) else path.name).suffix.lower()
 
 
-def _end_of_line(data: bytes, at: int) -> int:
-    """Where the next line begins."""
-    ends = [i for i in (data.find(b"\n", at), data.find(b"\r", at)) if i >= 0]
-    end = min(ends, default=len(data) - 1)
-    return end + 2 if data[end : end + 2] == b"\r\n" else end + 1
+def unpacked(path: str, data: bytes) -> bytes:
+    """The bytes that were packed by gzip (RFC 1952), of all members that follow each other.
+
+    Raises:
+        InputError: it is none of gzip, it is cut off or damaged, or it claims more than a log has.
+    """
+    text, budget = bytearray(), Budget(path, len(data))
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            while piece := file.read(1 << 22):
+                # And its numbers: of two letters, a digit and what is behind it, eight bytes.
+                ends = sum(map(piece.count, (b"\n", b",", b";", b"\t")))
+                budget.take(len(piece) + 8 * ends)
+                text += piece
+    except (OSError, EOFError, zlib.error) as e:
+        raise wrong(path, f"is no whole file of gzip ({type(e).__name__})") from e
+    return bytes(text)
+
+
+def as_text(path: str, data: bytes) -> bytes:
+    """A file's text in UTF-8 with `\\n` between its lines.
+
+    Spreadsheets save "Unicode text" as UTF-16 with a mark, and older programs write one byte a
+    letter, of which the degree sign in a header is the commonest.
+
+    Raises:
+        InputError: it is no text.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            data = data.decode("utf-16").encode()
+        except UnicodeDecodeError as e:
+            raise wrong(path, "begins as text in UTF-16, and is none, expected whole text") from e
+    data = data.removeprefix(codecs.BOM_UTF8)
+    if (null := data.find(b"\0")) >= 0:  # valid in UTF-8, and in no log
+        at = data.count(b"\n", 0, null) + 1
+        raise wrong(path, "got binary data, expected text", f"line {at}")
+    if not data.isascii():
+        try:
+            codecs.utf_8_decode(data, "strict", True)
+        except UnicodeDecodeError as e:
+            foreign = len(data) - len(data.decode("ascii", "ignore"))
+            try:
+                if foreign > _FOREIGN * len(data):
+                    raise e
+                data = data.decode("cp1252").encode()
+            except UnicodeDecodeError:
+                at = data.count(b"\n", 0, e.start) + 1
+                problem = f"got the byte 0x{data[e.start]:02x}, expected text in UTF-8"
+                raise wrong(path, problem, f"line {at}") from e
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
+
+
+# Where the table is: a line of names right above rows of as many cells, most of them numbers.
+
+
+def _find_head(path: str, data: bytes, blanks: bool) -> _Head:
+    """The header of the table in a text, below what stands above it: titles, settings, comments."""
+    lines = list(_lines(data))
+    delimiters = (*_DELIMITERS, " ") if blanks else _DELIMITERS
+    if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
+        # Excel's own word for what stands between cells.
+        delimiters, lines = (separator[1],), lines[1:]
+    plain = [line for line in lines if not line.is_comment]
+    if not plain:
+        raise wrong(path, "holds no header, expected names of columns and rows of numbers")
+    for delimiter in delimiters:
+        head = _head(lines, delimiter)
+        if head is not None:
+            return head
+    header, *below = plain
+    first = below[0].text if below else ""
+    agreed = (d for d in delimiters if header.text.count(d) == first.count(d) > 0)
+    delimiter = next(agreed, max(reversed(delimiters), key=header.text.count))
+    names = tuple(cell.strip() for cell in _cells_of(header.text, delimiter))
+    return _Head(names, header.number, delimiter, header.after, header.number + 1, (), False)
+
+
+def _lines(data: bytes) -> Iterator[_Line]:
+    """The lines at the beginning of a text that are not blank."""
+    at = 0
+    for number in range(1, _MOST_LINES):
+        if at >= min(len(data), _LOOKED_AT):
+            return
+        end = data.find(b"\n", at)
+        after = len(data) if end < 0 else end + 1
+        text = data[at : min(after, at + _LOOKED_AT)].decode("utf-8", "ignore").rstrip("\n")
+        at = after
+        if text.strip():
+            bare = _MARK.sub("", text, count=1) if (mark := _MARK.match(text)) else text
+            yield _Line(number, bare, after, mark is not None)
+
+
+def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
+    """The names above the first run of rows with as many cells."""
+    if not any(delimiter in line.text for line in lines):
+        return None
+    cells = [_cells_of(line.text, delimiter) for line in lines]
+    at, count = 0, len(lines)
+    while at < count:
+        end = at
+        while end < min(count, at + _FEWEST) and _is_row(cells[end], lines[end], len(cells[at])):
+            end += 1
+        # A file may end before there are so many.
+        if (end - at == _FEWEST or (end == count and end > at)) and (
+            head := _above(lines, cells, at, delimiter)
+        ):
+            return head
+        at = end if end > at and end - at < _FEWEST else at + 1
+    return None
+
+
+def _above(
+    lines: Sequence[_Line], cells: Sequence[list[str]], row: int, delimiter: str
+) -> _Head | None:
+    """The header of rows that begin at a line; None where no names stand above them."""
+    width, at = len(cells[row]), row - 1
+    # A rule, or a word on what follows, between names and rows.
+    at -= at > 0 and len(cells[at]) == 1
+    near = [i for i in (at, at - 1) if i >= 0]
+    fit = [i for i in near if _names_fit(cells[i], cells[row])]
+    if not fit:
+        return None
+    if len(near) == 1:
+        near = []  # no line beside the names; to know all units takes a quarter of a second
+    # One of two lines of words has units, the other names; words that are units may be names too.
+    stated = {i: made for i in near if len(cells[i]) > 1 and (made := row_of_units(cells[i]))}
+    found = next((i for i in fit if i not in stated), fit[0])
+    if at not in (found, *stated):
+        return None
+    beside = next((made for i, made in stated.items() if i != found), ())
+    names = [cell.strip() for cell in cells[found]]
+    # A delimiter at the end of each row, or a column for comments that rows need not have.
+    names = (names + [""] * width)[:width]
+    units_of = (*beside, *[""] * width)[:width] if beside else ()
+    last = lines[row - 1]
+    return _Head(
+        tuple(names), lines[found].number, delimiter, last.after, last.number + 1, units_of
+    )
+
+
+def _cells_of(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    if '"' in line:
+        try:
+            return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+        except (csv.Error, StopIteration):
+            pass
+    return line.split(delimiter)
+
+
+def _is_value(cell: str) -> bool:
+    """True for a cell of a sample: a number, a time, or a mark for nothing."""
+    number = _NUMBER.fullmatch(cell) or _WITH_COMMA.fullmatch(cell)
+    return number is not None or cell in MISSING or is_date(cell)
+
+
+def _is_row(cells: Sequence[str], line: _Line, width: int) -> bool:
+    """True for the cells of a sample: the first is a number or a time, or most are."""
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    if line.is_comment or len(cells) != width or width < 2 or not filled:
+        return False
+    values = sum(map(_is_value, filled))
+    return 2 * values > len(filled) or (_is_value(filled[0]) and 3 * values >= len(filled))
+
+
+def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
+    """True where a line names the cells of a row."""
+    filled = [name.strip() for name in names if name.strip()]
+    surplus = len(names) - len(row)
+    fits = (
+        surplus == 0
+        or (surplus == 1 and names[-1].strip().lower() in ("", "comment", "comments"))
+        or (surplus == -1 and not row[-1].strip())
+    )
+    # A sample of which all but the time is text is no line of names.
+    if not fits or not filled or _is_value(filled[0]):
+        return False
+    return 2 * sum(map(_is_value, filled)) < len(filled)
+
+
+def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
+    """The units in a row beside the names, brackets taken off; empty where it is no such row."""
+    bare = [re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip().strip('"')).strip() for cell in cells]
+    # A row of marks for nothing says nothing of units.
+    words = [word for word in bare if word not in ("", "-", "1", "--", *MISSING)]
+    if not words or any(map(_NUMBER.fullmatch, words)):
+        return ()
+    spelled = {word: _unit(word) for word in words}
+    # One of them may be written as only its author does.
+    if 2 * sum(spelled[word] is not None for word in words) <= len(words):
+        return ()
+    return tuple(spelled.get(word) or word for word in bare)
+
+
+def _unit(word: str) -> str | None:
+    """A unit as it is known, in small letters where it is by these alone, as of DEG/SEC; None where
+    a word is none."""
+    if time_unit(word) or units.is_unit(word) or word.casefold() in _OF_NO_MODEL:
+        return word
+    # Of one letter there are too many: P is pressure, rate and pitch.
+    small = word.casefold()
+    return small if len(word) > 1 and units.is_unit(small) else None
+
+
+def _require_names(path: str, head: _Head) -> None:
+    """Refuse a first line that holds a sample, and rows that commas cut at their decimal signs."""
+    if any(map(is_date, head.names)) or all(map(_NUMBER.fullmatch, head.names)):
+        example = head.delimiter.join(
+            ["time", *(f"column{i}" for i in range(2, len(head.names) + 1))][:6]
+        )
+        problem = "got numbers or times, expected the names of the columns"
+        remedy = f"write a line of names above, such as {shown(example)}"
+        raise wrong(path, f"{problem}; {remedy}", f"line {head.number}")
+
+
+def _require_short_lines(path: str, data: bytes, head: _Head) -> None:
+    """Refuse a line longer than any of a log: its cells alone would fill the memory."""
+    start = head.begin
+    while len(data) - start > _LONGEST_LINE:
+        end = data.rfind(b"\n", start, start + _LONGEST_LINE + 1)
+        if end < 0:
+            line = head.first_line + data.count(b"\n", head.begin, start)
+            raise wrong(path, "is longer than a line of a log can be", f"line {line}")
+        start = end + 1
+
+
+def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ...]]:
+    """The rows without those of empty cells at the end, as spreadsheets write them, and without a
+    last line that ends before its last cells, as where a logger lost its power; and a note."""
+    of_nothing, size = b" \t\n" + head.delimiter.encode(), 1 << 16
+    while not (end := bytes(rows[-size:])).rstrip(of_nothing) and size < len(rows):
+        size *= 16
+    if kept := len(end.rstrip(of_nothing)):
+        after = end.find(b"\n", kept)
+        rows = rows if after < 0 else rows[: len(rows) - len(end) + after + 1]
+    at = end[:kept].rfind(b"\n") + 1
+    cells = end[at:].count(head.delimiter.encode()) + 1
+    # Of quotes a delimiter may stand within; an only line is told as what it is.
+    if at == 0 or b"\n" in end[kept:] or cells >= len(head.names) or b'"' in end[at:]:
+        return rows, ()
+    words = f"the last line is cut off ({cells} of {len(head.names)} cells): it is left out"
+    cut = note("text.line-cut-off", words, value=cells)
+    return rows[: len(rows) - len(end) + at], (cut,)
 
 
 class CsvTable:
@@ -155,22 +405,20 @@ class CsvTable:
 
     def __init__(
         self,
+        path: str,
         size: int,
         digest: Digest,
-        names: tuple[str, ...],
-        body: Body,
-        head: Head,
-        notes: tuple[Finding, ...] = (),
-        units: Mapping[str, str] | None = None,
+        rows: memoryview,
+        head: _Head,
+        notes: tuple[Finding, ...],
+        has_quotes: bool,
     ) -> None:
-        self.path, self.size, self.names = body.path, size, names
-        self.notes = notes
-        self.units: Mapping[str, str] = dict(units or {})
-        self._digest, self._body, self._head = digest, body, head
+        self.path, self.size, self.names, self.notes = path, size, head.names, notes
+        self.units: Mapping[str, str] = dict(zip(head.names, head.units, strict=False))
+        self._digest, self._rows, self._head = digest, rows, head
         self._dates: set[str] = set()
-        self._signs = decimal_signs(body)
-        self._is_searched = False
-        """for comments among the rows"""
+        self._has_quotes = has_quotes
+        self._signs = self._decimal_signs()
 
     @property
     def sha256(self) -> str:
@@ -184,7 +432,7 @@ class CsvTable:
             InputError: a column is missing or there twice, a row has more or fewer cells than
                 the header, a cell is no number.
         """
-        self._require(names)
+        require_columns(self.path, self.names, names)
         with progress.reading(self.path, self.size):
             numbers = self._numbers(names)
         self._digest.begin()
@@ -192,20 +440,18 @@ class CsvTable:
 
     def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]
-        numbers = number_columns(self._body, len(self.names), indices, self._signs)
-        if numbers is None and self._passed_over():
-            numbers = number_columns(self._body, len(self.names), indices, self._signs)
-        if numbers is not None:
-            return {n: numbers[i].values for n, i in zip(names, indices, strict=True)}
+        plain = self._plain(indices)
+        if plain is not None:
+            return {n: plain[i][0] for n, i in zip(names, indices, strict=True)}
         result = {}
         for name, text in zip(names, self._texts(indices), strict=True):
-            try:
-                values = self._values(name, text)
-            except TwoDecimalSigns as e:
-                raise wrong(self.path, str(e), column(name)) from e
+            values = self._values(name, text)
             if isinstance(values, int):
-                self._require_no_names(values)
-                problem = f"got {self.cell_text(name, values)}, expected a number"
+                cell = self.cell_text(name, values)
+                sign = " with a decimal comma" if self._signs == (",",) else ""
+                problem = f"got {cell}, expected a number{sign}"
+                if ":" in cell:
+                    problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
                 raise wrong(self.path, problem, self.place(values), column(name))
             result[name] = values
         return result
@@ -213,38 +459,31 @@ class CsvTable:
     def survey(self) -> list[Survey]:
         """Every column, in the file's order."""
         with progress.reading(self.path, self.size):
-            return self._survey()
-
-    def _survey(self) -> list[Survey]:
-        width = len(self.names)
-        likely = likely_numbers(self._body, width, self._signs)
-        plain = number_columns(self._body, width, likely, self._signs) or {}
-        rest = [i for i in range(width) if i not in plain]
-        if rest and self._passed_over():
-            return self._survey()
-        by_column = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
-        if rest:
-            texts = zip(rest, self._texts(rest), strict=True)
-            by_column |= {i: self._surveyed(self.names[i], text) for i, text in texts}
+            plain = self._plain(self._likely_numbers()) or {}
+            rest = [i for i in range(len(self.names)) if i not in plain]
+            by_column = {i: Survey(self.names[i], x, filled) for i, (x, filled) in plain.items()}
+            for i, text in zip(rest, self._texts(rest) if rest else (), strict=True):
+                by_column[i] = self._surveyed(self.names[i], text)
         # What stands behind a delimiter at the end of every row is no column.
-        surveys = [by_column[i] for i in range(width)]
+        surveys = [by_column[i] for i in range(len(self.names))]
         return [s for s in surveys if s.name or s.n_filled]
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
-        try:
-            values = self._values(name, text)
-        # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
-        except TwoDecimalSigns:
-            values = 0
-        filled = len(text) - filled_cells(text).null_count
+        values, cells = self._values(name, text), _filled(text)
+        filled = len(cells) - cells.null_count
         if not isinstance(values, int):
             return Survey(name, values, filled)
-        count = few_strays(text)
-        if not count:
+        odd = sum(
+            not _NUMBER.fullmatch(cell)
+            for piece in _pieces(cells)
+            for cell in piece.to_pylist()
+            if cell is not None
+        )
+        if 2 * odd >= filled:
             return Survey(name, None, filled)
-        words = "is no number" if count == 1 else "are no numbers, the first"
+        words = "is no number" if odd == 1 else "are no numbers, the first"
         place = f"{self.cell_text(name, values)} in {self.place(values)}"
-        return Survey(name, None, filled, f"{count} of {filled} {words}: {place}")
+        return Survey(name, None, filled, f"{odd} of {filled} {words}: {place}")
 
     def place(self, row: int) -> str:
         """`line 12`, counted from the top of the file, comments and blank lines included."""
@@ -257,146 +496,256 @@ class CsvTable:
 
     def time_unit(self, name: str) -> str | None:
         """Seconds of a column of dates; else what a row of units says, where it is one of time."""
-        if name in self._dates:
-            return "s"
-        return time_unit(self.units.get(name, ""))
+        return "s" if name in self._dates else time_unit(self.units.get(name, ""))
 
     def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
-        """A column's numbers (N,), or the first row that holds none.
+        """A column's numbers (N,), or the first row that holds none."""
+        import pyarrow as pa
 
-        Raises:
-            TwoDecimalSigns: a number has the other sign than the file.
+        cells = _filled(text)
+        first = next((c for c in cells[:_FIRST].to_pylist() if c is not None), "")
+        if is_date(first):
+            self._dates.add(name)
+            return seconds_of_dates(cells.to_pylist())
+        if "," not in self._signs:
+            sign = "."
+        else:
+            sign = "," if len(self._signs) == 1 or _first_with(cells, ",") is not None else "."
+        if sign == ",":
+            # A point would be one between thousands, or a slip.
+            if (row := _first_with(cells, ".")) is not None:
+                return row
+            cells = _compute().replace_substring(cells, ",", ".")
+        try:
+            return _floats(cells.cast(pa.float64()))
+        except pa.ArrowInvalid:  # it does not say which row
+            return _floats_one_by_one(cells)
+
+    def _decimal_signs(self) -> tuple[str, ...]:
+        """The decimal sign of the file; both, in the order to try, where its first rows tell none.
+
+        A file has one: `1.577` beside `0,25` would else be one and a half.
         """
-        filled = filled_cells(text)
-        # Before signs are changed, which dates and times of day have of their own.
-        first = next((c for c in filled[:_FIRST].to_pylist() if c is not None), "")
-        if not is_date(first):
-            # Both may be tried where no row at the beginning has a sign.
-            has_commas = len(self._signs) > 1 and _has_comma(filled)
-            sign = "," if has_commas else self._signs[0]
-            points, example = decimal_points(filled, sign)
-            values = text_floats(points)
-            if example and not isinstance(values, int):
-                other = "commas" if sign == "," else "points"
-                words = f"{shown(name)} has marks between thousands, as in {shown(example)}"
-                self._note(note("text.thousands", f"{words}: {other} are decimal", name))
-            return values
-        cells = filled.to_pylist()
-        dates = seconds_of_dates(cells, self._days(name))
-        if isinstance(dates, int):
-            return dates
-        self._dates.add(name)
-        if dates.note:
-            self._note(note("clock.dates", f"{shown(name)}: {dates.note}", name))
-        return dates.seconds
+        delimiter, first = self._head.delimiter, bytes(self._rows[:_SAMPLE])
+        # A comma between cells is decimal only within quotes.
+        if b'"' not in first if delimiter == "," else b"," not in first:
+            return (".",)
+        lines = first.decode("utf-8", "ignore").split("\n")[:2000]
+        cells = (cell.strip() for line in lines for cell in _cells_of(line, delimiter))
+        if any(map(_WITH_COMMA.fullmatch, cells)):
+            return (",",)
+        return (".",) if delimiter == "," else (".", ",")
 
-    def _days(self, name: str) -> list[str | None] | None:
-        """The cells of the one column of dates beside a time of day."""
-        _, first = self._record(0)
-        columns = [i for i, cell in enumerate(first) if is_day(cell.strip())]
-        if len(columns) != 1 or self.names[columns[0]] == name:
+    def _plain(self, indices: Sequence[int]) -> dict[int, tuple[np.ndarray, int]] | None:
+        """Columns of numbers by index, and how many of their cells are filled; None where anything
+        is not plain."""
+        import pyarrow as pa
+
+        for sign in self._signs:
+            table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), sign)
+            if table is not None:
+                columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
+                return {i: (_floats(c), len(c) - c.null_count) for i, c in columns.items()}
+        return None
+
+    def _likely_numbers(self) -> list[int]:
+        """The columns that hold numbers as far as the first rows tell."""
+        import pyarrow as pa
+
+        first = self._rows[:_SAMPLE]
+        if len(self._rows) > len(first):
+            first = first[: bytes(first).rfind(b"\n") + 1]
+        likely = set()
+        for sign in self._signs:
+            table = self._arrow(first, dict.fromkeys(range(len(self.names))), sign)
+            kinds = [] if table is None else table.schema.types
+            likely |= {
+                i
+                for i, kind in enumerate(kinds)
+                if pa.types.is_integer(kind) or pa.types.is_floating(kind)
+            }
+        return sorted(likely)
+
+    def _arrow(self, rows: memoryview, kinds: Mapping[int, Any], sign: str) -> "pa.Table | None":
+        """Columns by index, in their types (None lets pyarrow guess); None where it cannot read
+        them."""
+        import pyarrow as pa
+        from pyarrow import csv as arrow_csv
+
+        # pyarrow takes a line break within quotes for one within a cell or for the end of a row, by
+        # an option; either way the lines that it counts are not those of the file.
+        if self._has_quotes or not kinds:
             return None
-        return filled_cells(self._texts(columns)[0]).to_pylist()
+        stated = {str(i): kind for i, kind in kinds.items() if kind is not None}
+        ragged: list[Any] = []
 
-    def _passed_over(self) -> bool:
-        """Whether comments stood among the rows, which are without them from now on."""
-        if self._is_searched or self._body.size > _LARGEST_SEARCHED:
-            return False
-        self._is_searched = True
-        stripped = without_comments(self._body)
-        if stripped is None:
-            return False
-        self._body, passed_over = stripped
-        self._signs = decimal_signs(self._body)
-        self._note(passed_over)
-        return True
+        # Called for each row with other than the header's number of cells: so for blank lines too,
+        # which are no error. That there is any other is enough: `_records` finds its line.
+        def skip(row: Any) -> str:
+            if not _is_blank(row.text, self._head.delimiter):
+                ragged.append(row)
+            return "skip"
 
-    def _note(self, finding: Finding) -> None:
-        if finding not in self.notes:
-            self.notes = (*self.notes, finding)
-
-    def _require_no_names(self, row: int) -> None:
-        """Refuse a header between the rows: a logger began anew there."""
-        line, cells = self._record(row)
-        if tuple(cell.strip().strip('"') for cell in cells) == self.names:
-            problem = "holds the names of the columns again, as where a logger began anew, expected"
-            raise wrong(self.path, f"{problem} numbers; make two files of it here", f"line {line}")
-
-    def _require(self, names: Sequence[str]) -> None:
-        missing = [name for name in names if name not in self.names]
-        # The likeliest cause has a sentence of its own.
-        if missing and len(self.names) == 1:
-            raise wrong(
-                self.path,
-                f"got no comma, semicolon or tab between names, expected columns,"
-                f" {shown(missing[0])} among them",
-                f"line {self._head.header.number}",
+        # By number, since two columns may have one name.
+        names = [str(i) for i in range(len(self.names))]
+        try:
+            table = arrow_csv.read_csv(
+                pa.BufferReader(pa.py_buffer(rows)),
+                read_options=arrow_csv.ReadOptions(column_names=names),
+                parse_options=arrow_csv.ParseOptions(
+                    delimiter=self._head.delimiter,
+                    quote_char=False,
+                    double_quote=False,
+                    invalid_row_handler=skip,
+                ),
+                convert_options=arrow_csv.ConvertOptions(
+                    column_types=stated,
+                    include_columns=[str(i) for i in kinds],
+                    # Not its own list, which has words such as #N/A N/A.
+                    null_values=["", *MISSING],
+                    decimal_point=sign,
+                ),
             )
-        require_columns(self.path, self.names, names)
+        except pa.ArrowException:  # such as a line longer than a block, or a cell that is no number
+            return None
+        return None if ragged or not table.num_rows else table
+
+    def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
+        """The cells of some columns as pyarrow string arrays (N,)."""
+        import pyarrow as pa
+
+        if len(self._rows) > _LARGEST_TEXT:
+            problem = (
+                "has quotes, a row of other than the header's number of cells, or a cell that is "
+                f"no plain number, which is looked at in files of at most "
+                f"{size_words(_LARGEST_TEXT)}, got {size_words(len(self._rows))}"
+            )
+            raise wrong(self.path, problem)
+        table = self._arrow(self._rows, dict.fromkeys(indices, pa.string()), ".")
+        if table is not None:
+            return [table.column(str(i)) for i in indices]
+        # Row by row; packed as they come: as objects of Python cells take many times the file's
+        # size. large_string: an array of string() holds 2 GB of text at most.
+        pieces: list[list[Any]] = [[] for _ in indices]
+        rows: list[list[str]] = []
+
+        def pack() -> None:
+            for piece, i in zip(pieces, indices, strict=True):
+                piece.append(pa.array([cells[i] for cells in rows], pa.large_string()))
+            rows.clear()
+
+        count = 0
+        for line, cells in self._records():
+            if len(cells) != len(self.names):
+                raise wrong(self.path, self._ragged(len(cells)), f"line {line}")
+            rows.append(cells)
+            count += 1
+            if len(rows) * len(cells) >= _CELLS_AT_ONCE:
+                pack()
+        pack()
+        if not count:
+            raise wrong(self.path, "holds a header alone, expected rows of numbers")
+        return [pa.chunked_array(piece, pa.large_string()) for piece in pieces]
+
+    def _ragged(self, count: int) -> str:
+        problem = f"{count} cell{'' if count == 1 else 's'}, expected {len(self.names)}"
+        problem += f" as in the header in line {self._head.number}"
+        if self._head.is_fitting:
+            return problem
+        return f"{problem}; no line of names stands right above rows of as many cells"
 
     def _record(self, row: int) -> tuple[int, list[str]]:
         # From the top each time: only a message asks for one, and an index of all rows would be as
         # large as the log.
-        for i, record in enumerate(self._body.records()):
+        for i, record in enumerate(self._records()):
             if i == row:
                 return record
         raise IndexError(row)
 
-    def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
-        """The cells of some columns as pyarrow string arrays (N,)."""
-        size = self._body.size
-        if size > _LARGEST_TEXT:
-            problem = (
-                "has quotes, a row of other than the header's number of cells, or a cell that is "
-                f"no plain number, which is looked at in files of at most "
-                f"{size_words(_LARGEST_TEXT)}, got {size_words(size)}"
-            )
-            raise wrong(self.path, problem)
-        texts = text_columns(self._body, len(self.names), indices)
-        if texts is None:
-            texts = self._texts_row_by_row(indices)
-        if texts and not len(texts[0]):
-            raise wrong(self.path, "holds a header alone, expected rows of numbers")
-        return texts
+    def _records(self) -> Iterator[tuple[int, list[str]]]:
+        """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader.
 
-    def _texts_row_by_row(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
-        """As `_texts`; cells are packed as they come: as objects of Python they take many times
-        the file's size."""
-        import pyarrow as pa
-
-        # large_string: an array of string() holds 2 GB of text at most.
-        width, kind = len(self.names), pa.large_string()
-        pieces: list[list[Any]] = [[] for _ in indices]
-        cells_of: list[list[str]] = [[] for _ in indices]
-
-        def pack() -> None:
-            for piece, cells in zip(pieces, cells_of, strict=True):
-                piece.append(pa.array(cells, kind))
-                cells.clear()
-
-        for row, (line, cells) in enumerate(self._body.records()):
-            if len(cells) != width:
-                problem = f"{_count(len(cells))}, expected {width} as in the header"
-                problem += f" in line {self._head.header.number}"
-                if not self._head.is_fitting:
-                    problem += f"; {_SOUGHT}"
-                raise wrong(self.path, problem, f"line {line}")
-            for column_cells, i in zip(cells_of, indices, strict=True):
-                column_cells.append(cells[i])
-            if row % self._rows_at_once == self._rows_at_once - 1:
-                pack()
-        pack()
-        return [pa.chunked_array(piece, kind) for piece in pieces]
-
-    @property
-    def _rows_at_once(self) -> int:
-        return max(1, CELLS_AT_ONCE // len(self.names))
+        Raises:
+            InputError: a quotation mark that closes nothing or is never closed.
+        """
+        delimiter, first = self._head.delimiter, self._head.first_line
+        # newline: what else Python takes for the end of a line, no spreadsheet and no pyarrow does.
+        lines = io.TextIOWrapper(io.BytesIO(self._rows), "utf-8", newline="\n")
+        if not self._has_quotes:
+            for number, line in enumerate(lines, first):
+                if not _is_blank(line, delimiter):
+                    yield number, line.rstrip("\n").split(delimiter)
+            return
+        reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
+        # The line where a record starts, not where it ends: a quoted cell may span several.
+        start = first
+        try:
+            for cells in reader:
+                if cells and not (len(cells) == 1 and _is_blank(cells[0], delimiter)):
+                    yield start, cells
+                start = first + reader.line_num
+        except csv.Error as e:
+            problem = "a quotation mark that closes nothing or is never closed, expected numbers"
+            raise wrong(self.path, problem, f"line {start}") from e
 
 
-def _count(n: int) -> str:
-    return "1 cell" if n == 1 else f"{n} cells"
+def _is_blank(line: str, delimiter: str) -> bool:
+    """True for a line without a cell; one of delimiters alone is a row of empty cells."""
+    return not line.strip() and delimiter not in line
 
 
-def _has_comma(text: "pa.ChunkedArray") -> bool:
-    pc = compute()
-    return bool(pc.any(pc.match_substring(text, ",")).as_py())
+def _compute() -> Any:
+    """pyarrow's functions on columns; they are made at run time, so no checker knows them."""
+    import pyarrow.compute
+
+    return pyarrow.compute
+
+
+def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
+    """Cells without the blanks around them, null where nothing or a mark for it is left."""
+    import pyarrow as pa
+
+    pc = _compute()
+    trimmed = pc.utf8_trim_whitespace(text)
+    is_empty = pc.is_in(trimmed, value_set=pa.array(["", *MISSING], trimmed.type))
+    return pc.if_else(is_empty, pa.nulls(1, trimmed.type)[0], trimmed)
+
+
+def _first_with(cells: "pa.ChunkedArray", sign: str) -> int | None:
+    """The first row whose cell holds a sign."""
+    row = _compute().index(_compute().match_substring(cells, sign), True).as_py()
+    return row if row >= 0 else None
+
+
+def _pieces(cells: "pa.ChunkedArray") -> Iterator["pa.ChunkedArray"]:
+    """As objects of Python all cells at once take many times the file's size."""
+    return (cells.slice(at, _CELLS_AT_ONCE) for at in range(0, len(cells), _CELLS_AT_ONCE))
+
+
+def _floats_one_by_one(cells: "pa.ChunkedArray") -> np.ndarray | int:
+    """Numbers (N,), or the first row that holds none. Fortran writes 1.0D+00, some a true minus."""
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cell for piece in _pieces(cells) for cell in piece.to_pylist()):
+        if cell is None:
+            continue
+        if not _NUMBER.fullmatch(cell):
+            return row
+        values[row] = float(cell.replace("\u2212", "-").replace("D", "e").replace("d", "e"))
+    return values
+
+
+def _floats(numbers: "pa.ChunkedArray") -> np.ndarray:
+    """Numbers of pyarrow as float64 (N,), NaN where null."""
+    import pyarrow as pa
+
+    values, at = np.empty(len(numbers), np.float64), 0
+    # As buffers, since to_numpy imports pandas, which takes a second.
+    for chunk in filter(len, numbers.chunks):
+        piece = values[at : at + len(chunk)]
+        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
+        if chunk.null_count:
+            known = chunk.is_valid().cast(pa.uint8())
+            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
+            piece[at_known == 0] = np.nan
+        at += len(chunk)
+    return values

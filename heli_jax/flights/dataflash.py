@@ -6,6 +6,7 @@ never lets it end, and it reads one message at a time.
 """
 
 import array
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from heli_jax.regular_file import read_regular
 # The first message of a log is the format of formats: two bytes with which every message begins,
 # and its number 0x80.
 MAGIC = b"\xa3\x95\x80"
-_LARGEST = 2 * 10**9
+_LARGEST, _LARGEST_TEXT = 2 * 10**9, 10**9
 _HEAD = b"\xa3\x95"
 _FMT = 0x80
 # Bytes: three of the head, type and length, 4 of the name, 16 of the kinds and 64 of the columns.
@@ -115,7 +116,7 @@ def open_dataflash(path: Path) -> ChannelLog:
     described, damaged = _walk(data)
     raw = np.frombuffer(data, np.uint8)
     parts = []
-    for form, number, since, starts in described:
+    for form, number, since, starts, _ in described:
         # Messages of one description are of one length, so all of them are taken out of the bytes
         # at once. Each message's bytes become a row, whose columns are then the fields.
         at = np.frombuffer(starts, np.int64)
@@ -134,13 +135,14 @@ def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 
 class _Described(NamedTuple):
-    """A description, its message's number, where it stands in the file, and where the messages
-    that are read by it begin."""
+    """A description, its message's number, where it stands in the file, where the messages that are
+    read by it begin, and in text their cells."""
 
     form: Format
     number: int
     since: int
-    starts: array.array
+    places: array.array
+    cells: list[list[str]]
 
 
 def _walk(data: bytes) -> tuple[list[_Described], int]:
@@ -148,10 +150,10 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
     # The format of formats is stated here, since without it the first message could not be read,
     # which states it again.
     of_formats = Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))
-    described = [_Described(of_formats, _FMT, 0, array.array("q"))]
+    described = [_Described(of_formats, _FMT, 0, array.array("q"), [])]
     forms = {_FMT: of_formats}
     lengths = {_FMT: _FMT_LENGTH}
-    starts = {_FMT: described[0].starts}
+    starts = {_FMT: described[0].places}
     at, damaged, size, report_at = 0, 0, len(data), 0
     while at + 3 <= size:
         if at >= report_at:
@@ -184,12 +186,12 @@ def _walk(data: bytes) -> tuple[list[_Described], int]:
             # Every boot describes its messages again. A new firmware may do so otherwise, and what
             # follows is written by its description.
             if taken is not None and forms.get(taken[0]) != taken[1]:
-                new = _Described(taken[1], taken[0], at, array.array("q"))
+                new = _Described(taken[1], taken[0], at, array.array("q"), [])
                 described.append(new)
-                forms[new.number], starts[new.number] = new.form, new.starts
+                forms[new.number], starts[new.number] = new.form, new.places
                 lengths[new.number] = new.form.dtype.itemsize + 3
         at += length
-    return [d for d in described if d.starts], damaged
+    return [d for d in described if d.places], damaged
 
 
 def _format(body: bytes) -> tuple[int, Format] | None:
@@ -511,3 +513,101 @@ def _firmware(rows: np.ndarray) -> str:
     # The firmware names itself when it begins to log; messages of the flight may quote anything.
     texts = [_text(text) for text in rows["Message"][:50]]
     return next((t for t in texts if t.startswith(("Ardu", "APM:", "Blimp", "Rover"))), "")
+
+
+_FMT_PARTS = 5
+"""cells of a format before the names of the columns, the word FMT among them"""
+# The kinds of fields that hold text, of 4, 16 and 64 characters.
+_TEXTS = "nNZ"
+
+
+def is_dataflash_text(head: bytes) -> bool:
+    """Whether the first bytes of a file hold the format of a message, as such logs begin."""
+    return any(line.startswith(b"FMT,") for line in head.splitlines())
+
+
+def open_dataflash_text(path: Path) -> ChannelLog:
+    """The flight of a DataFlash log in text.
+
+    Raises:
+        InputError: it is no DataFlash log, or holds no samples.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a DataFlash log in text", _LARGEST_TEXT)
+    formats: dict[str, _Described] = {}
+    described: list[_Described] = []
+    damaged = 0
+    # Bytes that are no UTF-8 cost the line that they are in and not the log: a message may hold
+    # damage.
+    for at, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace")):
+        name, _, rest = line.rstrip("\n").partition(",")
+        name = name.strip()
+        if name == "FMT":
+            taken = _format_of_line(rest)
+            damaged += taken is None
+            # A new firmware may describe its messages otherwise from its boot on.
+            if taken is not None and (
+                taken[1].name not in formats or formats[taken[1].name].form != taken[1]
+            ):
+                described.append(_Described(taken[1], taken[0], at, array.array("q"), []))
+                formats[taken[1].name] = described[-1]
+        elif name in formats:
+            form, _, _, places, rows = formats[name]
+            # The last cell may be a message with commas of its own.
+            row = [cell.strip() for cell in rest.split(",", len(form.columns) - 1)]
+            if len(row) == len(form.columns):
+                places.append(at)
+                rows.append(row)
+            else:
+                damaged += 1
+        # Before the first format stand lines of the firmware and the board.
+        elif line.strip() and formats:
+            damaged += 1
+    if not formats:
+        raise wrong(str(path), "is no DataFlash log, expected lines of FMT that name its columns")
+    parts = []
+    for form, number, since, places, rows in described:
+        table, good = _columns(form, rows)
+        damaged += len(rows) - table.size
+        if table.size:
+            parts.append(Part(form, number, since, np.array(places)[good], table))
+    return make_log(str(path), data, parts, damaged, scaled=True)
+
+
+def _format_of_line(rest: str) -> tuple[int, Format] | None:
+    """The number and the format that a line FMT describes; None of damage."""
+    cells = [cell.strip() for cell in rest.split(",")]
+    if len(cells) < _FMT_PARTS or not cells[0].isdigit():
+        return None
+    # A line is FMT, type, length, name, kinds, columns. The length is that of the binary message,
+    # which says nothing of a text.
+    form = Format(cells[2], cells[3], tuple(cells[_FMT_PARTS - 1 :]))
+    # Of arrays nobody has seen a text.
+    if not form.is_valid or "a" in form.kinds:
+        return None
+    # Cut, since a damaged cell may hold thousands of digits, which Python refuses to convert.
+    return int(cells[0][:9]), form
+
+
+def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, list[int]]:
+    """Lines of one message as a structured array, and which of them hold numbers."""
+    good, parsed = [], []
+    for i, row in enumerate(lines):
+        try:
+            parsed.append(
+                tuple(
+                    cell.encode() if kind in _TEXTS else float(cell)
+                    for kind, cell in zip(form.kinds, row, strict=True)
+                )
+            )
+            good.append(i)
+        # A row whose cells are no numbers is left out as a whole: what else it holds is as
+        # doubtful.
+        except ValueError:
+            continue
+    # Whatever its letter says, a number in text may have decimals: what the binary log stores as
+    # hundredths is written as what it means.
+    kinds = [FIELDS[kind][0] if kind in _TEXTS else "<f8" for kind in form.kinds]
+    # A mode is written as its name: a column that never holds a number is text.
+    dtype = np.dtype(list(zip(form.columns, kinds, strict=True)))
+    return np.array(parsed, dtype), good

@@ -14,9 +14,10 @@ import numpy as np
 from heli_jax.errors import nearest
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.marks import Marked, at_sure_or_suspected, mark_words
+from heli_jax.flights.marks import Marked, at_marks, mark_words, without_marks
 from heli_jax.flights.resample import longest_gap
-from heli_jax.flights.table import Survey, Table, shown, wrong
+from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_view import TableView
 
 EULER = ("roll", "pitch", "yaw")
 BODY = ("u", "v", "w")
@@ -216,7 +217,7 @@ class DerivedLog(ChannelLog):
                 raise wrong(self.path, f"{problem} channels of one", place)
         values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
         # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
-        return topics[0], np.stack([_without_marks(x) for x in values])
+        return topics[0], np.stack([without_marks(x) for x in values])
 
     def source_marks(self, name: str) -> dict[str, Marked]:
         """The marks in the channels that a derived one is computed from, by channel."""
@@ -240,14 +241,12 @@ def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray
     return between
 
 
-class DerivedTable:
+class DerivedTable(TableView):
     """A table of rows whose derived columns can be asked for as its own."""
 
     def __init__(self, table: Table, swashplate: Swashplate | None = None) -> None:
-        self.table, self.swashplate = table, swashplate
-        self.path, self.format, self.size = table.path, table.format, table.size
-        self.sha256, self.names = table.sha256, table.names
-        self.notes, self.units = table.notes, table.units
+        super().__init__(table)
+        self.swashplate = swashplate
         self._marks: dict[str, dict[str, Marked]] = {}
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -260,13 +259,11 @@ class DerivedTable:
         plain = [name for name in names if name not in derived]
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
-        # A table says more of its cells once they were read.
-        self.notes = self.table.notes
         for name, d in derived.items():
             needed = {n: columns[n] for group in d.groups for n in group}
             rows = {n: (np.arange(x.size), x) for n, x in needed.items()}
             self._marks[name] = _marked(rows)
-            clean = {n: _without_marks(x) for n, x in needed.items()}
+            clean = {n: without_marks(x) for n, x in needed.items()}
             columns[name] = d.compute(*(np.stack([clean[n] for n in g]) for g in d.groups))
         return {name: columns[name] for name in names}
 
@@ -281,32 +278,16 @@ class DerivedTable:
         except ValueError as e:
             raise wrong(self.path, str(e), f"column {shown(name)}") from e
 
-    def survey(self) -> list[Survey]:
-        """The file's own columns."""
-        return self.table.survey()
-
-    def place(self, row: int) -> str:
-        """Where a row stands."""
-        return self.table.place(row)
-
     def cell_text(self, name: str, row: int) -> str:
         """What stands in a cell; of a derived column the number."""
         if self._derivation(name) is None:
-            return self.table.cell_text(name, row)
+            return super().cell_text(name, row)
         return f"{self.numbers([name])[name][row]:g}"
-
-    def time_unit(self, name: str) -> str | None:
-        """The unit of a column of time stamps."""
-        return self.table.time_unit(name) if name in self.names else None
-
-
-def _without_marks(numbers: np.ndarray) -> np.ndarray:
-    return np.where(at_sure_or_suspected(numbers), np.nan, numbers)
 
 
 def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Marked]:
     """By channel the marks in places and samples (N,), of those that have some."""
-    kept = {n: at_sure_or_suspected(x) for n, (_, x) in channels.items()}
+    kept = {n: at_marks(x) for n, (_, x) in channels.items()}
     return {n: Marked(*(x[kept[n]] for x in pair)) for n, pair in channels.items()}
 
 

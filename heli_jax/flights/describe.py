@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import arrival_notes, counter_notes
+from heli_jax.flights.clock_guess import counter_notes, table_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -27,8 +27,15 @@ from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.row_clock import ROWS, contradicted_rate
-from heli_jax.flights.runs import clock_scale, numbering, numbering_notes, restarts, with_runs
+from heli_jax.flights.row_clock import (
+    ROWS,
+    clock_scale,
+    contradicted_rate,
+    numbering,
+    numbering_notes,
+    restarts,
+    with_runs,
+)
 from heli_jax.flights.table import (
     Survey,
     Table,
@@ -37,8 +44,6 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.table_clock import table_clock
-from heli_jax.flights.table_view import without_copies
 from heli_jax.flights.time_units import SECONDS
 
 _GAP_STEPS = 1.5
@@ -255,10 +260,6 @@ def describe_table(
     starts = np.zeros(0, int)
     if signal is not None and signal.name != ROWS:
         table, surveys, starts = _with_runs(table, surveys, signal)
-    if signal is not None and signal.name != ROWS:
-        once = without_copies(table, signal.name, surveys)
-        if once is not table:
-            table, surveys = once, once.survey()
     # A stamp is never taken as missing: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
@@ -279,7 +280,7 @@ def describe_table(
             *table.notes,
             *_other_lengths(surveys),
             *clock_notes(table),
-            *(counter_notes(surveys) if clock is None else arrival_notes(table, clock.column)),
+            *(counter_notes(surveys) if clock is None else ()),
             *numbering_notes(clock.numbering if clock else ""),
             *(contradicted_rate(table, clock.column, clock.rate) if clock else ()),
             *marks,
@@ -340,9 +341,7 @@ def _with_runs(
     if not starts.size:
         return table, surveys, starts
     parted = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
-    apart = parted.numbers([signal.name])[signal.name]
-    changed = [replace(s, values=apart) if s.name == signal.name else s for s in surveys]
-    return parted, changed, starts
+    return parted, parted.survey(), starts
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:

@@ -1,13 +1,8 @@
 """The fingerprint of a file, computed beside other work."""
 
 import hashlib
-import threading
-from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-
-_PIECE = 1 << 20
-_AT_ONCE = 1 << 22
-"""bytes: below, a thread costs more than it saves"""
 
 
 class Digest:
@@ -17,22 +12,13 @@ class Digest:
     """
 
     def __init__(self, source: bytes | Path) -> None:
-        """Note what to read.
-
-        Args:
-            source: all bytes of the file, or where it is.
-        """
-        self._hash = hashlib.sha256()
-        self._thread: threading.Thread | None = None
-        self._failure: OSError | None = None
-        self._is_small = isinstance(source, bytes) and len(source) < _AT_ONCE
-        self._pieces = _pieces_of(source) if isinstance(source, bytes) else _pieces_read(source)
+        """Note what to read: all bytes of the file, or where it is."""
+        self._source = source
+        self._made: Future[str] | None = None
 
     def begin(self) -> None:
-        """Begin, if it has not, where that is worth a thread."""
-        if self._thread is None and not self._is_small:
-            self._thread = threading.Thread(target=self._run, daemon=True)
-            self._thread.start()
+        """Begin, if it has not."""
+        self._begun()
 
     def hex(self) -> str:
         """The fingerprint, once it is there.
@@ -40,30 +26,18 @@ class Digest:
         Raises:
             OSError: the file could not be read to its end.
         """
-        self.begin()
-        if self._thread is None:
-            self._run()
-        else:
-            self._thread.join()
-        if self._failure is not None:
-            raise self._failure
-        return self._hash.hexdigest()
+        return self._begun().result()
 
-    def _run(self) -> None:
-        try:
-            for piece in self._pieces:
-                self._hash.update(piece)
-        except OSError as e:
-            self._failure = e
+    def _begun(self) -> Future[str]:
+        if self._made is None:
+            pool = ThreadPoolExecutor(1)
+            self._made = pool.submit(_sha256, self._source)
+            pool.shutdown(wait=False)
+        return self._made
 
 
-def _pieces_of(data: bytes) -> Iterator[memoryview]:
-    view = memoryview(data)
-    for at in range(0, len(data), _PIECE):
-        yield view[at : at + _PIECE]
-
-
-def _pieces_read(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            yield piece
+def _sha256(source: bytes | Path) -> str:
+    if isinstance(source, bytes):
+        return hashlib.sha256(source).hexdigest()
+    with source.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

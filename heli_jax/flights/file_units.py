@@ -17,10 +17,6 @@ def with_file_units(log: ChannelLog | Table, request: Request) -> Request:
     """The request with the units that the file has where none was asked for, and with those that
     contradict what was.
 
-    Args:
-        log: the file.
-        request: for signals of it.
-
     Raises:
         InputError: the file's unit is of another kind than what is asked for.
     """

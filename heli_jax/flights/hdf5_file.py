@@ -9,14 +9,14 @@ import contextlib
 import json
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.flights import hdf5_texts, packed
+from heli_jax.flights import packed
 from heli_jax.flights.array_table import DataSets, guarded, holds_numbers
 from heli_jax.flights.table import Budget, shown, wrong
 
@@ -24,6 +24,8 @@ _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 _BESIDE = 10**9
 """bytes for Python and its libraries"""
+_MOST_ELEMENTS = 1000
+"""of an array of references that are looked at"""
 _COPIES = 4
 """how often numbers may be in memory while they are unpacked"""
 
@@ -60,7 +62,7 @@ def main() -> None:
 def _read(path: Path, kind: str, budget: Budget) -> DataSets:
     import h5py  # pyright: ignore[reportMissingImports]
 
-    read = DataSets(budget)
+    read, references, stored = DataSets(budget), References(), []
 
     # Any: h5py's classes have no annotations.
     def visit(name: str, item: Any) -> None:
@@ -71,13 +73,13 @@ def _read(path: Path, kind: str, budget: Budget) -> DataSets:
         # A structure's path is as `open_mat` gives it for older versions, so that a configuration
         # does not depend on the version in which a file was saved.
         dotted = name.replace("/", ".") if kind == "mat 7.3" else name
-        if (texts := hdf5_texts.list_of(item)) is not None:
+        if (texts := list_of(item)) is not None:
             read.add_texts(dotted, texts)
             return
         if kind == "mat 7.3":
-            read.references.add(dotted, item)
-        if hdf5_texts.is_text(item):
-            read.references.add_letters(dotted, item)
+            references.add(dotted, item)
+        if is_text(item):
+            references.add_letters(dotted, item)
             return
         if not holds_numbers(item.dtype, item.ndim):
             read.leave_out(dotted, item.dtype, item.shape)
@@ -91,10 +93,10 @@ def _read(path: Path, kind: str, budget: Budget) -> DataSets:
         # Of others nothing is read: they may be of types that h5py does not know.
         counting = (*packed.ATTRIBUTES, *packed.UNIT_ATTRIBUTES)
         attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
-        for beside, texts in hdf5_texts.of_attributes(item).items():
+        for beside, texts in of_attributes(item).items():
             read.add_texts(f"{dotted}_{beside}", texts)
-        for field, values, own in _fields(dotted, hdf5_texts.content(item), attributes):
-            read.add(field, values, own)
+        for field, values, own in _fields(dotted, content(item), attributes):
+            stored.append((field, values, own))
 
     def refuse(name: str | bytes, link: Any) -> None:
         if isinstance(link, h5py.ExternalLink):
@@ -105,8 +107,10 @@ def _read(path: Path, kind: str, budget: Budget) -> DataSets:
         file.visititems_links(refuse)
         # This visits every object once and follows no links, of which a circle would never end.
         file.visititems(visit)
-        for name, number in hdf5_texts.numbers_of(file).items():
-            read.add(name, np.array([number]), {})
+        stored += [(name, np.array([x]), {}) for name, x in numbers_of(file).items()]
+    for name, values, own in stored:
+        read.add(references.path(name), values, own)
+    read.labels |= references.texts
     return read
 
 
@@ -124,6 +128,130 @@ def _fields(
     units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
     for field, unit in zip(names, units, strict=True):
         yield from _fields(f"{name}/{field}", values[field], {"units": unit})
+
+
+_MOST_TEXTS, _LONGEST = 100, 1000
+"""of a list, and bytes of each: others are data"""
+_ATTRIBUTES = ("columns", "names", "labels", "channels", "column_names", "channel_names")
+"""of a matrix, that may list its columns"""
+
+
+# Any: h5py's classes cannot be named where it is not installed.
+def content(item: Any) -> np.ndarray:
+    """All of a data set. Nothing else here reads one.
+
+    Raises:
+        InputError: it is kept in another file, any of which a log could name.
+    """
+    if item.is_virtual or item.external:
+        problem = "is kept in another file, expected its numbers in this one"
+        raise wrong(item.file.filename, problem, f"data set {shown(str(item.name))}")
+    return np.asarray(item[()])
+
+
+def list_of(item: Any) -> Sequence[Any] | None:
+    """The texts of a data set that is a list of them; None of any other."""
+    if not 0 < (item.size or 0) <= _MOST_TEXTS:
+        return None
+    if item.dtype.kind == "S" and item.dtype.itemsize <= _LONGEST:
+        return list(np.ravel(content(item)))
+    if item.dtype.kind != "O":
+        return None
+    # Texts of any length, or in MATLAB's cells references to arrays of letters.
+    values = list(np.ravel(content(item)))
+    if all(isinstance(v, bytes | str) and len(v) <= _LONGEST for v in values):
+        return values
+    if _class_of(item) != "cell":
+        return None
+    letters = [item.file[v] if v else None for v in values]
+    if not all(x is not None and is_text(x) and x.size <= _LONGEST for x in letters):
+        return None
+    return ["".join(map(chr, np.ravel(content(x)))) for x in letters]
+
+
+def is_text(item: Any) -> bool:
+    """Whether a data set of numbers holds letters, as MATLAB writes them."""
+    return _class_of(item) == "char"
+
+
+def _class_of(item: Any) -> str:
+    stated = item.attrs.get("MATLAB_class", b"")
+    return stated.decode("ascii", "replace") if isinstance(stated, bytes) else ""
+
+
+def of_attributes(item: Any) -> dict[str, Sequence[Any]]:
+    """Lists of texts among a data set's attributes that may name its columns, by attribute."""
+    attributes = {}
+    for name in _ATTRIBUTES:
+        if name not in item.attrs:
+            continue
+        texts = np.ravel(item.attrs[name])
+        if 1 < texts.size <= _MOST_TEXTS and texts.dtype.kind in "SUO":
+            attributes[name] = list(texts)
+    return attributes
+
+
+def numbers_of(file: Any) -> dict[str, float]:
+    """Single numbers among the attributes of a file, such as a rate."""
+    numbers = {}
+    for name in list(file.attrs)[:_MOST_TEXTS]:
+        value = np.asarray(file.attrs[name])
+        if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
+            numbers[name] = float(np.ravel(value)[0])
+    return numbers
+
+
+_KEPT = "#refs#"
+_DEEPEST = 10
+"""references within references, that are followed"""
+
+
+class References:
+    """The paths of referred elements, as in older versions of MATLAB: `signals[0].values`.
+
+    MATLAB 7.3 keeps the elements of cells and of arrays of structures in a group `#refs#`, by names
+    that mean nothing, each referred to from its place.
+    """
+
+    def __init__(self) -> None:
+        self._paths: dict[str, str] = {}
+        self._letters: dict[str, str] = {}
+
+    # Any: h5py's classes cannot be named where it is not installed.
+    def add(self, path: str, item: Any) -> None:
+        """A data set of references."""
+        if item.dtype.kind != "O" or not 0 < (item.size or 0) <= _MOST_ELEMENTS:
+            return
+        parent, _, field = path.rpartition(".")
+        for i, reference in enumerate(np.ravel(content(item))):
+            if not reference or isinstance(reference, bytes | str):
+                continue
+            target = item.file[reference].name.strip("/").replace("/", ".")
+            # A cell has elements by itself, of structures each field has all elements'.
+            is_cell = "MATLAB_class" in item.attrs or not parent
+            self._paths.setdefault(target, f"{path}[{i}]" if is_cell else f"{parent}[{i}].{field}")
+
+    def add_letters(self, path: str, item: Any) -> None:
+        """A data set of letters, which may be the label of an array."""
+        if 0 < (item.size or 0) <= _LONGEST:
+            self._letters[path] = "".join(map(chr, np.ravel(content(item))))
+
+    def path(self, name: str) -> str:
+        """Where an array belongs; its own name where nothing refers to it."""
+        for _ in range(_DEEPEST):
+            if not name.startswith(_KEPT):
+                break
+            parts = name.split(".")
+            known = (k for k in range(len(parts), 1, -1) if ".".join(parts[:k]) in self._paths)
+            if (k := next(known, None)) is None:
+                break
+            name = ".".join([self._paths[".".join(parts[:k])], *parts[k:]])
+        return name
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """Texts by the paths where they belong."""
+        return {self.path(name): text for name, text in self._letters.items()}
 
 
 if __name__ == "__main__":

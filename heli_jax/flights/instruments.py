@@ -13,21 +13,13 @@ _SAME = 1e-6
 def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[str, ...]:
     """The inputs whose instrument is the input itself in every flight in which it moves: the stick,
     with all that feedback brings into it.
-
-    Args:
-        flights: of which some may hold instruments.
-        names: inputs.
     """
     held = [n for n in names if all(n in f.instruments and n in f.inputs for f in flights)]
     return tuple(n for n in held if _is_own(flights, n))
 
 
 def own_said(names: Sequence[str]) -> str:
-    """What is to be said of them.
-
-    Args:
-        names: of `own_instruments`.
-    """
+    """What is to be said of them."""
     return (
         f"instrument of {', '.join(names)}: it is the input itself, which knows gusts as far as a "
         "loop is closed; expected the excitation alone, before pilot or autopilot add to it"

@@ -1,8 +1,8 @@
 """Tables whose rows hold the values of one topic each, the other cells empty: an outer join.
 
 PlotJuggler, MAVExplorer and pandas' outer merges write such. The columns that are filled in the
-same rows are a topic, and their clock is that of these rows: an empty cell is no lost sample. Where
-such a join was filled forward the cells between hold the last value again, and are no samples.
+same rows are a topic, and their clock is that of these rows: an empty cell is no lost sample.
+A join that was filled forward is told by its repeated values (`repeats.carried_on`).
 """
 
 import itertools
@@ -12,18 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.finding import Finding, note
-from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
 from heli_jax.flights.log import ChannelLog, Topic
-from heli_jax.flights.repeats import carried_on, first_of_each
 from heli_jax.flights.request import Request
-from heli_jax.flights.runs import clock_scale
+from heli_jax.flights.row_clock import clock_scale
 from heli_jax.flights.slower import SLOWER, usual_step
 from heli_jax.flights.table import Table, listed, shown
 
 _SHARED = 0.1
 """of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
-_SHORTEST = 1e-6
-"""[s] between rows, below which they are no clock's"""
 _FEWEST = 8
 """rows of a topic"""
 _NAMED = 2
@@ -97,13 +93,7 @@ def _all_begun(columns: Mapping[str, np.ndarray]) -> slice:
 def joined_log(
     table: Table, request: Request, numbers: Mapping[str, np.ndarray]
 ) -> ChannelLog | None:
-    """A table whose rows are those of several topics as a log of these; else None.
-
-    Args:
-        table: the file.
-        request: names the clock and the signals.
-        numbers: the columns (N,) of both.
-    """
+    """A table whose rows are those of several topics as a log of these; else None."""
     assert request.time is not None  # no table is read without
     stamps = numbers[request.time.name]
     # What is no clock is told by its line where rows are read.
@@ -113,40 +103,14 @@ def joined_log(
     inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
     scale = clock_scale(table, request.time)
     seconds = stamps * scale
-    if is_joined(seconds, signals, inputs):
-        topics = topics_of(seconds, signals, table.units, request.time.name)
-        notes = (*table.notes, joined_note(topics))
-    else:
-        carried = _carried(request, stamps, signals, scale)
-        if not carried:
-            return None
-        topics = topics_of(seconds, {**signals, **carried}, table.units, request.time.name)
-        notes = (*table.notes, _carried_note(topics, carried))
+    if not is_joined(seconds, signals, inputs):
+        return None
+    topics = topics_of(seconds, signals, table.units, request.time.name)
+    notes = (*table.notes, joined_note(topics))
     start = float(seconds[0])
     return ChannelLog(
         table.path, table.format, table.size, table.sha256, topics, notes=notes, start=start
     )
-
-
-def _carried(
-    request: Request, stamps: np.ndarray, signals: Mapping[str, np.ndarray], scale: float
-) -> dict[str, np.ndarray]:
-    """The outputs (N,) of a join that was filled forward, at the rows with a new value alone; none
-    where the rows are one clock's, or are wanted as they are."""
-    stated = {s.name: s.repeats for (_, kind), s in request.signals.items() if kind == "output"}
-    inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
-    asked = [n for n, repeats in stated.items() if repeats != "keep" and n not in inputs]
-    # Without a rate the rows are the grid, and a repeated value is a missing sample of it.
-    if request.options.rate is None or stamps.size < _FEWEST:
-        return {}
-    seconds = stamps * scale
-    steps = np.diff(seconds)
-    # What is no clock is refused where a table is read.
-    if np.any(steps <= 0) or np.median(steps) < _SHORTEST:
-        return {}
-    if not isinstance(uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale), Uneven):
-        return {}
-    return {n: first_of_each(signals[n]) for n in asked if carried_on(seconds, signals[n])}
 
 
 def topics_of(
@@ -180,22 +144,6 @@ def joined_note(topics: Sequence[Topic]) -> Finding:
         f"rows that hold it ({rates})"
     )
     return note("channels.joined", words, value=len(topics))
-
-
-def _carried_note(topics: Sequence[Topic], carried: Collection[str]) -> Finding:
-    """What was made of values that are carried on."""
-    rates = ", ".join(
-        f"{shown(name)} at about {1 / usual_step(t.times):.4g} Hz"
-        for t in topics
-        for name in t.columns
-        if name in carried
-    )
-    words = (
-        "its rows are those of several topics, and between its own each column repeats the last "
-        f"value (a join that was filled forward): each is taken where it has a new one ({rates}); "
-        "`repeats: keep` beside an output takes the repeats for measurements"
-    )
-    return note("repeats.carried-on", words, *carried)
 
 
 def _called(names: Sequence[str]) -> str:

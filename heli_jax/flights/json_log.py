@@ -24,8 +24,8 @@ _OBJECTS = {b",": 32, b"[": 64, b"{": 200, b'"': 30}
 _MOST_COLUMNS = 10_000
 _MOST_TEXTS = 100
 _DEEPEST = 8
-_FEWEST = 8
-"""samples of a run"""
+_LONGEST_LIST = 16
+"""numbers of a list within a sample"""
 
 
 def open_json(path: Path) -> ArrayTable:
@@ -77,50 +77,26 @@ def _parsed(where: str, data: bytes) -> Any:
 
 def _columns(where: str, content: Any, budget: Budget) -> dict[str, Any]:
     """Columns of a file, each a list or an array, by path."""
-    if isinstance(content, list) and not _are_runs(content):
-        return _of_rows(where, content, budget)
     if isinstance(content, list):
-        content = {"data": content}
-    if isinstance(content, dict):
-        columns = dict(_within(content, "", 0, budget))
-        if len(columns) <= _MOST_COLUMNS:
-            return columns
-    raise wrong(where, "holds no records and no columns, expected a log")
+        columns = _of_rows(where, content, budget)
+    else:
+        columns = dict(_within(where, content, budget)) if isinstance(content, dict) else {}
+    if not 0 < len(columns) <= _MOST_COLUMNS:
+        raise wrong(where, f"holds {len(columns)} columns, expected 1 to {_MOST_COLUMNS}")
+    return columns
 
 
-def _within(
-    record: Mapping[str, Any], path: str, depth: int, budget: Budget
-) -> Iterator[tuple[str, Any]]:
+def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any]]:
     """The lists in records within records by path; numbers that stand alone too, such as a rate."""
-    for key, value in record.items():
-        name = f"{path}.{key}" if path else str(key)
-        if isinstance(value, dict) and depth < _DEEPEST:
-            # Columns of pandas: {"0": 0.1, "1": 0.2}.
-            if len(value) > 1 and all(map(str.isdigit, value)):
-                yield name, list(value.values())
-            else:
-                yield from _within(value, name, depth + 1, budget)
-        elif _are_runs(value) and depth < _DEEPEST:
-            for i, run in enumerate(value):
-                yield from _within(run, f"{name}[{i}]", depth + 1, budget)
+    for name, value in _cells(content, "", 0):
+        if isinstance(value, dict):
+            yield name, list(value.values())
         elif isinstance(value, list) and value and isinstance(value[0], dict):
-            yield from ((f"{name}.{n}", x) for n, x in _of_rows(name, value, budget).items())
+            yield from ((f"{name}.{n}", x) for n, x in _of_rows(where, value, budget).items())
         elif isinstance(value, list):
             yield name, value
         elif isinstance(value, int | float):
             yield name, [value]
-
-
-def _are_runs(value: Any) -> bool:
-    """Whether a list holds runs, each with columns of its own, and no samples: the lists within are
-    longer than the list is, and as long as one another."""
-    if not isinstance(value, list) or not value or not all(isinstance(x, dict) for x in value):
-        return False
-    lengths = [[len(x) for x in run.values() if isinstance(x, list)] for run in value]
-    longest = [max(each, default=0) for each in lengths]
-    return min(longest) >= max(_FEWEST, len(value)) and all(
-        each.count(most) > 1 for each, most in zip(lengths, longest, strict=True)
-    )
 
 
 def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
@@ -129,25 +105,34 @@ def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
         return {"data": rows}
     columns: dict[str, list[Any]] = {}
     for i, row in enumerate(rows):
-        for name, value in _cells(row, "", 0) if isinstance(row, dict) else ():
-            if name not in columns:
-                budget.take(8 * len(rows))
-            column = columns.setdefault(name, [])
-            # Rows before that had none of this.
-            column.extend([None] * (i - len(column)))
-            column.append(value)
+        for path, value in _cells(row, "", 0) if isinstance(row, dict) else ():
+            if not isinstance(value, list):
+                cells = [(path, value)]
+            elif len(value) > _LONGEST_LIST:
+                problem = f"record {i + 1} has a list of {len(value)}, {shown(path)}"
+                raise wrong(where, f"{problem}: expected a sample a record, or columns by name")
+            else:
+                cells = [(f"{path}[{k}]", x) for k, x in enumerate(value)]
+            for name, cell in cells:
+                if name not in columns:
+                    budget.take(8 * len(rows))
+                column = columns.setdefault(name, [])
+                # Rows before that had none of this.
+                column.extend([None] * (i - len(column)))
+                column.append(cell)
         if len(columns) > _MOST_COLUMNS:
             raise wrong(where, f"expected at most {_MOST_COLUMNS} columns")
     return {n: x + [None] * (len(rows) - len(x)) for n, x in columns.items()}
 
 
 def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    """What is in records within records, by path."""
     for key, value in record.items():
         name = f"{path}.{key}" if path else str(key)
-        if isinstance(value, dict) and depth < _DEEPEST:
+        # Columns of pandas are no records: {"0": 0.1, "1": 0.2}.
+        numbered = isinstance(value, dict) and len(value) > 1 and all(map(str.isdigit, value))
+        if isinstance(value, dict) and not numbered and depth < _DEEPEST:
             yield from _cells(value, name, depth + 1)
-        elif isinstance(value, list):
-            yield from ((f"{name}[{i}]", x) for i, x in enumerate(value[:100]))
         else:
             yield name, value
 
@@ -156,9 +141,9 @@ def _add(sets: DataSets, name: str, values: list[Any], texts: list[str]) -> None
     filled = [x for x in values if x is not None]
     if filled and all(isinstance(x, str) for x in filled):
         if is_date(filled[0]):
-            dates = seconds_of_dates(values, None)
-            if not isinstance(dates, int):
-                sets.add(name, dates.seconds, {"units": "s"})
+            seconds = seconds_of_dates(values)
+            if not isinstance(seconds, int):
+                sets.add(name, seconds, {"units": "s"})
                 return
         if len(values) <= _MOST_TEXTS:
             sets.add_texts(name, values)

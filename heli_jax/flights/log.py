@@ -18,6 +18,16 @@ _APART = 1.0
 """s before and after the others' samples that a topic on their clock may have some"""
 
 
+_PX4_COMMANDS = ("actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint")
+"""topics of PX4; their `timestamp_sample` is that of the gyro's sample that they answer"""
+
+
+def holds_commands(name: str) -> bool:
+    """True for the name of a topic of PX4, or of a file made of one, that holds commands: they act
+    from when they are published."""
+    return any(topic in name for topic in _PX4_COMMANDS)
+
+
 class Channel(NamedTuple):
     """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where one is missing."""
 

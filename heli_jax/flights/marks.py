@@ -32,16 +32,9 @@ _MOST, _FEW = 0.2, 2
 large for half of its time"""
 _APART = 1.0
 """times the range of all other values, by which a mark lies outside of it"""
-_ASIDE = 0.25
-"""the same of a number that may be one"""
 _LEVELS = 4
 """distinct values that a signal has beside its marks, at least"""
-_FAR = 10.0
-"""times the range of fewer values, from which on a number may be a mark"""
-_SPACING = 3.0
-"""times the largest distance between neighbouring values, by which what may be a mark is off"""
 _MOST_NOTES = 6
-WHY_SUSPECTED = "which loggers write where they have no value"
 
 Counts = tuple[tuple[float, int], ...]
 """values, as the log has them, and how many of each there are"""
@@ -118,46 +111,6 @@ class Marked(NamedTuple):
         """Those from one place to another, both included."""
         at = (self.places >= first) & (self.places <= last)
         return Marked(self.places[at], self.values[at])
-
-
-def suspected(numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log may be marks and are not sure to be: repeated outside of
-    all others, though not far, or beside so few values that each may mean something."""
-    known, none = _is_one_of(_KNOWN, numbers), np.zeros(numbers.shape, bool)
-    if not known.any():
-        return none
-    rest = numbers[np.isfinite(numbers) & ~known]
-    levels = np.unique(rest)
-    if not levels.size:
-        return none
-    low, high = float(levels[0]), float(levels[-1])
-    if levels.size < _LEVELS or rest.size < _FEWEST:
-        below = (numbers < 0) & _is_one_of(_DECIMAL, numbers) & (low >= 0)
-        far = (np.abs(numbers - low) > _FAR * (high - low)) & (levels.size > 1)
-        return known & (below | far)
-    aside = max(_SPACING * float(np.diff(levels).max()), _ASIDE * (high - low))
-    at = known & ((numbers > high + aside) | (numbers < low - aside))
-    # A peak may be any number, but hardly twice the same.
-    for value in np.unique(numbers[at]):
-        if np.count_nonzero(numbers == value) < 2:
-            at &= numbers != value
-    return at
-
-
-def suspect_notes(name: str, numbers: np.ndarray) -> list[Finding]:
-    """Notes on numbers (N,) that may be marks; `name` is the channel's, as it is shown."""
-    at = suspected(numbers)
-    if not at.any():
-        return []
-    words = f"{name} has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"
-    return [note("samples.stray-kept", words, value=int(np.count_nonzero(at)))]
-
-
-def at_sure_or_suspected(numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) are not to be computed with: of what comes of a -9999 that was
-    kept nobody would know any more that it was one."""
-    at = at_marks(numbers)
-    return at | suspected(np.where(at, np.nan, numbers))
 
 
 def without_marks(numbers: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ _LONGEST_TEXT = 1000
 """bytes of a name or a unit: longer texts are passed over"""
 _MOST_LETTERS = 20_000
 """bytes of a list of names"""
-_LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 _MOST_VALUES = 3 * 10**8
 _DEEPEST = 8
 """structures within structures"""
@@ -76,10 +75,9 @@ def read_mat(data: bytes, budget: Budget) -> MatFile:
         # Level 5 ends its header of 128 bytes with the letters MI as a number of the machine that
         # wrote it, so their order tells that of all bytes. Level 4 has no header.
         mark = data[126:128]
-        if len(data) > 128 and mark in (b"IM", b"MI"):
-            variables = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">", budget))
-        else:
-            variables = dict(_level_4(memoryview(data), budget))
+        if len(data) <= 128 or mark not in (b"IM", b"MI"):
+            raise DamagedMatFile("no header of level 5; save it anew, save('flight.mat', '-v7')")
+        variables = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">", budget))
         return MatFile(
             # What MATLAB keeps of objects stands behind them without a name.
             {name: x for name, x in variables.items() if isinstance(x, np.ndarray) and name},
@@ -247,28 +245,3 @@ def _numbers(
     if budget is not None:
         budget.take_numbers(len(element.data) // kind.itemsize, len(element.data))
     return np.frombuffer(element.data, kind).astype(kind.newbyteorder("=")), element.end
-
-
-def _level_4(data: memoryview, budget: Budget) -> Iterator[_Content]:
-    at = 0
-    # The first word is a number below 5000 whose digits say how the array is stored. So its fourth
-    # byte is zero if it was written lowest byte first, and hardly otherwise.
-    order = "<" if len(data) >= 4 and data[0] < 100 and not data[3] else ">"
-    while at < len(data):
-        kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
-        thousands, precision, what = kind // 1000, kind // 10 % 10, kind % 10
-        begin = at + 20 + length
-        count = rows * columns
-        known = thousands in (0, 1) and kind // 100 % 10 == 0 and precision < len(_LEVEL_4)
-        if not known or min(rows, columns, length) < 0 or imaginary not in (0, 1) or what > 2:
-            raise DamagedMatFile("it begins with no array")
-        dtype = np.dtype(order + _LEVEL_4[precision])
-        # An imaginary part follows the real one, and is passed over.
-        at = begin + count * dtype.itemsize * (1 + imaginary)
-        if at > len(data) or not 0 < length < 1000:
-            raise DamagedMatFile("it is cut off")
-        name = bytes(data[begin - length : begin]).split(b"\0")[0].decode("latin-1")
-        if what == 0 and count:
-            budget.take_numbers(count)
-            values = np.frombuffer(data[begin : begin + count * dtype.itemsize], dtype)
-            yield name, values.astype(dtype.newbyteorder("=")).reshape((rows, columns), order="F")

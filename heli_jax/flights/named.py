@@ -26,9 +26,6 @@ type NamedBy = Callable[[DerivedTable | DerivedLog], Named]
 def by_preset(name: str) -> NamedBy:
     """All signals of a preset that a log has, under the preset's names.
 
-    Args:
-        name: of the preset.
-
     Raises:
         ValueError: there is none of this name.
     """

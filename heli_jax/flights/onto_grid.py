@@ -98,12 +98,6 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
 
 
 def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
-    """Notes on the signals as they were logged."""
-    values = {key: signal.values for key, signal in signals.items()}
-    return [*_missing_notes(request, signals), *_turn_notes(request, values)]
-
-
-def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding]:
     """A note for every output with missing samples: how many, and where in the log."""
     notes = []
     for key, signal in signals.items():
@@ -111,32 +105,9 @@ def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Findi
         count = int(missing.sum())
         if count:
             name = shown(request.signals[key].name)
-            are = "is" if count == 1 else "are"
-            words = f"{count} of {missing.size} samples of {name} {are} missing"
-            words += f", {_where(signal.seconds[missing], missing)}"
+            words = f"{count} of {missing.size} samples of {name} {'is' if count == 1 else 'are'}"
+            words += f" missing, {_where(signal.seconds[missing], missing)}"
             notes.append(note("samples.missing", words, key[0], value=count))
-    return notes
-
-
-def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[Finding]:
-    """A note for every angle (N,) that jumps by a turn, as a heading from -pi to pi does."""
-    notes = []
-    for key, samples in values.items():
-        signal = request.signals[key]
-        if signal.si != "rad":
-            continue
-        jumps = np.abs(np.diff(samples[np.isfinite(samples)]))
-        # To within a radian: the machine goes on turning between two samples.
-        count = int(np.count_nonzero(np.abs(jumps - 2 * np.pi) < 1.0))
-        if count:
-            turn = float(np.ptp(signal.from_si(np.array([0.0, 2 * np.pi]))))
-            often = "once" if count == 1 else f"{count} times"
-            words = (
-                f"{shown(signal.name)} jumps by a turn {often}, which no model does, and between "
-                "samples it is drawn through the jump: name the channel "
-                f"unwrap({shown(signal.name)[1:-1]}, {turn:.6g}) instead"
-            )
-            notes.append(note("angles.jump", words, key[0], value=count))
     return notes
 
 

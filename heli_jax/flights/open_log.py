@@ -6,29 +6,23 @@ from pathlib import Path
 
 from heli_jax.flights import (
     array_table,
-    arrow_table,
-    blackbox_header,
+    blackbox_fields,
     dataflash,
-    dataflash_text,
-    foreign_files,
     json_log,
-    numpy_file,
+    parquet_table,
     progress,
     ulog,
 )
 from heli_jax.flights.blackbox import open_blackbox
-from heli_jax.flights.csv_table import open_csv
-from heli_jax.flights.gzipped import inner_ending, is_gzipped
+from heli_jax.flights.csv_table import inner_ending, is_gzipped, open_csv
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, require_short_names, shown, wrong
-from heli_jax.flights.table_view import with_joined_clock
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
-_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
+_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_fields.MARK)
 """what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
@@ -81,11 +75,6 @@ def chosen_flights(
 ) -> Table | tuple[ChannelLog, ...]:
     """The flight of a number, or all without one.
 
-    Args:
-        path: for the message.
-        logs: what was opened.
-        flight: from 1.
-
     Raises:
         InputError: there is none of this number.
     """
@@ -121,10 +110,7 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
     for log in opened if isinstance(opened, tuple) else (opened,):
         require_short_names(log.path, log.names)
-    # Arrays may have lengths of their own, of which no row is made.
-    if isinstance(opened, tuple | array_table.ArrayTable):
-        return opened
-    return with_joined_clock(opened)
+    return opened
 
 
 _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
@@ -134,11 +120,11 @@ def _reader(path: Path) -> _Reader:
     ending = path.suffix.lower()
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
-    foreign_files.refuse(path, head)
+    _refuse_foreign(path, head)
     # By the ending first where it says enough, so that a damaged Parquet file is called so and not
     # read as text.
     if ending == ".parquet":
-        return open_parquet
+        return parquet_table.open_parquet
     if is_gzipped(path):
         if inner_ending(path) not in _TEXTS:
             problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
@@ -164,8 +150,8 @@ def _reader(path: Path) -> _Reader:
         ".bbl": open_blackbox,
         ".bfl": open_blackbox,
     }
-    by_ending |= dict.fromkeys((".npy", ".npz"), numpy_file.open_numpy)
-    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), arrow_table.open_arrow)
+    by_ending |= dict.fromkeys((".npy", ".npz"), array_table.open_numpy)
+    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), parquet_table.open_arrow)
     by_ending |= dict.fromkeys((".json", ".jsonl", ".ndjson"), json_log.open_json)
     if ending not in by_ending:
         raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
@@ -180,29 +166,83 @@ def _by_content(head: bytes) -> _Reader | None:
         return _one(dataflash.open_dataflash)
     # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
     # mind what stands before the first.
-    if blackbox_header.MARK in head:
+    if blackbox_fields.MARK in head:
         return open_blackbox
     if head.startswith(b"PAR1"):
-        return open_parquet
+        return parquet_table.open_parquet
     if head.startswith(b"MATLAB "):
         return array_table.open_mat
     if head.startswith((b"CDF\x01", b"CDF\x02")):
         return array_table.open_netcdf
     if head.startswith(array_table.HDF5_MAGIC):
         return array_table.open_hdf5
-    if head.startswith(numpy_file.MAGIC):
-        return numpy_file.open_numpy
-    if head.startswith(arrow_table.MARK):
-        return arrow_table.open_arrow
-    if dataflash_text.is_dataflash_text(head):
-        return _one(dataflash_text.open_dataflash_text)
+    if head.startswith(array_table.NUMPY_MAGIC):
+        return array_table.open_numpy
+    if head.startswith(parquet_table.ARROW_MARK):
+        return parquet_table.open_arrow
+    if dataflash.is_dataflash_text(head):
+        return _one(dataflash.open_dataflash_text)
     return None
 
 
 def _is_exported(head: bytes) -> bool:
     """Whether a text begins with the formats of a DataFlash log, as no table does."""
-    return head.lstrip().startswith(b"FMT,") and dataflash_text.is_dataflash_text(head)
+    return head.lstrip().startswith(b"FMT,") and dataflash.is_dataflash_text(head)
 
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
     return lambda path: (reader(path),)
+
+
+# Files that hold flights and are not read: what each is, and what to make of it instead.
+
+_SHEET = "is a spreadsheet; save its sheet as CSV, one table with its names above"
+_PICKLE = (
+    "is a pickle of Python, which may run anything; save a table, frame.to_parquet(FILE), or "
+    "arrays, numpy.savez(FILE, t=t, p=p)"
+)
+_TOPICS = "export its topics to CSV (PlotJuggler does)"
+_ARCHIVE = "is an archive; unpack it and name the log in it"
+_TELEMETRY = (
+    "is telemetry of MAVLink, thinned out on its way to the ground; take the autopilot's own log "
+    "(.bin, .ulg), or export messages: mavlogdump.py --format csv --types ATTITUDE FILE"
+)
+_BY_ENDING = {
+    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods", ".numbers"), _SHEET),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), f"is a log of ROS; {_TOPICS}"),
+    **dict.fromkeys((".tlog", ".rlog"), _TELEMETRY),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib"), _PICKLE),
+    **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".xz", ".bz2", ".zst"), _ARCHIVE),
+    **dict.fromkeys((".mf4", ".mdf", ".tdms", ".c3d"), "is a measurement; export it to CSV"),
+    **dict.fromkeys((".slx", ".fig"), "is no data of MATLAB; save the signals as arrays in .mat"),
+}
+_BY_MARK = (
+    (b"\x89MCAP0\r\n", _BY_ENDING[".mcap"]),
+    (b"#ROSBAG V", _BY_ENDING[".bag"]),
+    (b"SQLite format 3\0", _BY_ENDING[".db3"]),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", _SHEET),
+    (
+        b"version https://git-lfs.github.com/spec/",
+        "is a pointer of Git LFS; run git lfs pull",
+    ),
+    (b"/annex/objects/", "is a pointer of git-annex; git annex get fetches the log"),
+    (b"FEA1", "is of the first version of Feather; write it anew, frame.to_feather(FILE)"),
+)
+_ZIP = b"PK\x03\x04"
+
+
+def _refuse_foreign(path: Path, head: bytes) -> None:
+    """Refuse a file that is known not to be read, by its first bytes or by its ending.
+
+    Raises:
+        InputError: with what to make of it.
+    """
+    ending = path.suffix.lower()
+    words = next((words for mark, words in _BY_MARK if head.startswith(mark)), None)
+    if words is None and head.startswith(_ZIP) and ending != ".npz":
+        # Spreadsheets are archives inside.
+        is_sheet = b"xl/" in head or b"[Content_Types].xml" in head or b"spreadsheet" in head
+        words = _SHEET if is_sheet else _ARCHIVE
+    words = words or _BY_ENDING.get(ending)
+    if words is not None:
+        raise wrong(str(path), words)

@@ -1,4 +1,4 @@
-"""Logs in Apache Parquet."""
+"""Logs in columns of Apache: Parquet, and Arrow's own files (.feather, .arrow)."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from heli_jax.flights.table import (
     require_few_columns,
     wrong,
 )
-from heli_jax.regular_file import open_regular, size_words
+from heli_jax.regular_file import open_regular, read_regular, size_words
 
 # Imported again within the functions that need it, as in `csv_table`.
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def open_parquet(path: Path) -> "ParquetTable":
             raise wrong(str(path), "holds no rows, expected a log")
         require_few_columns(str(path), metadata.num_columns)
         # Text stays as its dictionary: a few words that every row repeats can be large.
-        texts = [f.name for f in schema if _is_text(f.type)]
+        texts = [f.name for f in schema if pa.types.is_string(f.type) or pa.types.is_binary(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
     return ParquetTable(str(path), size, Digest(path), file)
@@ -133,7 +133,9 @@ class ColumnTable:
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text. Lists and records within cells are
         not read, so that all of their cells count as filled."""
-        nested = [is_nested(f.type) for f in self._schema]
+        import pyarrow as pa
+
+        nested = [pa.types.is_nested(f.type) for f in self._schema]
         flat = [f.name for f, n in zip(self._schema, nested, strict=True) if not n]
         data = self._read(flat if any(nested) else None)
         # By name: two columns may have the same, and come in an order of their own.
@@ -223,34 +225,16 @@ class ParquetTable(ColumnTable):
             raise wrong(self.path, "is no whole Parquet file")
 
 
-def is_nested(kind: "pa.DataType") -> bool:
-    """Whether cells hold lists or records."""
-    import pyarrow as pa
-
-    return pa.types.is_nested(kind)
-
-
-def _is_text(kind: "pa.DataType") -> bool:
-    import pyarrow as pa
-
-    types = pa.types
-    return types.is_string(kind) or types.is_binary(kind)
-
-
 def _is_number(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
-    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
     types = pa.types
-    return (
-        types.is_integer(kind)
-        or types.is_floating(kind)
-        or types.is_decimal(kind)
-        or types.is_boolean(kind)
-        or types.is_timestamp(kind)
-        or types.is_duration(kind)
-        or types.is_time(kind)
+    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
+    tests = (
+        *(types.is_integer, types.is_floating, types.is_decimal, types.is_boolean),
+        *(types.is_timestamp, types.is_duration, types.is_time),
     )
+    return any(test(kind) for test in tests)
 
 
 def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
@@ -270,3 +254,79 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
     # A piece of a column has to be asked to copy where it has nulls; a column copies anyway.
     copied = {"zero_copy_only": False} if isinstance(values, pa.Array) else {}
     return np.asarray(values.to_numpy(**copied), dtype=np.float64)
+
+
+# Apache Arrow's own format: Feather (.feather) and its files and streams (.arrow).
+
+ARROW_MARK = b"ARROW1"
+"""what files begin with, and those of Feather"""
+_STREAM = b"\xff\xff\xff\xff"
+_LARGEST_ARROW = 10**9
+
+
+def open_arrow(path: Path) -> "ArrowTable":
+    """Read a file or a stream of Arrow.
+
+    Raises:
+        InputError: it is none, it is broken, or larger than a log may be.
+        OSError: it cannot be read.
+    """
+    import pyarrow as pa
+
+    where = str(path)
+    data = read_regular(path, "a log in Arrow's format", _LARGEST_ARROW)
+    if not data.startswith((ARROW_MARK, _STREAM)):
+        raise wrong(where, "is no file of Arrow, expected one that begins with its mark")
+    source, budget = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data))
+    try:
+        if data.startswith(_STREAM):
+            table = _joined(pa.ipc.open_stream(source), budget)
+        else:
+            file = pa.ipc.open_file(source)
+            batches = (file.get_batch(i) for i in range(file.num_record_batches))
+            table = pa.Table.from_batches(list(_checked(batches, budget)), file.schema)
+        table.validate(full=True)
+    # pyarrow raises UnicodeDecodeError where the name of a column is no text.
+    except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
+        raise wrong(where, f"is no whole file of Arrow ({type(e).__name__})") from e
+    if not len(table.schema) or not table.num_rows:
+        raise wrong(where, "holds no rows, expected a log")
+    require_few_columns(where, len(table.schema))
+    return ArrowTable(where, len(data), Digest(data), table)
+
+
+def _joined(stream: "pa.RecordBatchReader", budget: Budget) -> "pa.Table":
+    import pyarrow as pa
+
+    return pa.Table.from_batches(list(_checked(stream, budget)), stream.schema)
+
+
+def _checked(
+    batches: "Iterator[pa.RecordBatch] | pa.RecordBatchReader", budget: Budget
+) -> "Iterator[pa.RecordBatch]":
+    for batch in batches:
+        budget.take(max(batch.nbytes, 8 * batch.num_rows * batch.num_columns))
+        batch.validate(full=True)
+        yield batch
+
+
+class ArrowTable(ColumnTable):
+    """A `Table` on columns of Arrow, in memory."""
+
+    format = "arrow"
+
+    def __init__(self, path: str, size: int, digest: Digest, table: "pa.Table") -> None:
+        super().__init__(path, size, digest, table.schema, table.num_rows)
+        self._table = table
+
+    def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
+        import pyarrow as pa
+
+        # By place: of two columns of one name `select` takes neither.
+        fields = enumerate(self._schema)
+        kept = [
+            i
+            for i, f in fields
+            if names is None or (f.name in names and not pa.types.is_nested(f.type))
+        ]
+        yield from self._table.select(kept).to_batches()

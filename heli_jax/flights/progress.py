@@ -11,12 +11,7 @@ STEP = 1 << 22
 
 
 def reading(path: str | Path, size: int) -> contextlib.AbstractContextManager[None]:
-    """A file is read meanwhile.
-
-    Args:
-        path: the file.
-        size: of it [bytes].
-    """
+    """A file is read meanwhile."""
     # Names may hold anything; a terminal obeys escape sequences.
     name = "".join(c if c.isprintable() else "?" for c in Path(path).name)[:40]
     return stages.stage(f"reading {name} ({size_words(size)})", total=size)

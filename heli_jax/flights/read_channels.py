@@ -1,17 +1,22 @@
-"""From the channels of an autopilot's log to a `Flight`: each signal from its own clock."""
+"""From signals on clocks of their own, as logs have them, to a `Flight` on one uniform grid.
+
+The rows of a table are a topic too: its places in messages are lines, those of an autopilot's log
+are times.
+"""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from heli_jax.errors import InputError
 from heli_jax.finding import Finding
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.file_units import other_units
-from heli_jax.flights.flight import Flight, Source
-from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import Marked, infinite
@@ -40,15 +45,31 @@ _SAME = 1e-6
 """of a step, by which stamps differ at most that are one"""
 _MOST_GAPS = 20
 """times the samples that there are"""
+_AN_INPUT = "; an input acts all the time: fill it in, or take windows without that part"
 
 
 @dataclass(frozen=True, eq=False)
 class TopicClock:
-    """The times (N,) [s] of one topic inside the window, from the log's beginning, and its rows."""
+    """The times of one topic inside the window.
+
+    Attributes:
+        topic: its name.
+        seconds: (N,) [s] from the log's beginning.
+        rows: of the topic that they are.
+        begin: the first of them, in the log's own count [s].
+        rounding: how coarsely they are rounded [s].
+        places: where the i-th of them stands: `line 12, column 't'`; of an autopilot's log
+            the topic.
+        of_table: True for the rows of a table, whose stamps are rounded in text.
+    """
 
     topic: str
     seconds: np.ndarray
     rows: slice
+    begin: float
+    rounding: float
+    places: Callable[[int], tuple[str, ...]]
+    of_table: bool = False
 
     @property
     def usual(self) -> float:
@@ -58,6 +79,10 @@ class TopicClock:
     @property
     def words(self) -> str:
         return f"{self.topic} at about {1 / self.usual:.4g} Hz"
+
+    def wrong(self, path: str, problem: str, i: int) -> InputError:
+        """The error at the i-th of the times."""
+        return wrong(path, f"{problem} at {self.seconds[i]:.6g} s", *self.places(i))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,26 +100,127 @@ class ClockedSignal:
         return Timed(self.clock.seconds, self.values)
 
 
-def read_channels(log: ChannelLog, request: Request) -> Flight:
-    """The flight of an autopilot's log.
-
-    Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
-    their hold, outputs on straight lines where they are as fast as it; what is slower is missing
-    between its samples.
-
-    Args:
-        log: what was opened.
-        request: the signals, named by their channels, and the options.
+def rows_in_window(
+    path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
+) -> slice:
+    """The rows of a clock (N,) [s] inside the window.
 
     Raises:
-        InputError: a channel is missing or holds no numbers, a clock is none, the window lies
-            outside the log, a rate is needed or makes no sense.
+        InputError: they are too few.
     """
-    notes = (*log.notes, *channel_window_note(log, request))
-    source = Source(
-        log.path, log.sha256, notes, log.firmware, log.parameters, cautions=log.cautions
-    )
-    return flight_of_signals(signals_of(log, request), request, source, log.first_time)
+    first, last = 0, elapsed.size
+    where = ""
+    if window is not None and elapsed.size > 1:
+        # The bounds are inclusive whatever the rounding of the stamps. The median and not the mean,
+        # which would count the gaps.
+        near = 1e-3 * float(np.median(np.diff(elapsed)))
+        first = int(np.searchsorted(elapsed, window[0] - near, side="left"))
+        last = int(np.searchsorted(elapsed, window[1] + near, side="right"))
+        where = f" from {window[0]:g} s to {window[1]:g} s"
+    if last - first < FEWEST:
+        span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
+        problem = f"holds {sample_count(max(last - first, 0))}{where}, expected at least {FEWEST}"
+        raise wrong(path, f"{problem}{span}", *place)
+    return slice(first, last)
+
+
+def topic_clock(
+    log: ChannelLog, topic: str, times: np.ndarray, window: tuple[float, float] | None
+) -> TopicClock:
+    """The times of a topic inside the window, finite and increasing.
+
+    Args:
+        log: of the topic.
+        topic: its name.
+        times: its stamps (N,) [s], in the log's own count.
+        window: first and last [s] from the log's beginning.
+
+    Raises:
+        InputError: they are no clock, or too few.
+    """
+    place, elapsed = f"topic {shown(topic)}", times - log.first_time
+    if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
+        raise wrong(log.path, "got times that are no finite numbers, expected a clock", place)
+    # Of stamps that go back those outside of the window do no harm.
+    if window is not None and np.any(np.diff(elapsed) <= 0):
+        inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
+        rows = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+        rows_in_window(log.path, elapsed[rows], None, place)
+    else:
+        rows = rows_in_window(log.path, elapsed, window, place)
+    seconds = elapsed[rows]
+    steps = np.diff(seconds)
+    back = np.flatnonzero(steps <= 0)
+    if back.size:
+        fault = "stands still" if steps[back[0]] == 0 else "runs backwards"
+        problem = f"the time {fault} after {seconds[back[0]]:.6g} s, expected increasing times"
+        raise wrong(log.path, f"{problem}; give a window without it", place)
+    require_steps(log.path, seconds, place)
+    begin = float(times[rows.start])
+    return TopicClock(topic, seconds, rows, begin, rounding_of(seconds), lambda i: (place,))
+
+
+def require_steps(path: str, seconds: np.ndarray, *place: str) -> None:
+    """Refuse steps that no clock resolves: the time's unit is wrong."""
+    # The median and not the mean, which one long gap would lift above any limit.
+    if np.median(np.diff(seconds)) < SHORTEST_STEP:
+        problem = "the usual step is shorter than 1 ns, expected a clock"
+        raise wrong(path, f"{problem}; look at the time's unit", *place)
+
+
+def in_si(
+    signal: Signal, kind: str, numbers: np.ndarray, refuse: Callable[[int, str], InputError]
+) -> np.ndarray:
+    """The numbers (N,) of a log in SI.
+
+    Args:
+        signal: what they are.
+        kind: `input` or `output`, which may be missing here and there.
+        numbers: as the log has them.
+        refuse: makes the error of a row of them, of what is to be said behind it.
+
+    Raises:
+        InputError: one is not finite.
+    """
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        values = signal.to_si(numbers)
+    bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise refuse(row, _AN_INPUT if kind == "input" and np.isnan(numbers[row]) else "")
+    return values
+
+
+def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
+    """The signals in SI inside the window, each on the clock of its topic.
+
+    Raises:
+        InputError: a channel is missing or holds no numbers, or a clock is none.
+    """
+    clocks: dict[str, TopicClock] = {}
+    signals = {}
+    for (key, kind), signal in request.signals.items():
+        topic = log.topic_of(signal.name).name
+        times, values = log.channel(signal.name)
+        if topic not in clocks:
+            clocks[topic] = topic_clock(log, topic, times, request.options.window)
+        clock = clocks[topic]
+        numbers = values[clock.rows]
+
+        def refuse(row: int, more: str) -> InputError:
+            why = why_missing(log, signal.name) or more  # noqa: B023
+            problem = f"got {numbers[row]} at {clock.seconds[row]:.6g} s"  # noqa: B023
+            at = f"channel {shown(signal.name)}"  # noqa: B023
+            return wrong(log.path, f"{problem}, expected a finite number{why}", at)
+
+        values = in_si(signal, kind, numbers, refuse)
+        span = tuple(times[clock.rows][[0, -1]])
+        marks = {
+            n: marked._replace(places=marked.places - log.first_time)
+            for n, marked in marks_of_sources(log, signal.name, span).items()
+        }
+        signals[key, kind] = ClockedSignal(clock, values, marks)
+    return signals
 
 
 def channel_window_note(log: ChannelLog, request: Request) -> tuple[Finding, ...]:
@@ -109,135 +235,51 @@ def channel_window_note(log: ChannelLog, request: Request) -> tuple[Finding, ...
 
 
 def flight_of_signals(
-    signals: Mapping[Key, ClockedSignal], request: Request, source: Source, first_time: float
+    signals: Mapping[Key, ClockedSignal], request: Request, source: Source
 ) -> Flight:
     """The flight of signals with clocks of their own.
+
+    Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
+    their hold, outputs on straight lines where they are as fast as it; what is slower is missing
+    between its samples.
 
     Args:
         signals: by key, in SI inside the window.
         request: what was asked for.
         source: where they came from, with notes on it so far.
-        first_time: from which the clocks count [s], in the log's own count.
 
     Raises:
         InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
+    clocks, rate = clocks_of(signals.values()), request.options.rate
+    is_one = len(clocks) == 1 and (rate is None or clocks[0].of_table)
+    if is_one:
+        # Before the samples are looked at: a wrong unit makes anything of their steps.
+        grid = uniform_grid(clocks[0].seconds, clocks[0].rounding)
+        if isinstance(grid, Uneven) and rate is None:
+            raise _uneven(source.path, clocks[0], grid)
     marks = {key: signal.of_sources for key, signal in signals.items()}
     logged = as_logged(request, {key: s.timed for key, s in signals.items()}, marks)
     values = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, values)
+    values, repeated = measured_once(request, logged.signals)
     timed = {key: Timed(signals[key].clock.seconds, x) for key, x in values.items()}
-    values, repeated = measured_once(request, timed)
-    signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
-    said = sample_notes(request, {key: signal.timed for key, signal in signals.items()})
-    start, dt, (samples, holds, notes) = _on_grid(source.path, request, signals, holds)
+    said = sample_notes(request, timed)
+    if is_one:
+        start, t0, end = float(clocks[0].seconds[0]), clocks[0].begin, clocks[0].seconds[-1]
+        dt, (samples, holds, notes) = _of_one_clock(
+            source.path, request, clocks[0], grid, timed, holds
+        )
+    else:
+        signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
+        start, dt, (samples, holds, notes) = _of_several(source.path, request, signals, holds)
+        t0 = source.first_time + start
+        end = start + dt * (next(iter(samples.values())).size - 1)
     notes = (*source.notes, *other_units(request), *logged.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
-    source = replace(source, notes=notes, rates=rates, first_time=first_time)
-    end = start + dt * (next(iter(samples.values())).size - 1)
-    source = logged.source(source, start, end)
-    return flight_of(request, samples, dt, first_time + start, holds, source)
-
-
-def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
-    """The signals in SI inside the window, each on the clock of its topic."""
-    clocks: dict[str, TopicClock] = {}
-    signals = {}
-    for (key, kind), signal in request.signals.items():
-        topic = log.topic_of(signal.name).name
-        times, values = log.channel(signal.name)
-        if topic not in clocks:
-            elapsed = times - log.first_time
-            clocks[topic] = topic_clock(log.path, topic, elapsed, request.options.window)
-        clock = clocks[topic]
-        with np.errstate(over="ignore"):  # what overflows is refused below
-            numbers = values[clock.rows]
-            values = signal.to_si(numbers)
-        # An output may be missing here and there; a stick is somewhere all the time.
-        bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
-        bad = np.flatnonzero(bad)
-        if bad.size:
-            at = f"channel {shown(signal.name)}"
-            problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"
-            why = why_missing(log, signal.name)
-            raise wrong(log.path, f"{problem}, expected a finite number{why}", at)
-        span = tuple(times[clock.rows][[0, -1]])
-        marks = {
-            n: marked._replace(places=marked.places - log.first_time)
-            for n, marked in marks_of_sources(log, signal.name, span).items()
-        }
-        signals[key, kind] = ClockedSignal(clock, values, marks)
-    return signals
-
-
-def topic_clock(
-    path: str, topic: str, elapsed: np.ndarray, window: tuple[float, float] | None
-) -> TopicClock:
-    """The times of a topic inside the window, finite and increasing.
-
-    Args:
-        path: for the message.
-        topic: its name.
-        elapsed: its stamps (N,) [s] from the log's beginning.
-        window: first and last [s].
-
-    Raises:
-        InputError: they are no clock, or too few.
-    """
-    place = f"topic {shown(topic)}"
-    if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
-        raise wrong(path, "got times that are no finite numbers, expected a clock", place)
-    first, last = 0, elapsed.size
-    if window is not None:
-        # The bounds are inclusive whatever the rounding of the stamps.
-        inside = np.flatnonzero((elapsed >= window[0] - 1e-9) & (elapsed <= window[1] + 1e-9))
-        first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
-    seconds = elapsed[first:last]
-    if seconds.size < FEWEST:
-        where = "" if window is None else f" from {window[0]:g} s to {window[1]:g} s"
-        span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
-        problem = f"holds {sample_count(seconds.size)}{where}, expected at least {FEWEST}{span}"
-        raise wrong(path, problem, place)
-    steps = np.diff(seconds)
-    back = np.flatnonzero(steps <= 0)
-    if back.size:
-        fault = "stands still" if steps[back[0]] == 0 else "runs backwards"
-        problem = f"the time {fault} after {seconds[back[0]]:.6g} s, expected increasing times"
-        raise wrong(path, f"{problem}; give a window without it", place)
-    # The median and not the mean, which one long gap would lift above any limit.
-    if np.median(steps) < SHORTEST_STEP:
-        raise wrong(path, "its steps are shorter than 1 ns, expected a clock", place)
-    return TopicClock(topic, seconds, slice(first, last))
-
-
-def _on_grid(
-    path: str,
-    request: Request,
-    signals: Mapping[Key, ClockedSignal],
-    holds: Mapping[str, Decision],
-) -> tuple[float, float, OnGrid]:
-    """First time and step [s] of the grid, and the signals on it with notes on how they came
-    there."""
-    rate = request.options.rate
-    clocks = clocks_of(signals.values())
-    if rate is None:
-        if len(clocks) > 1:
-            slowest = min(1 / clock.usual for clock in clocks)
-            words = ", ".join(clock.words for clock in clocks)
-            problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate to which"
-            raise wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
-        dt, notes = _uniform(path, clocks[0])
-        samples = {key: signal.values for key, signal in signals.items()}
-        made = OnGrid(samples, dict(holds), list(notes))
-        return float(clocks[0].seconds[0]), dt, made
-    clocks = on_all_the_time(signals, rate)
-    notes = [n.of(c.topic) for c in clocks for n in new_clock(c.seconds, rate).notes]
-    _require_no_gaps(path, clocks)
-    times = common_times(path, clocks, rate, _sampled_alike(signals, rate))
-    timed = {key: signal.timed for key, signal in signals.items()}
-    made = at_times(request, timed, holds, times)
-    return float(times[0]), 1.0 / rate, made._replace(notes=[*notes, *made.notes])
+    source = replace(source, notes=notes, rates=rates)
+    return flight_of(request, samples, dt, t0, holds, logged.source(source, start, end))
 
 
 def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
@@ -255,35 +297,93 @@ def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[T
     return clocks_of(needed or signals.values())
 
 
-def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[Finding, ...]]:
-    """The step [s] of a single topic's clock, which is a uniform grid, and notes."""
-    seconds = clock.seconds
-    grid = uniform_grid(seconds - seconds[0], rounding_of(seconds))
-    if isinstance(grid, Uneven):
-        at = f"{seconds[grid.row]:.6g} s"
-        if grid.drift is not None:
-            problem = f"its times leave a uniform grid by {grid.drift:.2g} samples"
-        else:
-            problem = f"a step of {grid.step:.6g} s before {at}, usual are {grid.usual:.6g} s"
-        problem += f", {even_expected(seconds, grid.usual)}"
-        raise wrong(path, problem, f"topic {shown(clock.topic)}")
-    return grid.dt, grid.notes
+def _of_one_clock(
+    path: str,
+    request: Request,
+    clock: TopicClock,
+    grid: Grid | Uneven,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+) -> tuple[float, OnGrid]:
+    """The time step, and the signals on the uniform grid with notes on how they came there."""
+    seconds, rate = clock.seconds, request.options.rate
+    notes: tuple[Finding, ...] = ()
+    if isinstance(grid, Grid):
+        # A rate that leaves the log's own grid by less than half a sample at its end is that grid:
+        # the samples stay as they are, unblurred by interpolation.
+        if rate is None or abs(rate * grid.dt - 1.0) * seconds.size < 0.5:
+            samples = {key: signal.values for key, signal in signals.items()}
+            dt = grid.dt if rate is None else 1.0 / rate
+            return dt, OnGrid(samples, dict(holds), list(grid.notes))
+        # The grid is better than its rounded stamps: held inputs would slip by a sample.
+        seconds, notes = seconds[0] + grid.dt * np.arange(seconds.size), grid.notes
+        clock = replace(clock, seconds=seconds)
+    assert rate is not None  # uneven stamps without one are refused
+    _require_no_gap(path, clock)
+    _require_rate(path, rate, clock.usual, (seconds[-1] - seconds[0]) * rate)
+    new = new_clock(seconds, rate)
+    timed = {key: Timed(seconds, signal.values) for key, signal in signals.items()}
+    made = at_times(request, timed, holds, new.times)
+    return new.dt, made._replace(notes=[*notes, *new.notes, *made.notes])
 
 
-def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
+def _of_several(
+    path: str,
+    request: Request,
+    signals: Mapping[Key, ClockedSignal],
+    holds: Mapping[str, Decision],
+) -> tuple[float, float, OnGrid]:
+    """First time and step [s] of the grid, and the signals on it with notes on how they came
+    there."""
+    rate = request.options.rate
+    if rate is None:
+        clocks = clocks_of(signals.values())
+        slowest = min(1 / clock.usual for clock in clocks)
+        words = ", ".join(clock.words for clock in clocks)
+        problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate to which"
+        raise wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
+    clocks = on_all_the_time(signals, rate)
+    notes = [n.of(c.topic) for c in clocks for n in new_clock(c.seconds, rate).notes]
     for clock in clocks:
-        gap = long_gap(clock.seconds)
-        if gap is not None:
-            problem = f"a gap of {gap.step:.6g} s at {clock.seconds[gap.row]:.6g} s, expected none"
-            problem += f" longer than {gap.most:.3g} s; give a window without it, or"
-            problem += " `gaps: split`"
-            raise wrong(path, problem, f"topic {shown(clock.topic)}")
-
-
-def _sampled_alike(signals: Mapping[Key, ClockedSignal], rate: float) -> TopicClock | None:
-    """The clock of an output that was sampled at the grid's own rate [Hz], if there is one."""
+        _require_no_gap(path, clock)
     outputs = (s.clock for (_, kind), s in signals.items() if kind == "output")
-    return next((c for c in outputs if abs(rate * c.usual - 1.0) < _ALIKE), None)
+    alike = next((c for c in outputs if abs(rate * c.usual - 1.0) < _ALIKE), None)
+    times = common_times(path, clocks, rate, alike)
+    timed = {key: signal.timed for key, signal in signals.items()}
+    made = at_times(request, timed, holds, times)
+    return float(times[0]), 1.0 / rate, made._replace(notes=[*notes, *made.notes])
+
+
+def _uneven(path: str, clock: TopicClock, uneven: Uneven) -> InputError:
+    """The error for stamps that are no uniform grid, with the remedy."""
+    if uneven.drift is not None:
+        problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
+    else:
+        problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
+    problem += f", {even_expected(clock.seconds, uneven.usual)};"
+    return clock.wrong(path, problem, uneven.row)
+
+
+def _require_no_gap(path: str, clock: TopicClock) -> None:
+    gap = long_gap(clock.seconds)
+    if gap is not None:
+        problem = f"a gap of {gap.step:.6g} s, expected none longer than {gap.most:.3g} s; give a"
+        problem += " window without it, or `gaps: split`; it ends"
+        raise clock.wrong(path, problem, gap.row + 1)
+
+
+def _require_rate(path: str, rate: float, usual: float, count: float) -> None:
+    """Refuse rates [Hz] that make no sense for a log of a usual step [s]: of `count` samples."""
+    # Written so that a NaN is refused too, here and below.
+    if not count >= FEWEST - 1 - 1e-6:
+        problem = f"a rate of {rate:g} Hz leaves fewer than {FEWEST} samples"
+        raise wrong(path, f"{problem} of {max(count / rate, 0.0):.6g} s, expected more")
+    # The product can overflow where the rate alone is finite.
+    if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
+        problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
+        # A thousandth of such a step is one of a flight.
+        unit = "; is its time in ms (time.unit)?" if 1.0 <= usual <= 1e3 else ""
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much{unit}")
 
 
 def common_times(
@@ -308,15 +408,8 @@ def common_times(
         later = on.seconds[on.seconds >= start - _SAME * on.usual]
         start = max(start, float(later[0])) if later.size else start
     end = min(float(clock.seconds[-1]) for clock in clocks)
-    fastest = min(clock.usual for clock in clocks)
     count = (end - start) * rate
-    # Written so that a NaN is refused too, here and below.
-    if not count >= FEWEST - 1 - 1e-6:
-        problem = f"the topics share {max(end - start, 0.0):.6g} s, at {rate:g} Hz fewer than"
-        raise wrong(path, f"{problem} {FEWEST} samples, expected more")
-    if not (rate * fastest <= MOST_UPSAMPLING and math.isfinite(count)):
-        problem = f"a rate of {rate:g} Hz for topics of at most {1 / fastest:.4g} Hz"
-        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")
+    _require_rate(path, rate, min(clock.usual for clock in clocks), count)
     # One wrong stamp at the end of a damaged log would otherwise fill the memory.
     most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
     if count > most:

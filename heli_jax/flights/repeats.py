@@ -127,12 +127,7 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
 def repeats_removed(
     outputs: Mapping[str, Timed], stated: Mapping[str, str]
 ) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes.
-
-    Args:
-        outputs: by name, NaN where a sample is missing.
-        stated: one of `REPEATS` by name.
-    """
+    """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes."""
     made, notes = {n: y.values for n, y in outputs.items()}, []
     runs = {n: usual_run(y) for n, y in made.items()}
     moving = [n for n, y in made.items() if runs[n] is None and _moves(y)]
@@ -144,7 +139,12 @@ def repeats_removed(
         sure = exact or carried_on(seconds, y)
         if sure and not exact:
             made[name] = first_of_each(y)
-            notes.append(_carried_note(name, seconds, made[name]))
+            hz = 1.0 / usual_step(seconds[~np.isnan(made[name])])
+            words = (
+                f"{name} is carried on from row to row, with a new value at about {hz:.4g} Hz: "
+                "taken as missing in between (`repeats: keep` leaves it)"
+            )
+            notes.append(note("repeats.carried-on", words, name, value=hz))
             continue
         if stated[name] == "missing":
             lengths, _ = _runs(y)
@@ -169,17 +169,6 @@ def repeats_removed(
         )
         notes.append(note("repeats.missing", words, name, value=usual))
     return made, notes
-
-
-def _carried_note(name: str, seconds: np.ndarray, made: np.ndarray) -> Finding:
-    seen = ~np.isnan(made)
-    hz = 1.0 / usual_step(seconds[seen])
-    words = (
-        f"{name} is carried on from row to row, with a new value at about {hz:.4g} Hz: taken as "
-        f"measured at the {np.count_nonzero(seen)} rows with a new one and missing at the others "
-        "(`repeats: keep` leaves them)"
-    )
-    return note("repeats.carried-on", words, name, value=hz)
 
 
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

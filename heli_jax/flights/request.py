@@ -96,11 +96,13 @@ class Request:
             raise wrong(path, "no input or output is asked for, expected at least one")
         # Columns first: a column with two uses makes every further sentence about it doubtful.
         self._check_columns()
-        self._check_units()
-        self._check_scales()
-        self._check_noise()
-        self._check_holds()
-        self._check_repeats()
+        time = (
+            {} if self.time is None else {"the time": Signal(self.time.name, self.time.unit, "s")}
+        )
+        uses = {f"{kind} {key!r}": signal for (key, kind), signal in self.signals.items()}
+        for use, signal in (time | uses).items():
+            if problem := _problem(use, signal):
+                raise wrong(path, problem, column(signal.name))
         self._check_numbers()
 
     @property
@@ -134,61 +136,6 @@ class Request:
                 problem = f"serves both as {before[1]} and as {use[1]}, expected one use"
                 raise wrong(self.path, problem, column(signal.name))
 
-    def _check_units(self) -> None:
-        signals = {f"{kind} {key!r}": s for (key, kind), s in self.signals.items()}
-        if self.time is not None:
-            signals["the time"] = Signal(self.time.name, self.time.unit, "s")
-        for use, signal in signals.items():
-            try:
-                units.factor(signal.unit, signal.si)
-            except ValueError as e:
-                raise wrong(self.path, f"for {use}: {e}", column(signal.name)) from e
-
-    def _check_scales(self) -> None:
-        for (key, kind), signal in self.signals.items():
-            problem = scale_problem(signal)
-            if problem:
-                raise wrong(self.path, f"{kind} {key!r}: {problem}", column(signal.name))
-
-    def _check_noise(self) -> None:
-        for (key, kind), signal in self.signals.items():
-            sd = signal.sd
-            if sd is None:
-                continue
-            use = f"{kind} {key!r}"
-            # Only what is measured has noise in the estimators; an input is taken as it is logged.
-            if kind == "input":
-                problem = f"an sd is stated for {use}, expected one for outputs alone"
-                raise wrong(self.path, problem, column(signal.name))
-            # In SI too: 1e-320 deg is positive, and zero in rad, by which residuals are divided.
-            scale = abs(units.factor(signal.unit, signal.si))
-            if not (sd > 0 and 0 < sd * scale < math.inf):
-                problem = f"the sd of {use} is {sd:g}, expected a positive number"
-                raise wrong(self.path, problem, column(signal.name))
-
-    def _check_holds(self) -> None:
-        for (key, kind), signal in self.signals.items():
-            use = f"{kind} {key!r}"
-            if kind == "output" and signal.hold != "auto":
-                problem = f"a hold is stated for {use}, expected one for inputs alone"
-                raise wrong(self.path, problem, column(signal.name))
-            if signal.hold not in ("auto", *HOLDS):
-                known = ", ".join(("auto", *HOLDS))
-                problem = f"the hold of {use}: expected one of {known}, got {signal.hold!r:.60}"
-                raise wrong(self.path, problem, column(signal.name))
-
-    def _check_repeats(self) -> None:
-        for (key, kind), signal in self.signals.items():
-            use = f"{kind} {key!r}"
-            # What an input repeats is what it was: it stays, as its hold says.
-            if kind == "input" and signal.repeats != "auto":
-                problem = f"repeats is stated for {use}, expected it for outputs alone"
-                raise wrong(self.path, problem, column(signal.name))
-            if signal.repeats not in REPEATS:
-                known, got = ", ".join(REPEATS), f"{signal.repeats!r:.60}"
-                problem = f"repeats of {use}: expected one of {known}, got {got}"
-                raise wrong(self.path, problem, column(signal.name))
-
     def _check_numbers(self) -> None:
         rate, window = self.options.rate, self.options.window
         # NaN passes no comparison, so each bound is written as what has to hold.
@@ -204,3 +151,34 @@ class Request:
             if not math.isfinite(value):
                 problem = f"known {name!r} is {value:g}, expected a finite number"
                 raise wrong(self.path, problem)
+
+
+def _problem(use: str, signal: Signal) -> str:
+    """What is wrong with a signal, of a use such as `input 'u'`; empty where nothing is."""
+    try:
+        scale = abs(units.factor(signal.unit, signal.si))
+    except ValueError as e:
+        return f"for {use}: {e}"
+    if problem := scale_problem(signal):
+        return f"{use}: {problem}"
+    is_input, is_output = use.startswith("input "), use.startswith("output ")
+    # Only what is measured has noise in the estimators; an input is taken as it is logged. What it
+    # repeats is what it was: it stays, as its hold says.
+    for what, stated, elsewhere in (
+        ("an sd", signal.sd is not None, is_input),
+        ("repeats", signal.repeats != "auto", is_input),
+        ("a hold", signal.hold != "auto", is_output),
+    ):
+        if stated and elsewhere:
+            others = "outputs" if is_input else "inputs"
+            return f"{what} is stated for {use}, expected it for {others} alone"
+    # In SI too: 1e-320 deg is positive, and zero in rad, by which residuals are divided.
+    if signal.sd is not None and not (signal.sd > 0 and 0 < signal.sd * scale < math.inf):
+        return f"the sd of {use} is {signal.sd:g}, expected a positive number"
+    for what, got, known in (
+        ("hold", signal.hold, ("auto", *HOLDS)),
+        ("repeats", signal.repeats, REPEATS),
+    ):
+        if got not in known:
+            return f"{what} of {use}: expected one of {', '.join(known)}, got {got!r:.60}"
+    return ""

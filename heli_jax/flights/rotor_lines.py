@@ -52,11 +52,7 @@ class RotorLines(NamedTuple):
 
 
 def rotor_lines(log: ChannelLog) -> RotorLines | None:
-    """Of the rates and specific forces of a log; None where it has none, or no rotor speed.
-
-    Args:
-        log: one flight.
-    """
+    """Of the rates and specific forces of a log; None where it has none, or no rotor speed."""
     with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
         for name in fitting_presets(log.format, log.names):
             by_preset = _by_preset(log, preset(name))

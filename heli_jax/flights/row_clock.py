@@ -1,4 +1,9 @@
-"""Clocks of tables that hold no times: rows, or counts of a column, at a rate that is known."""
+"""Clocks of tables that hold no times, or the times of several runs.
+
+Rows, or counts of a column, are samples at a rate that is known. Where the time begins anew with
+each run, or a column numbers them, the runs are put one after another with some seconds between, as
+a gap, at which they become flights.
+"""
 
 import math
 import re
@@ -6,11 +11,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from heli_jax import units
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, note
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.grid import without_overflow
+from heli_jax.flights.table import Survey, Table, listed, shown
+from heli_jax.flights.table_view import TableView
 
 ROWS = "row number"
 """what the numbers of rows are called, from 0, as a column"""
@@ -34,62 +42,14 @@ def by_rate(rate: float, counter: str | None = None) -> Signal:
     return Signal(counter or ROWS, "s", "s", scale=1.0 / rate)
 
 
-class CountedTable:
-    """A `Table` of which the numbers of the rows can be asked for as a column."""
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-        self.path, self.format, self.size = table.path, table.format, table.size
-        self.names = (*table.names, ROWS)
-        self.notes, self.units = table.notes, table.units
-
-    @property
-    def sha256(self) -> str:
-        """Of the file."""
-        return self.table.sha256
-
-    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), the numbers of the rows from 0."""
-        own = [n for n in names if n != ROWS] or list(self.table.names[:1])
-        columns = self.table.numbers(own)
-        # A table says more of its cells once they were read.
-        self.notes = self.table.notes
-        columns[ROWS] = np.arange(columns[own[0]].size, dtype=np.float64)
-        return {n: columns[n] for n in names}
-
-    def survey(self) -> list[Survey]:
-        """Every column of the file."""
-        return self.table.survey()
-
-    def place(self, row: int) -> str:
-        """Where a row stands."""
-        return self.table.place(row)
-
-    def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
-        return str(row) if name == ROWS else self.table.cell_text(name, row)
-
-    def time_unit(self, name: str) -> str | None:
-        """The unit of a column of time stamps."""
-        return None if name == ROWS else self.table.time_unit(name)
-
-
-def counted(table: Table, time: Signal | None) -> Table:
-    """A table with its rows' numbers, where they are the clock.
-
-    Args:
-        table: of rows.
-        time: the clock that is asked for.
-    """
-    return table if time is None or time.name != ROWS else CountedTable(table)
+def counted(table: Table) -> Table:
+    """A table of which the numbers of the rows can be asked for as a column, `ROWS`."""
+    return TableView(table, columns={ROWS: None})
 
 
 def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     """The rate [Hz] that a file states in a single number beside its samples (`Ts`, `dt`, `fs`),
     and what says so; None where there is none, or are several.
-
-    Args:
-        surveys: of all columns or arrays.
     """
     rates: dict[float, str] = {}
     for each in surveys:
@@ -106,13 +66,7 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
 
 
 def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, ...]:
-    """A caution where a file states another rate than that of its times.
-
-    Args:
-        table: of rows.
-        clock: the column of times.
-        rate: of its usual step [Hz].
-    """
+    """A caution where a file states another rate than that of its times."""
     stated: dict[float, str] = {}
     for name in table.names:
         # Of another clock than this one its path tells.
@@ -124,11 +78,6 @@ def contradicted_rate(table: Table, clock: str, rate: float) -> tuple[Finding, .
 def rate_cautions(stated: Mapping[float, str], clock: str, rate: float) -> tuple[Finding, ...]:
     """A caution for each rate that is neither that of times nor a whole multiple, of which every
     second or tenth sample may have been logged.
-
-    Args:
-        stated: what says so, by rate [Hz].
-        clock: the column of times.
-        rate: of its usual step [Hz].
     """
     if not (math.isfinite(rate) and rate > 0):
         return ()
@@ -192,3 +141,102 @@ def _is_step(name: str) -> bool | None:
     ):
         return False
     return None
+
+
+_BETWEEN = 10.0
+"""s, which no gap that is bridged is long"""
+_SHORTEST = 20
+"""rows of a run"""
+_BEGINNING = 0.1
+"""part of the run before, in which the next begins: a stamp that goes back is no new run"""
+_RUN_NAMES = {
+    *("run", "runs", "segment", "seg", "maneuver", "manoeuvre", "experiment", "exp", "trial"),
+    *("test", "record", "repetition", "rep", "case", "leg"),
+}
+
+
+def restarts(stamps: np.ndarray) -> np.ndarray:
+    """The rows (n,) in which the time begins anew; none where it only goes back here or there."""
+    none = np.zeros(0, int)
+    if stamps.size < 2 * _SHORTEST or not np.isfinite(stamps).all():
+        return none
+    stamps = without_overflow(stamps)
+    steps = np.diff(stamps)
+    # A stick that steps stands still in between.
+    if np.any(steps == 0):
+        return none
+    falls = np.flatnonzero(steps < 0) + 1
+    bounds = np.concatenate([[0], falls, [stamps.size]])
+    if not falls.size or np.diff(bounds).min() < _SHORTEST:
+        return none
+    # Without one row the clock goes on: that stamp is wrong, and nothing begins.
+    if np.any((stamps[falls] > stamps[falls - 2]) | (stamps[falls + 1] > stamps[falls - 1])):
+        return none
+    first, last = stamps[bounds[:-2]], stamps[falls - 1]
+    anew = stamps[falls] <= first + _BEGINNING * (last - first)
+    return falls if anew.all() else none
+
+
+def changes(numbers: np.ndarray) -> np.ndarray:
+    """The rows (n,) in which a number of a run is another than in the row before."""
+    return np.flatnonzero(np.diff(numbers) != 0) + 1
+
+
+def clock_scale(table: Table, time: Signal) -> float:
+    """Of the unit of a clock, or of its counts [s]."""
+    if time.scale != 1.0:
+        return time.scale
+    # A column of time stamps says by its type what its ticks are, whatever the user thinks.
+    return units.factor(table.time_unit(time.name) or time.unit, "s")
+
+
+def with_runs(
+    table: Table, clock: str, numbers: Mapping[str, np.ndarray], scale: float, column: str = ""
+) -> Table:
+    """A table whose runs follow one another; as it is where it holds one.
+
+    Args:
+        table: of rows.
+        clock: the column of times.
+        numbers: that column (N,), and the one that numbers runs.
+        scale: [s] of a unit of the stamps.
+        column: that numbers runs; without one they begin where the time does.
+    """
+    stamps = numbers[clock]
+    starts = changes(numbers[column]) if column else restarts(stamps)
+    if not starts.size:
+        return table
+    apart = stamps.copy()
+    for start in starts:
+        apart[start:] += apart[start - 1] - apart[start] + _BETWEEN / scale
+    places = listed(table.place(int(start)) for start in starts)
+    why = f"{shown(column)} is another" if column else "the time begins anew"
+    words = (
+        f"{why} in {places}: {starts.size + 1} runs, put one after another with "
+        f"{_BETWEEN:g} s between"
+    )
+    said = note("clock.runs", words, value=starts.size + 1)
+    return TableView(table, columns={clock: apart}, note=said)
+
+
+def numbering_notes(column: str) -> tuple[Finding, ...]:
+    """That a column numbers runs, where one does."""
+    if not column:
+        return ()
+    remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
+    words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
+    return (note("clock.runs-numbered", words, column),)
+
+
+def numbering(surveys: Sequence[Survey]) -> str:
+    """The column that numbers runs, by its name and numbers; empty without one."""
+    for each in surveys:
+        if each.values is None or not _RUN_NAMES & set(words_in(each.name)):
+            continue
+        values = each.values
+        if not np.isfinite(values).all() or np.any(values != np.rint(values)):
+            continue
+        bounds = np.concatenate([[0], changes(values), [values.size]])
+        if bounds.size > 2 and np.all(np.diff(values) >= 0) and np.diff(bounds).min() >= _SHORTEST:
+            return each.name
+    return ""

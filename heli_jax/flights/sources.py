@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from heli_jax.finding import Finding, note
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.array_clocks import by_clocks
@@ -18,25 +16,23 @@ from heli_jax.flights.file_units import with_file_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import without_marks
-from heli_jax.flights.onto_grid import FEWEST, Key
+from heli_jax.flights.onto_grid import Key
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import (
     ClockedSignal,
-    TopicClock,
     channel_window_note,
     flight_of_signals,
-    read_channels,
+    rows_in_window,
     signals_of,
 )
 from heli_jax.flights.read_table import (
     LoadedTable,
     clocked_table,
     load_table,
-    read_table,
     table_window_note,
 )
 from heli_jax.flights.request import Also, ReadOptions, Request
-from heli_jax.flights.table import Table, sample_count, shown, wrong
+from heli_jax.flights.table import Table, shown, wrong
 
 _SHARED = 0.5
 """of the shorter of two logs of one clock that the other covers too, at least"""
@@ -63,15 +59,11 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
 
-    Args:
-        request: for the signals of the first log.
-        log: the first one where it is open already.
-
     Raises:
         InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
-    request = with_file_units(_log_of(first), request)
+    request = with_file_units(first if isinstance(first, ChannelLog) else first.table, request)
     keys, everything, beside = frozenset(request.signals), copy.copy(request), []
     for also in request.options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
@@ -89,10 +81,17 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
 def clocked(logs: Opened, request: Request) -> dict[Key, ClockedSignal]:
     """The signals inside the window, each on its clock, in seconds from the first log's
     beginning."""
-    signals = _clocked(logs.log, _only(request, logs.keys))
+    return _signals(logs, request)[0]
+
+
+def _signals(
+    logs: Opened, request: Request
+) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
+    """As `clocked`, and notes."""
+    signals, notes = _clocked(logs.log, _only(request, logs.keys))
     for one in logs.beside:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
-    return signals
+    return signals, notes
 
 
 def flight_from(logs: Opened, request: Request) -> Flight:
@@ -101,24 +100,29 @@ def flight_from(logs: Opened, request: Request) -> Flight:
     Raises:
         InputError: one sentence on what is wrong with a log, the window or the rate.
     """
-    log = logs.log
-    if not logs.beside:
-        if isinstance(log, ChannelLog):
-            return read_channels(log, request)
-        # A table by itself has rows that a message can name, and stamps whose rounding is known.
-        return read_table(log, request)
-    notes = (*beyond(logs, request), *(one.note for one in logs.beside))
+    log, alongside = logs.log, tuple(one.note for one in logs.beside)
+    notes = (*beyond(logs, request), *alongside)
     if isinstance(log, ChannelLog):
-        notes = (*log.notes, *notes)
         source = Source(
-            log.path, log.sha256, notes, log.firmware, log.parameters, cautions=log.cautions
+            log.path,
+            log.sha256,
+            (*log.notes, *notes),
+            log.firmware,
+            log.parameters,
+            cautions=log.cautions,
+            first_time=log.first_time,
         )
-        first = log.first_time
-    else:
-        notes = (*log.table.notes, *log.clock.notes, *notes)
-        source = Source(log.table.path, log.table.sha256, notes, cautions=log.clock.cautions)
-        first = log.first_time
-    return flight_of_signals(clocked(logs, request), request, source, first)
+        return flight_of_signals(_signals(logs, request)[0], request, source)
+    with log.clock.hinting():
+        signals, more = _signals(logs, request)
+        source = Source(
+            log.table.path,
+            log.table.sha256,
+            (*log.table.notes, *log.clock.notes, *notes, *more),
+            cautions=log.clock.cautions,
+            first_time=log.first_time,
+        )
+        return flight_of_signals(signals, request, source)
 
 
 def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
@@ -153,8 +157,12 @@ def _by_clocks(log: Table) -> ChannelLog | Table:
     return log if with_clocks is None else with_derived(with_clocks, swashplate)
 
 
-def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
-    return signals_of(log, request) if isinstance(log, ChannelLog) else clocked_table(log, request)
+def _clocked(
+    log: ChannelLog | LoadedTable, request: Request
+) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
+    if isinstance(log, ChannelLog):
+        return signals_of(log, request), ()
+    return clocked_table(log, request)
 
 
 def _only(request: Request, keys: frozenset[Key]) -> Request:
@@ -170,27 +178,42 @@ def _whole(request: Request) -> Request:
     return request
 
 
-def _log_of(log: ChannelLog | LoadedTable) -> ChannelLog | Table:
-    return log if isinstance(log, ChannelLog) else log.table
-
-
 def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tuple[Beside, Request]:
     """The signals of a further log, its clock shifted to that of the first, and the request for
     them with the units that they have."""
-    if not also.same:
-        return _of_one_clock(log, request, also)
+    options = ReadOptions(number=also.number)
+    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    # The log that is open already may be large.
+    file = also.log or _of_file(asked)
+    asked = with_file_units(file, asked)
+    other = _open(asked, file)
+    signals, _ = _clocked(other, asked)
+    name = Path(also.path).name
+    stated = f"{name} (sha256 {file.sha256[:12]})"
+    if also.same:
+        lag, said = _aligned(log, request, also, file, stated)
+    else:
+        lag = float(other.first_time - log.first_time)
+        theirs = _span(signals, other.first_time)
+        ours = _span(_clocked(log, _whole(request))[0], log.first_time)
+        said = _as_one(request, also, ours, theirs, stated)
+    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, said), asked
+
+
+def _aligned(
+    log: ChannelLog | LoadedTable, request: Request, also: Also, file: ChannelLog | Table, name: str
+) -> tuple[float, Finding]:
+    """What has to be added to the times of a further log [s], by a motion that both hold."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
         problem = f"expected a signal of the first log ({known}), got {also.same!r:.60}"
         raise wrong(also.path, problem, "align.with")
-    options = ReadOptions(number=also.number)
     # Apart from the others, since it may well be one of them.
+    options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    file = also.log or _of_file(alone)
-    other = _open(alone, file)
-    reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
-    (twin,) = _clocked(other, alone).values()
+    reference = _clocked(log, _only(_whole(request), frozenset({key})))[0][key].timed
+    (twin,) = _clocked(_open(alone, file), alone)[0].values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
     motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
@@ -199,51 +222,34 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
     except NotAligned as e:
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
-    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    # The log that is open already: it may be large.
-    asked = with_file_units(file, asked)
-    signals = _clocked(_open(asked, file), asked)
-    name = Path(also.path).name
-    shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
-    return Beside(shifted, _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)), asked
+    return lag.lag, _note(name, also, lag)
 
 
-def _of_one_clock(
-    log: ChannelLog | LoadedTable, request: Request, also: Also
-) -> tuple[Beside, Request]:
-    """The signals of a further log whose times count as those of the first.
+def _as_one(
+    request: Request,
+    also: Also,
+    ours: tuple[float, float],
+    theirs: tuple[float, float],
+    name: str,
+) -> Finding:
+    """A note that the times of two logs, from first to last [s], count alike.
 
     Raises:
-        InputError: the two hardly overlap, so that they have no clock in common.
+        InputError: they hardly overlap, so that they have no clock in common.
     """
-    options = ReadOptions(number=also.number)
-    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    file = also.log or _of_file(asked)
-    asked = with_file_units(file, asked)
-    other = _open(asked, file)
-    signals = _clocked(other, asked)
-    spans = [
-        _span(clocks, each.first_time)
-        for clocks, each in ((_clocked(log, _whole(request)), log), (signals, other))
-    ]
-    (begin, end), (also_begin, also_end) = spans
-    shared = min(end, also_end) - max(begin, also_begin)
-    name = Path(also.path).name
-    first = Path(request.path).name
-    if not shared >= _SHARED * min(end - begin, also_end - also_begin):
+    first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
+    if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(
             also.path,
-            f"its times go from {also_begin:.6g} s to {also_end:.6g} s and those of {first} from "
-            f"{begin:.6g} s to {end:.6g} s, so that they are no one clock; state a motion that "
-            "both hold, align: {with: ..., to: ...}",
+            f"its times go from {theirs[0]:.6g} s to {theirs[1]:.6g} s and those of {first} from "
+            f"{ours[0]:.6g} s to {ours[1]:.6g} s, so that they are no one clock; state a motion "
+            "that both hold, align: {with: ..., to: ...}",
         )
-    lag = float(other.first_time - log.first_time)
     words = (
-        f"{name} (sha256 {file.sha256[:12]}): its times are taken as those of {first}, with which "
-        f"it shares {shared:.4g} s; if each counts from a beginning of its own, state align"
+        f"{name}: its times are taken as those of {first}, with which it shares {shared:.4g} s; if "
+        "each counts from a beginning of its own, state align"
     )
-    taken = note("clock.taken-as-one", words, value=shared)
-    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, taken), asked
+    return note("clock.taken-as-one", words, value=shared)
 
 
 def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
@@ -262,12 +268,6 @@ def _note(name: str, also: Also, lag: Lag) -> Finding:
         f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
         f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
     )
-    if lag.drift is not None:
-        rate, sd = lag.drift
-        words += (
-            f"; the lag drifts by {-1e6 * rate:.3g} us a second (sd {1e6 * sd:.2g}), which is "
-            "not corrected"
-        )
     return Finding(
         "clock.aligned", "note", words, lag.lag, "seconds added to its times", (also.same,)
     )
@@ -276,19 +276,15 @@ def _note(name: str, also: Also, lag: Lag) -> Finding:
 def _shifted(signal: ClockedSignal, lag: float, name: str) -> ClockedSignal:
     # Two files may well have topics of the same name.
     topic = signal.clock.topic if signal.clock.topic == name else f"{name}, {signal.clock.topic}"
-    clock = TopicClock(topic, signal.clock.seconds + lag, signal.clock.rows)
+    clock = dataclasses.replace(signal.clock, topic=topic, seconds=signal.clock.seconds + lag)
     return dataclasses.replace(signal, clock=clock)
 
 
 def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     """The part of a signal inside the window."""
-    window, seconds = request.options.window, signal.clock.seconds
-    if window is None:
+    if request.options.window is None:
         return signal
-    rows = slice(*np.searchsorted(seconds, [window[0] - 1e-9, window[1] + 1e-9]))
-    seconds = seconds[rows]
-    if seconds.size < FEWEST:
-        problem = f"holds {sample_count(seconds.size)} from {window[0]:g} s to {window[1]:g} s"
-        raise wrong(request.path, f"{problem}, expected at least {FEWEST}", signal.clock.topic)
-    clock = TopicClock(signal.clock.topic, seconds, rows)
+    clock = signal.clock
+    rows = rows_in_window(request.path, clock.seconds, request.options.window, clock.topic)
+    clock = dataclasses.replace(clock, seconds=clock.seconds[rows], rows=rows)
     return dataclasses.replace(signal, clock=clock, values=signal.values[rows])

@@ -4,7 +4,6 @@ They are put one after another, (segment times sample, channel), with a column t
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,19 +21,10 @@ _FEWEST = 10
 """samples of a segment, below which matrices of a few numbers are no stack"""
 
 
-class Unstacked(NamedTuple):
-    """Arrays of at most two dimensions, and what was made of the others."""
-
-    arrays: dict[str, np.ndarray]
-    notes: tuple[Finding, ...] = ()
-
-
-def unstacked(arrays: Mapping[str, np.ndarray]) -> Unstacked:
-    """Stacks as matrices of a column a channel.
-
-    Args:
-        arrays: of any shape, by path.
-    """
+def unstacked(
+    arrays: Mapping[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
+    """Arrays of at most two dimensions, stacks as matrices of a column a channel; and notes."""
     deep = {n: x for n, x in arrays.items() if x.dtype.kind in "biuf" and x.ndim > 2 and x.size}
     cubes = {n: x for n, x in deep.items() if x.ndim == DEEPEST}
     times = {n: x for n, x in arrays.items() if _is_time(n, x)}
@@ -63,7 +53,7 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> Unstacked:
         why = "which of their dimensions is the time is not known"
         notes.append(note(LEFT_OUT, f"left out, since {why}: {_listed(left, arrays)}", *left))
     kept = {n: made.get(n, x) for n, x in arrays.items() if n not in left}
-    return Unstacked({**kept, **{n: x for n, x in made.items() if n not in kept}}, tuple(notes))
+    return {**kept, **{n: x for n, x in made.items() if n not in kept}}, tuple(notes)
 
 
 def _is_time(name: str, values: np.ndarray) -> bool:
@@ -94,20 +84,9 @@ def _segments(
     samples = samples or max(shapes[0])
     if not all(samples in shape for shape in shapes):
         return None
-    # The number of segments is common to all; how many channels there are is not.
-    common = set.intersection(*(set(_rest(shape, samples)) for shape in shapes))
+    # Which of the others counts segments, and which channels, is anybody's choice.
     firsts = {shape[0] for shape in shapes}
-    if len(common) == 1 and (samples not in firsts or len(cubes) > 1):
-        return common.pop(), samples
-    # Whether channels or segments come behind the samples is anybody's choice.
     return (firsts.pop(), samples) if len(firsts) == 1 and samples not in firsts else None
-
-
-def _rest(shape: tuple[int, ...], size: int) -> list[int]:
-    """Of a shape, the others than one of a size."""
-    rest = list(shape)
-    rest.remove(size)
-    return rest
 
 
 def _all_increase(times: np.ndarray) -> bool:

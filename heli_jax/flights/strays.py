@@ -1,10 +1,10 @@
-"""Single samples of a log that no motion leads to, and numbers that may stand for no value."""
+"""Samples of a log that no motion leads to, and numbers that nothing measures."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax.flights.marks import WHY_SUSPECTED, counted, is_absurd, listed, suspected
+from heli_jax.flights.marks import counted, is_absurd, listed
 
 _LEVELS, _FEW_LEVELS = 8, 3
 """distinct values of a signal beside its strays, at least; where they are so few, only what is
@@ -41,8 +41,8 @@ class Strays:
 
 
 def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays, ...]:
-    """Samples that may well be none and are not sure to be: marks that are not far outside of all
-    others, and single samples to which no motion leads.
+    """Samples that may well be none and are not sure to be: single ones to which no motion leads,
+    and many that are larger than any measurement.
 
     Args:
         seconds: stamps (N,) [s].
@@ -53,7 +53,7 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
     absurd, too_large = is_absurd(numbers), "larger than any measurement"
     alone &= ~absurd
-    kinds = ((suspected(numbers), WHY_SUSPECTED), (absurd, too_large), (alone, off))
+    kinds = ((absurd, too_large), (alone, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in kinds if at.any())
 
 

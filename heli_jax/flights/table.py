@@ -124,12 +124,7 @@ class Budget:
     zeros."""
 
     def __init__(self, path: str, size: int) -> None:
-        """Nothing is taken yet.
-
-        Args:
-            path: of the file, for messages.
-            size: of the file [bytes].
-        """
+        """Nothing is taken yet."""
         self._path, self._size, self._taken = path, size, 0
         self.most = min(_MOST_BYTES, max(_MOST_SMALL, _DENSEST * size))
         """bytes"""
@@ -178,11 +173,6 @@ def require_short_names(path: str, names: Sequence[str]) -> None:
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
     """Refuse a column that is missing or stands in the file twice.
-
-    Args:
-        path: for the message.
-        have: the names in the file, in its order.
-        needed: those to be read.
 
     Raises:
         InputError: with the nearest name there is.

@@ -1,7 +1,7 @@
-"""A table of rows, or arrays of several lengths, as topics with clocks of their own."""
+"""A table of rows as a log of topics."""
 
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from heli_jax.errors import InputError
@@ -12,47 +12,11 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.row_clock import ROWS, CountedTable
-from heli_jax.flights.runs import clock_scale, with_runs
+from heli_jax.flights.row_clock import ROWS, clock_scale, counted, with_runs
 from heli_jax.flights.table import Table, listed, shown, wrong
-from heli_jax.flights.table_view import numbers_once
 
 _MOST_NAMED = 6
 """columns that notes name"""
-
-type Clockless = Mapping[str, int]
-"""arrays without a clock of their own length, with their numbers of samples"""
-
-
-def as_channels(
-    table: Table,
-    time: str | None,
-    unit: str | None,
-    notes: list[Finding],
-    rate: float | None = None,
-) -> tuple[ChannelLog, Clockless]:
-    """A table as a log of one topic, its clock named or guessed; arrays of other lengths that have
-    a clock too are topics of their own."""
-    topic, start = _table_topic(table, time, unit, notes, rate)
-    topics, clockless = [topic], {}
-    parts = {}
-    if isinstance(table, ArrayTable):
-        parts = {size: (names, table.only(names)) for size, names in table.lengths().items()}
-    for size, (names, part) in parts.items():
-        if size == topic.times.size:
-            continue
-        try:
-            another, first = _table_topic(part, None, None, said := [])
-        except InputError:
-            another, first, said = None, 0.0, []
-        if another is None or not another.columns:
-            clockless |= dict.fromkeys(names, size)
-            continue
-        # One machine's clocks have one zero.
-        times = another.times + (first - start)
-        topics.append(replace(another, name=f"arrays of {size} samples", times=times))
-        notes += said
-    return ChannelLog(table.path, table.format, table.size, table.sha256, tuple(topics)), clockless
 
 
 def without_joins(log: ChannelLog, notes: list[Finding]) -> ChannelLog:
@@ -67,25 +31,6 @@ def without_joins(log: ChannelLog, notes: list[Finding]) -> ChannelLog:
         notes.append(joined_note(parts))
         topics += parts
     return replace(log, topics=tuple(topics))
-
-
-def require_clocks(
-    log: ChannelLog, clockless: Clockless, patterns: Sequence[str], notes: list[Finding]
-) -> None:
-    """Refuse, or where they were not asked for by name note, arrays without a clock."""
-    rows = log.topics[0].times.size
-    for pattern in patterns:
-        matches = matching(clockless, pattern)
-        if matches and not matching(log.names, pattern):
-            name = matches[0]
-            problem = f"has {clockless[name]} samples and the clock {shown(log.topics[0].clock)}"
-            problem += f" {rows}, expected an array of {clockless[name]} times beside it"
-            raise wrong(log.path, problem, f"array {shown(name)}")
-    asked = [n for p in patterns or ["*"] for n in matching(clockless, p)]
-    for size in dict.fromkeys(clockless[name] for name in asked):
-        names = [n for n in dict.fromkeys(asked) if clockless[n] == size]
-        words = f"{listed(map(shown, names))}, of {size} samples, for which there is no clock"
-        notes.append(note(LEFT_OUT, f"left out: {words}", *names, value=size))
 
 
 def in_runs(table: Table, clock: TimeInfo) -> Table:
@@ -112,14 +57,25 @@ def matching(names: Iterable[str], pattern: str) -> list[str]:
     return [name for name in names if fnmatch.fnmatchcase(name, literal)]
 
 
-def _table_topic(
+def one_topic(
     table: Table,
     time: str | None,
     unit: str | None,
+    rate: float | None,
     notes: list[Finding],
-    rate: float | None = None,
-) -> tuple[Topic, float]:
-    """The columns of a table's clock, which is named or guessed, and its first time [s]."""
+) -> ChannelLog:
+    """A table as a log of one topic.
+
+    Args:
+        table: of rows, or of arrays, of which those of other lengths are left out.
+        time: the clock, where it is named; else guessed.
+        unit: of the clock.
+        rate: samples a second [Hz] of a table without times.
+        notes: to which what was assumed and left out is added.
+
+    Raises:
+        InputError: it has no clock, or two columns of one name.
+    """
     info = describe_table(table, time, unit, rate)
     clock = info.time
     if clock is None or clock.problem:
@@ -137,12 +93,15 @@ def _table_topic(
     elif clock.guessed:
         words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
         notes.append(note("clock.guessed", words, clock.column))
-    is_rows = clock.column == ROWS
     rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
     # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
     whole = not isinstance(table, ArrayTable)
     numeric = [c for c in info.columns if c.kind == "number"]
     names = [c.name for c in numeric if whole or c.count == rows]
+    others = [c.name for c in numeric if c.name not in names]
+    if others:
+        words = f"{listed(map(shown, others))}, not of {rows} samples as the clock"
+        notes.append(note(LEFT_OUT, f"left out: {words}", *others))
     notes += table.notes
     notes += _left_out(table, [c.name for c in info.columns if c.kind == "text"])
     twice = next((n for n in names if names.count(n) > 1), None)
@@ -152,16 +111,13 @@ def _table_topic(
     if clock.runs > 1:
         table = in_runs(table, clock)
         notes += table.notes[-1:]
-    if is_rows:
-        numbers, copies = CountedTable(table).numbers([*names, ROWS]), ()
-    else:
-        numbers, copies = numbers_once(table, clock.column, names)
+    names = list(dict.fromkeys([*names, clock.column]))
+    numbers = (counted(table) if clock.column == ROWS else table).numbers(names)
     stamps = without_overflow(numbers.pop(clock.column))
-    notes += copies
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
-    return topic, float(stamps[0]) * scale
+    return ChannelLog(table.path, table.format, table.size, table.sha256, (topic,))
 
 
 def _left_out(table: Table, names: Sequence[str]) -> list[Finding]:

@@ -14,8 +14,7 @@ import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.log import ChannelLog, Topic, require_samples
-from heli_jax.flights.px4_commands import is_command
+from heli_jax.flights.log import ChannelLog, Topic, holds_commands, require_samples
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
@@ -138,23 +137,16 @@ def _version(information: dict[str, str | int | float]) -> str:
 
 
 def _read_messages(path: str, data: bytes, content: _Content) -> None:
-    """All messages, the parts that were appended after a crash included."""
-    end = _read_part(path, data, _HEADER, len(data), content)
-    # Where an offset is named, the part before it ends with a message that was cut.
-    for offset in content.appended:
-        if end < offset <= len(data):
-            end = _read_part(path, data, offset, len(data), content)
-
-
-def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> int:
-    report_at = at
+    """All messages, what was appended after a crash included."""
+    at, end, report_at = _HEADER, len(data), _HEADER
     while at + 3 <= end:
         if at >= report_at:
             progress.advance(at)
             report_at = at + progress.STEP
         size, kind = data[at] | data[at + 1] << 8, data[at + 2]
         body, after = at + 3, at + 3 + size
-        limit = min((o for o in content.appended if o > at), default=end)
+        # The part before one that was appended ends with a message that was cut.
+        limit = min((o for o in content.appended if at < o <= end), default=end)
         topic = _topic_of(data, at, content) if kind == _DATA else None
         if topic is not None and after <= limit:  # nearly all of them
             topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
@@ -166,15 +158,13 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
                 content.damaged += 1
                 content.lost += after - at
         else:
-            # Damage, so that its length is no way on; or cut off, by the end of the file or by the
-            # part that was appended.
+            # Damage, so that its length is no way on; or cut off by the end of the file.
             content.damaged += 1
             after = min(_next_message(data, at, limit, content), limit)
             content.lost += after - at
             if after == end:
-                return at
+                return
         at = after
-    return at
 
 
 def _topic_of(data: bytes, at: int, content: _Content) -> _Subscription | None:
@@ -255,8 +245,7 @@ def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
             if len(flags) < 8 or flags[0] & ~1 or any(flags[1:]):
                 raise wrong(path, "is a ULog file of a kind that is not known, expected version 1")
             if flags[0] & 1 and len(body) >= 40:
-                offsets = struct.unpack("<3Q", body[16:40])
-                content.appended = sorted(o for o in offsets if o)
+                content.appended = [o for o in struct.unpack("<3Q", body[16:40]) if o]
 
 
 def _take_format(body: bytes, content: _Content) -> None:
@@ -355,7 +344,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
 
 def _clock(name: str, rows: np.ndarray) -> str:
     names = rows.dtype.names or ()
-    if "timestamp_sample" in names and not is_command(name):
+    if "timestamp_sample" in names and not holds_commands(name):
         stamps = rows["timestamp_sample"]
         # Some modules leave the field at zero, or publish one sample twice.
         if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):

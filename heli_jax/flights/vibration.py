@@ -136,12 +136,7 @@ def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> t
 
 
 def folded(hz: float, rate: float) -> float:
-    """Where a frequency appears in samples taken at a rate [Hz].
-
-    Args:
-        hz: [Hz].
-        rate: [Hz].
-    """
+    """Where a frequency [Hz] appears in samples taken at a rate [Hz]."""
     return abs(hz - rate * round(hz / rate))
 
 

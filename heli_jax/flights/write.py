@@ -17,7 +17,7 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     """
     import pyarrow as pa  # here, so that a fit without files does not wait for it
 
-    table = pa.table({name: _column(values) for name, values in columns.items()})
+    table = pa.table(dict(columns))
     if isinstance(target, Path) and target.suffix.lower() == ".parquet":
         import pyarrow.parquet
 
@@ -29,36 +29,6 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     pyarrow.csv.write_csv(
         table, target if isinstance(target, Path) else pa.PythonFile(target, mode="w")
     )
-
-
-def _column(values: Any) -> Any:
-    """A column as pyarrow has it."""
-    import pyarrow as pa
-
-    # `pa.array` looks whether it was given something of pandas, which it loads for that: a fifth of
-    # a second.
-    if isinstance(values, list):
-        cells: list[Any] = values
-        only = cells and all(isinstance(v, str) for v in cells)
-        return _texts(cells) if only else pa.array(cells)
-    numbers = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "iuf"
-    if not (numbers and values.dtype.isnative):
-        return pa.array(values)
-    whole = np.ascontiguousarray(values)
-    kind = pa.from_numpy_dtype(whole.dtype)
-    return pa.Array.from_buffers(kind, whole.size, [None, pa.py_buffer(whole)])
-
-
-def _texts(values: list[str]) -> Any:
-    """Texts as pyarrow has them: all bytes one after the other, and where each begins."""
-    import pyarrow as pa
-
-    encoded = [v.encode("utf-8") for v in values]
-    begins = np.concatenate([[0], np.cumsum([len(e) for e in encoded])])
-    if begins[-1] > np.iinfo(np.int32).max:
-        return pa.array(values)
-    buffers = pa.py_buffer(begins.astype(np.int32)), pa.py_buffer(b"".join(encoded))
-    return pa.StringArray.from_buffers(len(values), *buffers)
 
 
 def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:

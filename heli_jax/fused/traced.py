@@ -9,8 +9,8 @@ import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.place import place_of
-from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.kernel import Argument, Run
+from heli_jax.fused.translate import place_of
 from heli_jax.numerics.hoist import hoisted
 
 # `Any` below: trees of arrays, and jaxprs.
@@ -66,8 +66,6 @@ def traced(
     """Trace a run.
 
     Args:
-        making: the steps of an element.
-        shared: what all elements share, but for records.
         records: arrays (N, ...) that are read by the sample.
         element: an example of what an element has of its own.
         own_records: of each leaf of the records whether every element has another; none unless

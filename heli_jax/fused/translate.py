@@ -2,10 +2,14 @@
 
 Small arrays are taken apart into their elements; long ones, such as the inputs of a record, stay in
 memory, and what is computed of them is computed of the elements that are asked for.
+
+What loops carry is kept in registers, one of LLVM's phi nodes each.
 """
 
 import functools
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,24 +17,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from heli_jax.fused.code import Code, UnsupportedError, Value, constant, said
-from heli_jax.fused.lookups import in_order
-from heli_jax.fused.loops import loop
-from heli_jax.fused.operands import (
+from heli_jax.fused.code import (
     INDEX,
     MOST,
+    Code,
     Elements,
     Operand,
     Stored,
+    UnsupportedError,
+    Value,
     at_place,
+    constant,
     dtype_of,
     elements,
+    said,
     scalar,
 )
+from heli_jax.fused.lookups import COMBINED, Combined, in_order, scattered
 from heli_jax.fused.operations import OPERATIONS
-from heli_jax.fused.place import place_of
 from heli_jax.fused.shapes import SHAPED
-from heli_jax.fused.writes import COMBINED, Combined, scattered
 
 _UNROLLED = 16
 """Passes of a loop that are written out where it cannot stay a loop."""
@@ -52,12 +57,6 @@ _NESTED = {
 
 def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[Operand]) -> list:
     """Write what a jaxpr computes.
-
-    Args:
-        code: where it is written.
-        jaxpr: as `jax.make_jaxpr` gives it, closed or with its constants.
-        consts: of it.
-        operands: of its arguments.
 
     Returns:
         An operand for each result.
@@ -355,3 +354,99 @@ def _where(code: Code, which: Elements, yes: list[Operand], no: list[Operand]) -
         each = np.broadcast_to(which.reshape((*which.shape, *rest)), new.shape)
         results.append(_elementwise(code, "select_n", {}, [each, old, new], dtype_of(old)))
     return results
+
+
+def loop(
+    code: Code,
+    until: Value | Callable[[list[Operand]], Value],
+    carry: Sequence[Operand],
+    body: Callable[[Value, list[Operand]], list[Operand]],
+) -> list[Operand]:
+    """A loop that is passed at least once.
+
+    Args:
+        until: how many passes (int32), or of what is carried whether there is another.
+        body: of the pass's number (int32) and what is carried, what is carried on.
+    """
+    starts = [elements(code, v) for v in carry]
+    varies = [_vary(v) for v in starts]
+    # What starts the same for all vehicles may not stay so: tried until nothing changes.
+    while True:
+        mark = code.mark()
+        results = _tried(code, until, starts, varies, body)
+        changed = [old | _vary(new) for old, new in zip(varies, results[1], strict=True)]
+        if all(np.array_equal(a, b) for a, b in zip(varies, changed, strict=True)):
+            return list(results[0])
+        varies = changed
+        code.back_to(mark)
+
+
+def _vary(values: Elements) -> np.ndarray:
+    """Of each whether vehicles have numbers of their own."""
+    return np.vectorize(lambda v: not v.shared, otypes=[bool])(values)
+
+
+def _tried(
+    code: Code,
+    until: Value | Callable[[list[Operand]], Value],
+    starts: list[Elements],
+    varies: list[np.ndarray],
+    body: Callable[[Value, list[Operand]], list[Operand]],
+) -> tuple[list[Elements], list[Elements]]:
+    before = [
+        [code.of(v, not bool(w)) for v, w in zip(s.ravel(), each.ravel(), strict=True)]
+        for s, each in zip(starts, varies, strict=True)
+    ]
+    entry, inside = code.block, code.new_label("loop")
+    code.write(f"br label %{inside}")
+    code.label(inside)
+    # The phi nodes are written when what comes round is known; their place is kept.
+    place = len(code.lines)
+    index = Value(code.register(), INDEX, True)
+    carried = []
+    for s, each in zip(starts, varies, strict=True):
+        values = np.empty(s.shape, object)
+        for at in np.ndindex(s.shape):
+            values[at] = Value(code.register(), s[at].dtype, not bool(each[at]))
+        carried.append(values)
+    results = [elements(code, v) for v in body(index, list(carried))]
+    around = [
+        [code.of(v, not bool(w) and v.shared) for v, w in zip(r.ravel(), e.ravel(), strict=True)]
+        for r, e in zip(results, varies, strict=True)
+    ]
+    following = code.operation("add", index, constant(1, INDEX))
+    if isinstance(until, Value):
+        again = code.compare("icmp slt", following, until)
+    else:
+        again = until(list(results))
+    end = code.block
+    after = code.new_label("after")
+    phis = [f"{index.operand} = phi i32 [ 0, %{entry} ], [ {following.operand}, %{end} ]"]
+    for values, first, then in zip(carried, before, around, strict=True):
+        for v, a, b in zip(values.ravel(), first, then, strict=True):
+            kind = code.typed(v.dtype, v.shared)
+            phis.append(f"{v.operand} = phi {kind} [ {a}, %{entry} ], [ {b}, %{end} ]")
+    code.lines[place:place] = [f"  {p}" for p in phis]
+    code.write(f"br i1 {again.operand}, label %{inside}, label %{after}")
+    code.label(after)
+    return results, results
+
+
+_OURS = str(Path(__file__).parents[1])
+_INSTALLED = re.compile(r"(?:site|dist)-packages[/\\]([^/\\.]+)")
+
+
+def place_of(equation: Any) -> str | None:
+    """As 'at model.py:12' or 'in diffrax'; None where nothing says so."""
+    trace, library = equation.source_info.traceback, None
+    # From the innermost call outwards, until somebody's own function is met. What a function of
+    # JAX's is made of was traced once for all who call it, and knows no caller.
+    for frame in () if trace is None else trace.frames:
+        name = frame.file_name
+        if name.startswith(_OURS):
+            return None if library in (None, "jax", "jaxlib") else f"in {library}"
+        if (installed := _INSTALLED.search(name)) is not None:
+            library = installed[1]
+        elif not name.startswith("<"):
+            return f"at {Path(name).name}:{frame.line_num}"
+    return None

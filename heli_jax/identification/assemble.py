@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding, weighed
 from heli_jax.identification.agreement import (
+    coloured_residuals,
     free_runs,
     pooled_metrics,
     signals_of,
@@ -19,9 +20,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import Optimum, meas
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.fit_notes import Numbers, fit_notes, open_directions
-from heli_jax.identification.identifiability.as_likely import unless_as_likely
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
-from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.judgement import End, end_of, judge, params_of
@@ -176,7 +175,15 @@ def assemble(
     held = _held_out(end, judged.loop)
     # Of rounding, and of numbers that are none, notes of their own speak.
     astray = status == "not-converged" and not ill and bool(np.all(np.isfinite(e.J)))
+    coloured = coloured_residuals(
+        end.white,
+        layout,
+        layout.free,
+        allowed_for=errors.coloured,
+        converged=status != "not-converged",
+    )
     findings = [
+        *coloured,
         *fit_notes(
             problem,
             search,
@@ -238,7 +245,6 @@ def _errors(end: End, run: OptimizationRun) -> tuple[StandardErrors, list[FastMo
     fast = fast_modes(problem, values, measurement_noise(problem, at.noise.sd))
     if arrived:
         fast = as_good_as_aliases(fast, Valley(problem, at, e))
-    twins = twins_of(problem, at, e) if arrived else ()
     errors = standard_errors(
         problem,
         at,
@@ -246,15 +252,12 @@ def _errors(end: End, run: OptimizationRun) -> tuple[StandardErrors, list[FastMo
         run.before,
         white=all(w.white for w in end.white.values()) if e.innovations else end.all_white,
         aliased=frozenset(n for mode in fast for n in mode.undetermined),
-        twins=twins,
-        second=second_solutions(problem, at, e, reported=twins) if arrived else (),
+        second=second_solutions(problem, at, e) if arrived else (),
         optimum=arrived,
     )
     if not arrived:
         return errors, fast
-    verdict = unless_as_likely(errors.verdict, end.optimum.as_likely)
-    verdict = unless_inputs_explain_nothing(at, e, verdict)
-    return errors._replace(verdict=verdict), fast
+    return errors._replace(verdict=unless_inputs_explain_nothing(at, e, errors.verdict)), fast
 
 
 def _unknowns(layout: Layout, absent: int) -> int:

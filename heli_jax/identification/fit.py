@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import UNIT_IN_DOUBT, Finding, note, sentences
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, note
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
@@ -46,7 +46,6 @@ from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
-from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -171,9 +170,8 @@ def check(problem: Problem) -> Check:
     # At the start values, since nothing else is known yet: where these are far off, what is
     # determined there may differ from what is at the optimum, for which the fit asks again.
     at = Solution(*guess[:4])
-    twins = twins_of(problem, at, guess.e, optimum=False)
-    second = second_solutions(problem, at, guess.e, optimum=False, reported=twins)
-    around = Around(twins=twins, second=second, valley=Valley(problem, at, guess.e))
+    second = second_solutions(problem, at, guess.e, optimum=False)
+    around = Around(second=second, valley=Valley(problem, at, guess.e))
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
@@ -247,7 +245,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    notes = (*ranking.notes, *sentences(guessed_gusts(problem, at)))
+    notes = (*ranking.notes, *guessed_gusts(problem, at))
     return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
 
 

@@ -85,8 +85,7 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
     )
     first = fit(in_frequency, max_steps=max_steps)
     # Any of several solutions is as good a start as the only one would be.
-    of_several = {n for pair in first.verdict.twins for n in pair}
-    of_several |= {n for other in first.verdict.second for n in other.changed}
+    of_several = {n for other in first.verdict.second for n in other.changed}
     values = {
         name: _value(
             estimate, first.status, problem.free[name].start, of_several=name in of_several

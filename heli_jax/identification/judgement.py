@@ -52,7 +52,6 @@ from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_stick import late_stick
 from heli_jax.identification.validation.logging_rate import loop_between_samples
 from heli_jax.identification.validation.metrics import Whiteness, metrics
-from heli_jax.identification.validation.noisy_inputs import noisy_inputs
 from heli_jax.identification.validation.unmodelled import unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
@@ -155,8 +154,6 @@ def judge(
         flights = labels(problem.training)
         misfits += late_stick(problem, at, end.e, named)
         misfits += unmodelled(at, end.e, coloured=in_colour, flights=flights)
-    if arrived and not (ahead or instruments):
-        misfits += noisy_inputs(problem, at, end.e, named)
     held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the vehicle either.

@@ -11,11 +11,9 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.check_model import cannot_start, check_model
+from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
 from heli_jax.dynamics.model import Model, require_constants, require_linear
-from heli_jax.dynamics.sensor_noise import sensor_noise
-from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.arguments import check_arguments, warn_of_degrees

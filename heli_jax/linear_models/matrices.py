@@ -1,5 +1,6 @@
 """The matrices of a file, entry by entry: names, units and expressions checked."""
 
+import ast
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -37,10 +38,6 @@ class _Unit(NamedTuple):
 def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
     """The entries of A, B, C, D and E.
 
-    Args:
-        mapping: what the YAML holds.
-        content: what `content_of` makes of it.
-
     Raises:
         InputError: an entry is wrong, or the parameters' values make one infinite.
     """
@@ -62,8 +59,6 @@ def not_possible(
     inverse.
 
     Args:
-        content: what the parameters are.
-        matrices: of `matrices_of`.
         values: of all parameters, by name [SI].
     """
     # A sentence is returned and nothing is raised, since who calls knows whether the values are the
@@ -143,11 +138,6 @@ class _Matrices:
     def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
         """A matrix as it is written: by row, by column.
 
-        Args:
-            matrix: its name, as A.
-            known: names that its rows may have.
-            columns: names that its columns may have.
-
         Raises:
             InputError: a row or a column has another name.
         """
@@ -171,11 +161,6 @@ class _Matrices:
         self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
     ) -> tuple[Entry, ...]:
         """All entries of a matrix but E.
-
-        Args:
-            name: of the matrix, as A.
-            rows: what each row is in, by name.
-            columns: names that its columns may have.
 
         Raises:
             InputError: a name or an entry is wrong.
@@ -222,7 +207,7 @@ class _Matrices:
         value = float(source)
         if not math.isfinite(value):
             raise InputError(f"{place}: expected a finite number, got {source!r:.40}")
-        return expression.Number(value)
+        return ast.Constant(value)
 
     def entry(
         self,
@@ -236,11 +221,7 @@ class _Matrices:
         """One entry, checked.
 
         Args:
-            place: where it stands, as A.p.b.
             source: a number or an expression, as the YAML has it.
-            row: name of its row.
-            column: name of its column.
-            of: what the row is in.
             per: what the column is in; the state or the input itself unless given.
 
         Raises:

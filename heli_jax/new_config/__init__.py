@@ -1,6 +1,6 @@
 """`heli-jax new LOG`: a configuration that begins with what a log holds, its guesses marked."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding, note
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.preset import fitting_presets
+from heli_jax.flights.table import shown
 from heli_jax.identification.validation.follows_response import feedback
 from heli_jax.identification.validation.late_inputs import led_by
 from heli_jax.linear_models import read as linear_models
-from heli_jax.new_config import tables, text
-from heli_jax.new_config.filtered import filter_settings, filtered_outputs
+from heli_jax.new_config import guess, tables, text
 from heli_jax.new_config.guess import Series
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.model_choice import chosen_model, other_models, other_vehicle
@@ -26,7 +26,7 @@ from heli_jax.new_config.signals import (
     only_turn,
     signals_of,
 )
-from heli_jax.new_config.unread import unread_notes
+from heli_jax.new_config.text import filter_settings, filtered_outputs
 from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
 from heli_jax.yaml_file import EDIT
@@ -52,11 +52,9 @@ def write_config(
     """Write a configuration, and for models of a machine's geometry a vehicle file to fill in.
 
     Args:
-        log: of any format that is read.
         out: the configuration's place; what stands there is not replaced.
         model: as a configuration names it, a linear one by its file's name too; chosen by what
             moves unless given.
-        vehicle: a vehicle file.
         flight: of a log that holds several, from 1.
         time_rate: samples a second [Hz] of a table without times.
 
@@ -130,7 +128,7 @@ def write_config(
         absent = [n for n in naming.names(chosen.model.Outputs) if n not in signals.outputs]
         absent = [n for n in absent if n not in signals.wandering]
         called = {n: names_of_output(n) for n in absent} | {n: names_of_input(n) for n in lacking}
-        notes += unread_notes((*lacking, *absent), called, read.unread)
+        notes += _unread_notes((*lacking, *absent), called, read.unread)
     if vehicle_of_log := other_vehicle(read.autopilot):
         words = f"the log's vehicle is {vehicle_of_log}: see that the model is one of it"
         notes.append(note("model.other-vehicle", words))
@@ -273,3 +271,21 @@ def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
     own = linear_models.linear_model(chosen.name["linear"]).vehicle().constants
     values = {name: constant.value for name, constant in own.items()}
     return {n: v for n, v in values.items() if v and n not in free and n not in _GRAVITY}
+
+
+_MOST = 4
+"""columns that are named"""
+
+
+def _unread_notes(
+    lacking: Collection[str], called: Mapping[str, Sequence[str]], unread: Mapping[str, str]
+) -> list[Finding]:
+    """Notes on signals that were not found, where a column that cannot be read is called so."""
+    columns: dict[str, str] = {}
+    for signal in lacking:
+        for name in guess.by_name(called[signal], list(unread))[:1]:
+            columns.setdefault(name, signal)
+    return [
+        note(LEFT_OUT, f"{signal} may be the column {shown(name)}, which {unread[name]}", name)
+        for name, signal in list(columns.items())[:_MOST]
+    ]

@@ -86,8 +86,6 @@ def by_name(
     """The channels that may be a signal, the likeliest first.
 
     Args:
-        called: what people call it, words by blanks.
-        names: of the log's channels.
         commanded: what else a command of it may name, as `roll` in roll_cmd.
     """
     forms = [tuple(c.split()) for c in called]
@@ -120,9 +118,6 @@ def by_name(
 def spelled_out(names: Sequence[str]) -> dict[str, str]:
     """Names of rates that have a letter for their axis, with the axis in words: ArduPilot's RATE.R,
     RATE.P and RATE.Y are of roll, pitch and yaw, where rate_p, rate_q and rate_r are p, q and r.
-
-    Args:
-        names: of the log's channels.
     """
     groups: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
@@ -143,12 +138,7 @@ def spelled_out(names: Sequence[str]) -> dict[str, str]:
 
 
 def by_number(called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The channels that a number alone gives away, as `chan1_raw` and `servoRaw.servo1`.
-
-    Args:
-        called: what they are called, word and number by a blank.
-        names: of the log's channels.
-    """
+    """The channels that a number alone gives away, as `chan1_raw` and `servoRaw.servo1`."""
     forms = {tuple(c.split()) for c in called}
     return [n for n in names if _numbered(n) in forms]
 
@@ -169,16 +159,10 @@ def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> str:
-    """The first channel, or one of the same words whose unit is stated: rc_aileron(percent).
-
-    Args:
-        names: the likeliest first.
-        log: the channels.
-        si: the unit that the model has.
-    """
+    """The first channel, or one of the same words whose unit is stated: rc_aileron(percent)."""
     words = words_of(names[0])
     alike = [n for n in names if words_of(n) == words]
-    known = (n for n in alike if fits(log[n].unit or without_unit(n)[1] or "none", si))
+    known = (n for n in alike if units.fits(log[n].unit or without_unit(n)[1] or "none", si))
     return next(known, names[0])
 
 
@@ -188,12 +172,7 @@ def is_excitation(name: str) -> bool:
 
 
 def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The logged excitations of an input, by their names.
-
-    Args:
-        called: what people call the input, words by blanks.
-        names: of the log's channels.
-    """
+    """The logged excitations of an input, by their names."""
     forms = {tuple(c.split()) for c in called}
     return [
         name
@@ -204,40 +183,22 @@ def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
-    """Whether a channel's name and unit leave room for an output of the model.
-
-    Args:
-        name: of the channel.
-        series: its samples.
-        called: what people call the output, words by blanks.
-        si: the unit that the model has.
-    """
+    """Whether a channel's name and unit leave room for an output of the model."""
     unit = series.unit or without_unit(name)[1]
     # A model that states no unit takes any.
-    if unit and si != "1" and not fits(unit, si):
+    if unit and si != "1" and not units.fits(unit, si):
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
     return not (_OTHER | _CHANGES) & words - own
 
 
 def may_move(name: str, series: Series, si: str) -> bool:
-    """Whether a channel's name and unit leave room for an input of the model.
-
-    Args:
-        name: of the channel.
-        series: its samples.
-        si: the unit that the model's input has.
-    """
+    """Whether a channel's name and unit leave room for an input of the model."""
     return not no_stick(name, series.unit or without_unit(name)[1], si)
 
 
 def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:
-    """The channel that an output follows, with the correlation; None where it follows none.
-
-    Args:
-        output: what moves.
-        channels: those that may move it.
-    """
+    """The channel that an output follows, with the correlation; None where it follows none."""
     best: tuple[str, float] | None = None
     for name, series in channels.items():
         related = _largest_correlation(series, output)
@@ -271,11 +232,7 @@ def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
 
 
 def full_travel(sticks: Mapping[str, Series]) -> float | None:
-    """What a log's sticks count to at their stops, where one of them was there; None if not.
-
-    Args:
-        sticks: channels that are named as sticks or what is commanded by them.
-    """
+    """What a log's sticks count to at their stops, where one of them was there; None if not."""
     for series in sticks.values():
         values = series.values[np.isfinite(series.values)]
         # Radios of the EdgeTX family count to 1024, in whole numbers.
@@ -287,12 +244,3 @@ def full_travel(sticks: Mapping[str, Series]) -> float | None:
 def are_whole(values: np.ndarray) -> bool:
     """Whether samples (N,) are whole numbers."""
     return bool(np.all(values == np.rint(values)))
-
-
-def fits(unit: str, si: str) -> bool:
-    """Whether a unit is one of what the model has in `si`."""
-    try:
-        units.factor(unit, si)
-    except ValueError:
-        return False
-    return True

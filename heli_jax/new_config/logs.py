@@ -12,16 +12,18 @@ import numpy as np
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_faults import require_increasing
-from heli_jax.flights.clock_guess import COUNTS_ROWS, arrival_notes, is_called_time
+from heli_jax.flights.clock_guess import (
+    COUNTS_ROWS,
+    is_called_time,
+    require_increasing,
+)
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.row_clock import ROWS, CountedTable
+from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.flights.table_topics import in_runs, rate_note
-from heli_jax.flights.table_view import numbers_once
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0
@@ -52,7 +54,6 @@ def read_log(path: Path, number: int | None, rate: float | None = None) -> Log:
     """The channels of a log that hold samples.
 
     Args:
-        path: of any format that is read.
         number: of the flight, of a log that holds several, from 1.
         rate: samples a second [Hz] of a table without times.
 
@@ -117,7 +118,7 @@ def _read_table(table: Table, rate: float | None) -> Log:
     if time.said:
         notes = (rate_note(time),)
     clock = time.column
-    table = CountedTable(table) if clock == ROWS else in_runs(table, time)
+    table = counted(table) if clock == ROWS else in_runs(table, time)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
@@ -125,14 +126,13 @@ def _read_table(table: Table, rate: float | None) -> Log:
     rows = {ROWS: info.n_rows} | {c.name: c.rows for c in info.columns}
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
-    values, _ = numbers_once(table, clock, [clock, *(n for n in names if n != clock)])
+    values = table.numbers([clock, *(n for n in names if n != clock)])
     times = _from_first(values[clock], time.duration)
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))
         for n in names
         if n != clock and _is_known(values[n])
     }
-    notes += arrival_notes(table, clock)
     if time.runs > 1:
         notes += table.notes[-1:]
     if others:

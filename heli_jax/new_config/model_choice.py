@@ -13,8 +13,7 @@ from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables
 from heli_jax.new_config.logs import Log
-from heli_jax.new_config.places import is_place
-from heli_jax.new_config.signals import outputs_called, that_move
+from heli_jax.new_config.signals import is_place, outputs_called, that_move
 
 _AXES = {
     "roll": ("roll-flybarless", ("roll_rate", "roll")),
@@ -52,9 +51,6 @@ def chosen_model(
 
     Args:
         name: as stated; chosen by what moves unless given.
-        log: of which signals are known.
-        path: of the log.
-        folder: of the configuration, where a module of one's own lies.
     """
     if name is None:
         vehicle = other_vehicle(log.autopilot)

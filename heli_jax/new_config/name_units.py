@@ -28,25 +28,8 @@ _LETTERS = ("V", "A", "%")
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
 # What may stand behind a name and change nothing; roll_rate is no roll.
 FILLERS = {
-    "pwm",
-    "us",
-    "raw",
-    "filt",
-    "filtered",
-    "meas",
-    "measured",
-    "value",
-    "values",
-    "data",
-    "adc",
-    "counts",
-    "norm",
-    "in",
-    "input",
-    "body",
-    "imu",
-    "est",
-    "out1",
+    *("pwm", "us", "raw", "filt", "filtered", "meas", "measured", "value", "values", "data", "adc"),
+    *("counts", "norm", "in", "input", "body", "imu", "est", "out1"),
 }
 
 

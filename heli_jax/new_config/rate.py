@@ -26,12 +26,7 @@ def two_digits(rate: float) -> float:
 
 
 def common_rate(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
-    """The slowest clock of the outputs that are used [Hz], 100 at most; None of none.
-
-    Args:
-        series: of the log by channel.
-        outputs: names of channels.
-    """
+    """The slowest clock of the outputs that are used [Hz], 100 at most; None of none."""
     rates = [1.0 / usual_step(series[n].times) for n in outputs if n in series]
     rates = [rate for rate in rates if rate >= _SLOW] or rates
     return two_digits(min(_FASTEST, *rates)) if rates else None
@@ -40,10 +35,6 @@ def common_rate(series: Mapping[str, Series], outputs: Collection[str]) -> float
 def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
     """The rate [Hz] of the fastest output by its own samples, 100 at most, where a table's rows
     come faster than that since they are those of several topics; else None.
-
-    Args:
-        series: of the table by channel.
-        outputs: names of channels.
     """
     rates, rows = [], 0.0
     for times, values, *_ in (series[n] for n in outputs if n in series):
@@ -56,13 +47,7 @@ def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> f
 
 
 def channels_of_preset(name: str, series: Collection[str], signals: Collection[str]) -> list[str]:
-    """The log's channels that a preset may take for signals of a model.
-
-    Args:
-        name: of the preset.
-        series: the log's channels.
-        signals: the model's inputs and outputs.
-    """
+    """The log's channels that a preset may take for signals of a model."""
     inputs, outputs, table = model_inputs(), model_outputs(), preset(name).signals
     meant = [outputs.get(n, inputs[n].command if n in inputs else n) for n in signals]
     # Of several channels the first that the log has is taken.

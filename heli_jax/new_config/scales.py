@@ -3,7 +3,7 @@
 import numpy as np
 
 from heli_jax import units
-from heli_jax.new_config.guess import Guess, Series, are_whole, fits, words_of
+from heli_jax.new_config.guess import Guess, Series, are_whole, words_of
 from heli_jax.new_config.name_units import without_unit
 from heli_jax.yaml_file import EDIT
 
@@ -45,7 +45,7 @@ def scaled(
     stated, source = series.unit, "the log"
     if not stated:
         stated, source = without_unit(channel)[1], "its name"
-    if stated and fits(stated, si):
+    if stated and units.fits(stated, si):
         return Guess(channel, stated, remarks=(f"unit by {source}",))
     if _is_sbus(channel, values):
         return _about(channel, si, ("counts of S.BUS", "", "a count"), _SBUS_REST, _SBUS_STOP)
@@ -76,7 +76,7 @@ def scaled(
         return Guess(channel, "1", EDIT, remarks=(remark,))
     elif si == "1":
         return _of_stick(channel, low, high, full)
-    elif fits("m", si):
+    elif units.fits("m", si):
         guess = "GUESS: full travel of the input for 1 in the log is not known"
         return Guess(channel, si, EDIT, remarks=(guess,))
     else:
@@ -150,14 +150,9 @@ def _of_stick(channel: str, low: float, high: float, full: float | None) -> Gues
 
 
 def rotor_speed(channel: str, series: Series) -> float:
-    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s.
-
-    Args:
-        channel: its name.
-        series: its samples.
-    """
+    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s."""
     mean = float(np.nanmean(series.values))
     unit = series.unit or without_unit(channel)[1]
-    if unit and fits(unit, "rad/s"):
+    if unit and units.fits(unit, "rad/s"):
         return mean * units.factor(unit, "rad/s")
     return mean * units.factor("rpm", "rad/s") if mean > 500.0 else mean

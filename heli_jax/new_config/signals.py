@@ -7,12 +7,11 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.model import axes_of
-from heli_jax.flights.channel_names import names_a_stick
+from heli_jax.flights.channel_names import names_a_stick, words_in
 from heli_jax.flights.preset import model_inputs, model_outputs
 from heli_jax.new_config import guess, scales, tables, text
-from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.guess import Guess, Series
 from heli_jax.new_config.logs import Log
-from heli_jax.new_config.places import is_place
 from heli_jax.numerics.white_noise import wanders, without_noise
 
 _STICKS_TOO = {"roll", "pitch", "yaw"}
@@ -197,3 +196,29 @@ def _by_correlation(
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)
+
+
+_CALLED = {"lat", "lon", "lng", "long", "latitude", "longitude"}
+_STEADY = 50.0
+"""times what a flight goes over, by which a place is away from zero at least"""
+_PARTS, _DEGREES, _INTEGERS = 1.5, 180.0, 1e6
+"""of full travel, of half a circle, and of the parts of a degree in which receivers of GPS count"""
+
+
+def is_place(name: str, log: Mapping[str, Series]) -> bool:
+    """Whether a channel is a latitude or a longitude, by its name and its numbers, or by a `Lng`
+    that stands beside it.
+    """
+    words = words_in(name)
+    if not words or words[-1] not in _CALLED:
+        return False
+    beside = {other for other in log if other.rpartition(".")[0] == name.rpartition(".")[0]}
+    if any(words_in(other)[-1:] in (("lng",), ("longitude",)) for other in beside):
+        return True
+    values = log[name].values[np.isfinite(log[name].values)]
+    if not values.size:
+        return False
+    smallest, largest = float(np.min(np.abs(values))), float(np.max(np.abs(values)))
+    # Pulse widths of a stick at rest are between the two.
+    scaled = _PARTS < largest <= _DEGREES or largest > _INTEGERS
+    return scaled and smallest > _STEADY * float(np.ptp(values))

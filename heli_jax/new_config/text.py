@@ -7,11 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from heli_jax import naming
+from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
 from heli_jax.flights.describe import TimeInfo
+from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
 from heli_jax.flights.row_clock import ROWS
-from heli_jax.new_config.filtered import Filtered
 from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.logs import Log
 from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
 
@@ -33,6 +35,39 @@ _SMOOTH = (
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
 _ROWS_OF_TOPICS = "# Hz; the rows are those of several topics, the outputs slower"
+
+
+class Filtered(NamedTuple):
+    """The channel of an output, and the settings of its filters in words."""
+
+    signal: Alternative
+    settings: str
+
+
+def filter_settings(log: Log, channel: str) -> str:
+    """The settings of constant filters that a channel went through, empty without one."""
+    if log.autopilot is None:
+        return ""
+    logged = logged_filters(log.autopilot.firmware, log.autopilot.parameters, channel)
+    return ", ".join(logged.settings) if logged is not None and logged.filters else ""
+
+
+def filtered_outputs(
+    name: str, model: Any, log: Log, asked: Collection[str]
+) -> dict[str, Filtered]:
+    """The filtered ones of the outputs that a preset supplies.
+
+    Args:
+        asked: the outputs to take from the preset; all unless given.
+    """
+    table, known = preset(name).signals, model_outputs()
+    result: dict[str, Filtered] = {}
+    for output in asked or naming.names(model.Outputs):
+        signals = table.get(known.get(output, ""), ())
+        chosen = choose(log.autopilot, signals) if log.autopilot is not None else None
+        if chosen is not None and (settings := filter_settings(log, chosen.channel)):
+            result[output] = Filtered(chosen, settings)
+    return result
 
 
 class Chosen(NamedTuple):
@@ -83,20 +118,10 @@ def configuration(
     """The configuration as text.
 
     Args:
-        chosen: the model.
-        log: as the configuration names it.
-        time: the clock of a table.
-        flight: the number, where a log holds several.
-        preset: the table of the autopilot, in place of signals.
-        signals: by the model's names.
-        vehicle: the vehicle file, as the configuration names it.
         free: starts by parameter; None at the vehicle's value.
-        held: parameters that stay at the values of the model's own file.
         rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
             those of several topics.
-        others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
-        filtered: those of the preset's outputs that the autopilot filtered.
         late: which input is logged late, in words, empty where none is; and whether nothing else
             looks like that.
 
@@ -132,8 +157,14 @@ def configuration(
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
-    lines += [_free(name, start) for name, start in free.items()]
-    lines += [_held(name, value) for name, value in held.items()]
+    lines += [
+        f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
+        if start is None
+        else f"    {name}: {{start: {_number(start)}}}"
+        for name, start in free.items()
+    ]
+    stays = "# stays at this, another machine's; found without the first #"
+    lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     guess, sure = late
     why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
     lines += [
@@ -144,31 +175,16 @@ def configuration(
     return "\n".join(lines) + "\n"
 
 
-def _free(name: str, start: float | str | None) -> str:
-    if start is None:
-        return f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
-    return f"    {name}: {{start: {_number(start)}}}"
-
-
-def _held(name: str, value: float) -> str:
-    line = f"    # {name}: {{start: {_number(value)}}}".ljust(33)
-    return f"{line}# stays at this, another machine's; found without the first #"
-
-
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
-    """A vehicle file to fill in.
-
-    Args:
-        model: whose parameters it has.
-        means: those that the log tells, with the channel that they are the mean of.
-    """
+    """A vehicle file to fill in."""
     lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number stands for one that has to be there: it only shows what the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})
     needed = {*(n for n in known if n not in defaults), *needed_but_missing(model, params)}
     for name in known:
-        if name not in needed and not _is_read(model, params, name):
+        unset = not math.isfinite(float(getattr(params, name)))
+        if name not in needed and (unset or not reads(model, params, name)):
             continue
         unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
         value = EDIT if name in needed else f"{float(getattr(params, name)):g}"
@@ -179,10 +195,6 @@ def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
             meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or let the fit find it"
         lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
     return "\n".join(lines) + "\n"
-
-
-def _is_read(model: Any, params: Any, name: str) -> bool:
-    return math.isfinite(float(getattr(params, name))) and reads(model, params, name)
 
 
 def _axes(model: Any, logged: Collection[str]) -> tuple[str, ...]:

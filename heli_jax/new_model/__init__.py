@@ -23,7 +23,6 @@ def write_skeleton(name: str, folder: str | Path | None = None) -> list[Path]:
     """Write a model that runs as it stands: module, vehicle, configuration and test.
 
     Args:
-        name: of the model and of its module, a name in Python.
         folder: a new one; one called `name` in the working directory unless given.
 
     Returns:
@@ -32,34 +31,21 @@ def write_skeleton(name: str, folder: str | Path | None = None) -> list[Path]:
     Raises:
         InputError: the name is none, or that of a module that is installed; the folder exists.
     """
-    _check_identifier(name)
+    if keyword.iskeyword(name) or not name.isascii() or not name.isidentifier():
+        raise InputError(
+            f"new-model: got {name!r:.60}, expected a name of letters, digits and _ that does not "
+            "begin with a digit, and no keyword of Python"
+        )
     folder = Path(name) if folder is None else Path(folder)
     require_free(folder)
-    _check_new(name)
+    # A module of that name would be imported in its place, or hide it from everybody else.
+    if name in sys.stdlib_module_names or importlib.util.find_spec(name) is not None:
+        raise InputError(
+            f"new-model: {name!r} is the name of an installed module, expected another one"
+        )
     with whole(folder) as made:
         for template, target in _FILES.items():
             text = resources.files(__name__).joinpath(template).read_text(encoding="utf-8")
             place = made / string.Template(target).substitute(name=name)
             place.write_text(string.Template(text).substitute(name=name), encoding="utf-8")
     return [folder / string.Template(target).substitute(name=name) for target in _FILES.values()]
-
-
-def _check_identifier(name: str) -> None:
-    if keyword.iskeyword(name):
-        raise InputError(
-            f"new-model: {name!r} is a keyword of Python, which no module can be named after; "
-            "expected another name"
-        )
-    if not name.isascii() or not name.isidentifier():
-        raise InputError(
-            f"new-model: got {name!r:.60}, expected a name of letters, digits and _ that does not "
-            "begin with a digit"
-        )
-
-
-def _check_new(name: str) -> None:
-    # A module of that name would be imported in its place, or hide it from everybody else.
-    if name in sys.stdlib_module_names or importlib.util.find_spec(name) is not None:
-        raise InputError(
-            f"new-model: {name!r} is the name of an installed module, expected another one"
-        )

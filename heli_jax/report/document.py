@@ -76,8 +76,6 @@ class VerdictContent(TypedDict):
     """parameters that the priors determine, and not the data"""
     exchangeable_nuisances: Annotated[list[str], "exchangeable"]
     """nuisances, as `flight 1/bias p`, that make up for what is not determined"""
-    exchangeable_parameters: Annotated[list[list[str]], "twins"]
-    """pairs whose values may be exchanged: the data do not tell which is which"""
     other_solutions: Annotated[list[dict[str, float]], lambda v: [s.values for s in v.second]]
     """other values of the free parameters that fit as well [SI]"""
     names: list[str]

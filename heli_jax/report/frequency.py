@@ -19,7 +19,7 @@ from heli_jax.analysis.operating_point import (
     OperatingPoint,
     operating_point,
 )
-from heli_jax.analysis.spectra import (
+from heli_jax.analysis.spectral import (
     OWN,
     leakage,
     partial_coherence,

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
-from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
+from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
 from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
-from heli_jax.analysis.window_resolution import forgets
 from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.identification.agreement import COLOURED
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import FACTOR
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
@@ -83,45 +83,8 @@ def _doubts(fit: Fit) -> list[str]:
 
 
 def whiteness_note(fit: Fit) -> str:
-    """Why the intervals cannot be taken at their word; empty where the residuals are white."""
-    not_white = [name for name, w in fit.whiteness.items() if not w.white]
-    if not not_white:
-        return ""
-    # By the correlation at one sample, which is the number that the sentence gives.
-    worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    estimator = estimator_of(fit.method)
-    if estimator.noise_spectrum:
-        # Where no optimum was reached there are no intervals.
-        allow = "" if fit.status == "not-converged" else " and the intervals allow for it"
-        return (
-            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
-            f"the noise's spectrum is estimated{allow}."
-        )
-    what, better = estimator.errors, fit.disturbable
-    if fit.status == "not-converged":
-        consequence = ""
-    elif fit.coloured:
-        consequence = (
-            "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
-            "residuals' autocorrelation"
-            + (", which filter-error would use for a better estimate." if better else ".")
-        )
-    else:
-        # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
-        # samples.
-        consequence = "The intervals count every sample as news and are too narrow."
-    return (
-        f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
-        f"at one sample, {percent(worst.outside, 0)} of the lags outside the 99 % band): "
-        f"a disturbance or dynamics that the model lacks is in them. {consequence}".rstrip()
-    )
-
-
-def warnings(fit: Fit) -> list[str]:
-    """What a reader has to know before the numbers."""
-    # Whiteness first: the template takes the first one for it where residuals are not white.
-    note = whiteness_note(fit)
-    return ([note] if note else []) + list(fit.notes)
+    """What coloured residuals do to the intervals; empty where the residuals are white."""
+    return next((f.sentence for f in fit.findings if f.code == COLOURED), "")
 
 
 def model_remark(problem: Problem) -> str:

@@ -27,7 +27,7 @@ from scipy.stats import binned_statistic_2d
 from heli_jax.numbers import number
 from heli_jax.report import style
 from heli_jax.report.style import pretty
-from heli_jax.sweeps.chunks import chunks_of
+from heli_jax.sweeps.datasets import chunks_of
 
 RESULTS = 6
 """results with figures of their own"""

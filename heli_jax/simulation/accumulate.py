@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
@@ -12,11 +13,17 @@ from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
-from heli_jax.simulation.delays import at
-from heli_jax.simulation.hold import FlightOrInputs, between_samples
+from heli_jax.simulation.blocks import Reducing, blocks, of_whole_run
+from heli_jax.simulation.hold import FlightOrInputs, at, between_samples
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
-from heli_jax.simulation.reduced_blocks import Reducing, blocks, of_whole_run
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at
+from heli_jax.simulation.solvers import (
+    SolverWrapper,
+    Stepped,
+    Time,
+    ZeroOrderHoldArgs,
+    acting_at,
+    sample_index,
+)
 from heli_jax.simulation.stepping import (
     check_countable,
     field_term,
@@ -24,7 +31,6 @@ from heli_jax.simulation.stepping import (
     per_sample,
     start_state,
 )
-from heli_jax.simulation.wrappers import Accumulating
 
 
 class Accumulated(NamedTuple):
@@ -50,12 +56,9 @@ def accumulate(
     """Reduce a run to a value without keeping it: for large batches.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         update: value = update(value, outputs, data at that sample), at every sample.
         start: the value before the first sample, a pytree of numbers.
-        **keywords: those of `accumulated`.
 
     Returns:
         The final value and diffrax's result.
@@ -82,8 +85,6 @@ def accumulated(
     """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         update: value = update(value, outputs, data at that sample), at every sample.
         start: the value before the first sample, a pytree of numbers.
@@ -271,3 +272,29 @@ def _by_samples(
     # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
     solver = Accumulating(method, lambda *now: reducer(*now), linear)
     return _Samples(solver, term, (args, data), (x0, (start, outside)), n, last)
+
+
+class Accumulating(SolverWrapper):
+    """A per-sample solver that carries a running value beside the state.
+
+    y = (state, value); at each sample, before the step, value = update(value, state, held inputs
+    at that sample, k). Nothing else of the trajectory is kept.
+    """
+
+    update: Callable[..., Any] = eqx.field(static=True)
+    linear: tuple[bool, ...] = eqx.field(static=True, default=())
+    """of each input whether it moves between samples; () holds all"""
+
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
+    ) -> Stepped:
+        """The value at a sample, then the step from it."""
+        held, data = args
+        state, value = y0
+        # Before the step: the outputs of a sample belong to the state at its beginning. Whoever
+        # runs this has to add the last sample, which no step begins with.
+        k = sample_index(t0)
+        value = self.update(value, state, acting_at(held, k, self.linear), at(data, k))
+        state, result = self.solver.stepped(terms, t0, t1, state, held)
+        y1 = (state, value)
+        return y1, result

@@ -2,18 +2,28 @@
 
 For one record this takes a fraction of the time of a step per sample; for large batches of
 vehicles a step per sample is better, since the products grow with m.
+
+A run that is reduced while it goes on takes several samples a step likewise: from x[k] the state m
+samples on is A^m x[k] + ..., and each output between follows directly, as C A^j x[k] + ..., with
+coefficients of the vehicle's own. Of four states and one output four samples so take two thirds of
+the products that four steps take, two samples three quarters.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int, PyTree
 
+from heli_jax import naming
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
 from heli_jax.naming import Record
 from heli_jax.numerics.matrix_exponential import product
-from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs, at
+from heli_jax.simulation.discretize import Discrete, scalars
+from heli_jax.simulation.hold import at
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, dot
 
 
 def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
@@ -21,11 +31,6 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
 
     From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
-
-    Args:
-        args: with the recurrence, in matrices, and the inputs (N,).
-        m: samples in a block.
-        x0: the model's State at the first sample.
     """
     assert args.discrete is not None
     if args.discrete.Bn is not None:
@@ -103,3 +108,199 @@ def _powers(A: Array, m: int) -> tuple[Array, Array]:
 
     top, powers = jax.lax.scan(step, jnp.eye(A.shape[0], dtype=A.dtype), None, length=m)
     return powers, top
+
+
+# `Any` below: State, Inputs and Params are the user's own classes; tree structures, of which JAX
+# exports no type; and nested tuples of scalars.
+
+
+class Reducing(NamedTuple):
+    """What a run is reduced by."""
+
+    model: Model
+    params: Record
+    update: Callable[[Any, Any, Any], Any]
+    """value = update(value, outputs, data at that sample)"""
+
+
+class _Block(NamedTuple):
+    """The exact recurrence over a block of m samples, in nested tuples of scalars.
+
+    Nothing depends on the result before it within a block, so XLA makes one loop over the vehicles
+    of it; written out sample by sample it would compute every sample from the block's first again.
+    """
+
+    free: Any
+    """C A^j, row by row, for j = 1 ... m - 1"""
+    forced: Any
+    """what an input of j samples before adds to the outputs, for j = 0 ... m - 1"""
+    onward: Any
+    """A^m"""
+    driven: Any
+    """what each sample's inputs add to the state after the block"""
+    of_next: Any
+    """Bn, for inputs that are linear between samples; else None"""
+
+
+def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Discrete]:
+    """The recurrence over m samples, and that over one."""
+    assert args.discrete is not None
+    A, B, _, Bn = discrete = args.discrete
+    space = jacobians(model, args.params)
+    C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
+    of_next = None if Bn is None else scalars(Bn)
+    if Bn is not None:
+        # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
+        # held ones.
+        discrete, D = without_next(discrete), D + product(C, Bn)
+        B = discrete.Bd
+    # C A^j and A^j B for all j in m - 1 products each, in place of powers of A.
+    rows, columns, power = [C], [B], A
+    for _ in range(m - 1):
+        rows.append(product(rows[-1], A))
+        columns.append(product(A, columns[-1]))
+        power = product(A, power)
+    free = [scalars(row) for row in rows[1:]]
+    forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
+    onward, driven = scalars(power), [scalars(column) for column in reversed(columns)]
+    # Behind a barrier the coefficients are computed once, not for every step that reads them.
+    once = jax.lax.optimization_barrier((free, forced, onward, driven, of_next))
+    return _Block(*once), discrete
+
+
+class Blocks(NamedTuple):
+    """A run in steps of m samples."""
+
+    reducing: Reducing
+    m: int
+    block: _Block
+    discrete: Discrete
+    inputs: Any
+    """the model's Inputs, arrays (N,)"""
+    data: PyTree
+    carry: Any
+    """before the first step: the states as the recurrence has them, and the value"""
+    structure: Any
+    """of the model's State"""
+
+    @property
+    def samples(self) -> int:
+        """N"""
+        return jax.tree.leaves(self.inputs)[0].shape[0]
+
+    @property
+    def steps(self) -> int:
+        """How many; at least one sample is left over: the last has outputs, but no step after."""
+        return (self.samples - 1) // self.m
+
+    def step(self, carry: PyTree, k: Int[Array, ""], /) -> PyTree:
+        """The carry after the k-th step."""
+        rows = [
+            jax.tree.map(lambda v, j=j: v[k * self.m + j], (self.inputs, self.data))
+            for j in range(self.m)
+        ]
+        return self.over(carry, [jax.tree.leaves(r[0]) for r in rows], [r[1] for r in rows])
+
+    def over(self, carry: PyTree, u: list[list[Array]], now: list[Any]) -> PyTree:
+        """The carry after m samples, of which the inputs and the data are given."""
+        x, value = carry
+        value = self._reduced(x, value, u, now)
+        new = []
+        for i, row in enumerate(self.block.onward):
+            # The states last: their sums wait for those of the step before, the inputs for nothing.
+            driven = [
+                (c, v)
+                for j in range(self.m)
+                for c, v in zip(self.block.driven[j][i], u[j], strict=True)
+            ]
+            new.append(_sum([*driven, *zip(row, x, strict=True)]))
+        return new, value
+
+    def last(self, carry: PyTree, /) -> tuple[Any, Any]:
+        """The value with the samples that are left, and the State at the last of them."""
+        x, value = carry
+        done = self.steps * self.m
+        left = range(done, self.samples)
+        u = [[v[k] for v in jax.tree.leaves(self.inputs)] for k in left]
+        now = [jax.tree.map(lambda v, k=k: v[k], self.data) for k in left]
+        value = self._reduced(x, value, u, now)
+        x, discrete = list(x), self.discrete.in_scalars()
+        for j in range(len(left) - 1):
+            x = advance(discrete, x, u[j])
+        end = jax.tree.unflatten(self.structure, x)
+        inputs = jax.tree.unflatten(jax.tree.structure(self.inputs), u[-1])
+        return value, _plus(end, self.block.of_next, inputs)
+
+    def _reduced(self, x: list[Array], value: Any, u: list[list[Array]], now: list[Any]) -> Any:
+        """The value after all samples of which the data are given, from the states at the first."""
+        for j, data in enumerate(now):
+            value = self.reducing.update(value, self._outputs(x, u, j), data)
+        return value
+
+    def _outputs(self, x: list[Array], u: list[list[Array]], j: int) -> Any:
+        """The outputs of the j-th sample of a block that begins at x with the inputs u[0..j]."""
+        model, block = self.reducing.model, self.block
+        # The first sample by the model itself: nothing is gained there by the recurrence.
+        if j == 0:
+            now = jax.tree.unflatten(jax.tree.structure(self.inputs), u[0])
+            state = _plus(jax.tree.unflatten(self.structure, x), block.of_next, now)
+            return model.output(self.reducing.params, state, now)
+        # y[j] = C A^j x + the inputs of this sample and of those before it in the block.
+        outputs = {}
+        for i, name in enumerate(naming.names(model.Outputs)):
+            forced = [
+                (c, v)
+                for back in range(j + 1)
+                for c, v in zip(block.forced[back][i], u[j - back], strict=True)
+            ]
+            outputs[name] = _sum([*forced, *zip(block.free[j - 1][i], x, strict=True)])
+        return model.Outputs(**outputs)
+
+
+def blocks(
+    reducing: Reducing, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
+) -> Blocks:
+    """A run in steps of m samples."""
+    block, discrete = _block_of(reducing.model, args, m)
+    x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
+    carry = jax.tree.leaves(x0), start
+    structure = jax.tree.structure(x0)
+    return Blocks(reducing, m, block, discrete, args.inputs, data, carry, structure)
+
+
+def of_whole_run(
+    reducing: Reducing, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
+) -> tuple[Any, Any]:
+    """The value of a run and its last State, by XLA; arguments as `blocks` has them."""
+    # Unrolled over the m samples, and a loop over the blocks: a block is a few hundred operations,
+    # all of them on vectors over the batch.
+    run = blocks(reducing, args, m, x0, start, data)
+
+    def step(carry: PyTree, slices: tuple[list[Array], PyTree]) -> tuple[PyTree, None]:
+        rows, now = slices
+        u = [[v[j] for v in rows] for j in range(m)]
+        return run.over(carry, u, [jax.tree.map(lambda v, j=j: v[j], now) for j in range(m)]), None
+
+    def cut(v: Array) -> Array:
+        return v[: run.steps * m].reshape(run.steps, m, *v.shape[1:])
+
+    slices = jax.tree.map(cut, (jax.tree.leaves(args.inputs), data))
+    carry, _ = jax.lax.scan(step, run.carry, slices)
+    return run.last(carry)
+
+
+def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record:
+    """A State plus (or minus) a matrix, row by row in scalars, times the inputs; None adds none."""
+    if rows is None:
+        return state
+    u = jax.tree.leaves(inputs)
+    new = [x + sign * dot(row, u) for x, row in zip(jax.tree.leaves(state), rows, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(state), new)
+
+
+def _sum(terms: list[tuple[Array, Array]]) -> Array:
+    """Of products, from the first to the last."""
+    total = terms[0][0] * terms[0][1]
+    for a, b in terms[1:]:
+        total = total + a * b
+    return total

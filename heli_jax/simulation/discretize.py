@@ -12,7 +12,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.numerics.matrix_exponential import expm, van_loan
-from heli_jax.simulation.delays import Delays
+from heli_jax.simulation.hold import Delays
 
 
 class Discrete(NamedTuple):
@@ -43,13 +43,10 @@ def discretize(
     """The exact equivalent of a linear model for steps of `dt` [s], in matrices.
 
     Args:
-        model: linear, with n states and m inputs.
-        params: the model's Params, SI.
         dt: [s].
         delays: how late the inputs are; whole samples are left to who reads the arrays. With
             `late` [s] the part of each interval before the delayed sample u[k] acts, under a
             zero-order hold x[k+1] = Ad x[k] + (G(dt) - G(dt-late)) u[k-1] + G(dt-late) u[k].
-        linear: of each input whether it is linear between samples; () holds all.
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
@@ -98,7 +95,6 @@ def _late(
     Args:
         whole: what they would add over the whole sample at once.
         after: over what is left of it when the sample u[k] arrives.
-        late: the part of the sample before that.
         linear: of each whether it is linear between samples; () holds all.
     """
     # What is added before, at the end of the sample: all of it less what is added after. A ramp
@@ -124,8 +120,6 @@ def process_noise(model: Model, params: Record, dt: Number) -> Float[Array, "n n
     """Covariance of the noise that a linear model's white-noise drive adds in one step.
 
     Args:
-        model: linear, with n states.
-        params: the model's Params, SI.
         dt: [s].
     """
     A = jacobians(model, params).A

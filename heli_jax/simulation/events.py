@@ -34,14 +34,7 @@ def rotor_speed(lowest: Scalar, highest: Scalar) -> Event:
 def any_over(
     events: Mapping[str, Event], params: Record, state: Record, inputs: Record
 ) -> Bool[Array, ""]:
-    """Whether one of the events has come.
-
-    Args:
-        events: by name.
-        params: the model's Params, SI.
-        state: the model's State.
-        inputs: the model's Inputs that act.
-    """
+    """Whether one of the events has come."""
     return jnp.any(jnp.stack([event(params, state, inputs) <= 0 for event in events.values()]))
 
 
@@ -57,9 +50,6 @@ def stopped(
     """The states (N,) with the moment of the first event in place of all that follow it.
 
     Args:
-        model: of which the rates count.
-        params: the model's Params, SI.
-        events: by name, one or more.
         times: of the samples [s], (N,).
         states: the model's State, arrays (N,), constant from the first sample past an event.
         inputs: the model's Inputs that acted, arrays (N,).
@@ -143,14 +133,7 @@ class _Interval(NamedTuple):
     # no step of a solver has to be made again.
     def state(self, s: Array) -> Record:
         def cubic(a: Array, b: Array, da: Array, db: Array) -> Array:
-            """Between two values with their slopes.
-
-            Args:
-                a: at the begin.
-                b: at the end.
-                da: slope at the begin, per second.
-                db: slope at the end.
-            """
+            """Between two values with their slopes."""
             rest = 1.0 - s
             ends = rest**2 * (1.0 + 2.0 * s) * a + s**2 * (3.0 - 2.0 * s) * b
             return ends + self.h * s * rest * (rest * da - s * db)

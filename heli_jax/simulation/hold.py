@@ -3,6 +3,10 @@ mixed, which stays until it jumps and follows straight lines elsewhere.
 
 A stick that is commanded in steps stays; one that was sampled while it moved does not. To hold such
 an input delays it by half a sample on average.
+
+An input may be late, by one delay of all and one of its own. A delay is whole samples, by which an
+array is read further back, and the rest of a sample, which divides every sample interval in two:
+before and after the sample that falls into it.
 """
 
 import dataclasses
@@ -11,8 +15,10 @@ import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from heli_jax import naming
@@ -20,7 +26,90 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import nearest
 from heli_jax.naming import Number, Record
 from heli_jax.numerics.jumps import split
-from heli_jax.simulation.delays import Delays, at
+
+
+class Delays(eqx.Module):
+    """Delays of the inputs in samples; inputs that are equally late share a group."""
+
+    groups: tuple[int | None, ...] = eqx.field(static=True)
+    """by input, in the order of its fields; None where an input acts at once"""
+    whole: tuple[Array | int, ...]
+    """by group, an integer"""
+    rest: tuple[Array | float, ...]
+    """by group, the fraction of a sample in [0, 1) beside it"""
+
+    def group(self, i: int) -> int | None:
+        """The group of the i-th input; what comes behind the inputs (noise) is never late."""
+        return self.groups[i] if i < len(self.groups) else None
+
+    def members(self, group: int | None) -> tuple[int, ...]:
+        """Which inputs belong to a group."""
+        return tuple(i for i, g in enumerate(self.groups) if g == group)
+
+
+def delays_of(
+    model: Model, params: Record, common: "Number | Delays | None", dt: Number
+) -> Delays | None:
+    """The delays of a model's inputs; None where none is late.
+
+    Args:
+        model: whose `delays` name the parameters that are delays of single inputs [s].
+        common: None, or the delay of all inputs beside their own [s]; Delays are taken as they
+            are, and a model's own are no longer added.
+        dt: sample time [s].
+    """
+    if isinstance(common, Delays):
+        return common
+    # None and not zeros: without a delay the program has no second part in each interval.
+    if common is None and not model.delays:
+        return None
+    own = dict(model.delays)
+    # One group a parameter: inputs that share it are late together, and cost no part more.
+    keys = [own.get(name) for name in naming.names(model.Inputs)]
+    distinct = list(dict.fromkeys(k for k in keys if k is not None or common is not None))
+    whole, rest = [], []
+    for key in distinct:
+        seconds = 0.0 if common is None else jnp.asarray(common)
+        if key is not None:
+            seconds = seconds + jnp.asarray(getattr(params, key))
+        # Both delays of an input add before they are divided: two fractions of a sample may make a
+        # whole one.
+        samples = jnp.asarray(seconds) / dt
+        # The whole part has no derivative; the rest has that of the delay.
+        floor = jnp.floor(jax.lax.stop_gradient(samples))
+        whole.append(floor.astype(int))
+        rest.append(samples - floor)
+    # Which inputs are late is known when the program is made, by how much is not: a fit moves
+    # delays without compiling anew.
+    groups = tuple(distinct.index(k) if k in distinct else None for k in keys)
+    return Delays(groups, tuple(whole), tuple(rest))
+
+
+def at(
+    inputs: PyTree,
+    k: Int[Array, "..."] | Int[np.ndarray, "..."] | int,
+    delays: Delays | None = None,
+) -> PyTree:
+    """The inputs of sample k; before the first the first, after the last the last.
+
+    Args:
+        delays: where given, each input is read its whole samples before k.
+    """
+
+    def pick(u: Any, k: Any) -> Any:
+        # Clipped on purpose and in sight: JAX would clip an index past the end, and wrap one below
+        # zero.
+        return u[jnp.clip(k, 0, u.shape[0] - 1)]
+
+    if delays is None:
+        return jax.tree.map(lambda u: pick(u, k), inputs)
+    leaves, structure = jax.tree.flatten(inputs)
+    picked = []
+    for i, u in enumerate(leaves):
+        group = delays.group(i)
+        picked.append(pick(u, k if group is None else k - delays.whole[group]))
+    return jax.tree.unflatten(structure, picked)
+
 
 HOLDS = ("zero-order", "linear", "mixed")
 """The names of what an input may do between samples."""
@@ -57,10 +146,7 @@ def between_samples(
     linear. What takes inputs of either hold takes a mixed one as two.
 
     Args:
-        model: of which the names of the inputs count.
         flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
-        inputs: the model's Inputs, arrays (N,).
-        hold: as `simulate` takes it.
 
     Raises:
         ValueError: an unknown name of an input or of a hold.
@@ -137,13 +223,7 @@ def check_hold(value: PyTree, where: str = "hold") -> None:
 
 
 def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs at the end of the interval from sample k on, before any of them jumps.
-
-    Args:
-        inputs: arrays (N,).
-        k: the sample.
-        linear: of each input whether it moves between samples; () holds all.
-    """
+    """The inputs at the end of the interval from sample k on, before any of them jumps."""
     held = at(inputs, k)
     return _chosen(linear, at(inputs, k + 1), held) if linear else held
 
@@ -169,11 +249,9 @@ def segments(
     """The parts of the interval from sample k (an integer or a whole array of them) to the next.
 
     Args:
-        inputs: arrays (N,).
         dt: [s].
         delays: None, or how late the inputs are: the interval then has a part more for each group
             of them, divided where its sample falls into it.
-        linear: of each input whether it moves between samples; () holds all.
     """
     linear = linear or (False,) * len(jax.tree.leaves(inputs))
     if delays is None:
@@ -250,14 +328,7 @@ def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) 
 def delayed(
     inputs: Record, delays: Delays, k: Int[Array, "..."] | int, linear: tuple[bool, ...]
 ) -> Record:
-    """The inputs that act at sample k (an integer or an array of them) when they are late.
-
-    Args:
-        inputs: a pytree of arrays (N,).
-        delays: how late each of them is.
-        k: the samples.
-        linear: of each input whether it moves between samples; () holds all.
-    """
+    """The inputs that act at sample k (an integer or an array of them) when they are late."""
     before, now = at(inputs, k - 1, delays), at(inputs, k, delays)
     acting = []
     leaves = zip(jax.tree.leaves(before), jax.tree.leaves(now), strict=True)

@@ -1,7 +1,5 @@
 """Stick inputs to excite a machine with; each function gives (N,) samples of unit amplitude."""
 
-import warnings
-
 import numpy as np
 
 
@@ -11,9 +9,7 @@ def random_steps(
     """Pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold` [s].
 
     Args:
-        n: samples.
         dt: [s].
-        rng: where levels and times come from.
         hold: the shortest and the longest time [s].
     """
     # Uneven times, since steps at a fixed interval leave gaps in the spectrum.
@@ -32,9 +28,7 @@ def multistep_3211(
     """3-2-1-1 steps, in either direction, with neutral between.
 
     Args:
-        n: samples.
         dt: [s].
-        rng: which decides on the direction of each.
         unit: length of the shortest step [s].
         pause: of neutral between two of them [s].
     """
@@ -56,7 +50,6 @@ def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
     """A sine whose frequency rises exponentially over the record.
 
     Args:
-        n: samples.
         dt: [s].
         low: first frequency [Hz].
         high: last frequency [Hz].
@@ -66,16 +59,3 @@ def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
     t = np.arange(n) * dt
     growth = np.log(high / low) / max(t[-1], dt)
     return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
-
-
-def sweep(n: int, dt: float, low: float, high: float) -> np.ndarray:
-    """Deprecated: the name that `chirp` had.
-
-    Args:
-        n: as all others those of `chirp`.
-        dt: [s].
-        low: [Hz].
-        high: [Hz].
-    """
-    warnings.warn("sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
-    return chirp(n, dt, low, high)

@@ -1,32 +1,42 @@
-"""simulate: a model, its parameters and inputs in; the trajectory out."""
+"""simulate: a model, its parameters and inputs in; the trajectory out.
+
+Feedback, events and process noise are solvers around the one of a sample: each does one thing at a
+sample and leaves the step to the solver within. Process noise is drawn once a sample, with the
+covariance that a sample adds.
+"""
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
+from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model
-from heli_jax.naming import Number, Record
+from heli_jax.naming import Number, Record, Scalar
+from heli_jax.numerics.matrix_exponential import van_loan
 from heli_jax.simulation.blocks import blockwise
-from heli_jax.simulation.delays import Delays, at
+from heli_jax.simulation.discretize import Discrete, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
-from heli_jax.simulation.hold import FlightOrInputs, between_samples, delayed
+from heli_jax.simulation.hold import Delays, FlightOrInputs, at, at_end, between_samples, delayed
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
-from heli_jax.simulation.process_noise import with_process_noise
 from heli_jax.simulation.solvers import (
     Adaptive,
     Exact,
+    SolverWrapper,
+    Stepped,
+    Time,
     ZeroOrderHoldArgs,
+    sample_index,
 )
 from heli_jax.simulation.stepping import check_countable, held_inputs, per_sample, start_state
 from heli_jax.simulation.trajectory import Trajectory
-from heli_jax.simulation.wrappers import StateFeedback, Stopping
 
 _LONGEST_STEP = 0.005
 """of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
@@ -62,9 +72,7 @@ def simulate(
 
     Args:
         model: of one machine; `jax.vmap` over the other arguments simulates many.
-        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        options: how; all defaults unless given.
         **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,
             `initial_state`, `delay`, `key`, `hold`, ...
 
@@ -229,3 +237,154 @@ def _stepwise(
         throw=False,  # one run of a batch that fails must not end the others
     )
     return sol.ys, sol.result
+
+
+def with_process_noise(
+    model: Model,
+    args: ZeroOrderHoldArgs,
+    method: dfx.AbstractSolver,
+    options: SimulationOptions,
+    linear: tuple[bool, ...],
+) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs]:
+    """Standard normal numbers as further inputs, multiplied by a root of the process noise.
+
+    Raises:
+        ValueError: the model has no noise, or the options a delay.
+    """
+    assert options.key is not None
+    if model.noise_intensity is None:
+        raise ValueError(
+            f"key: expected a model with process noise, as with_disturbance makes one, got "
+            f"{model.name!r}"
+        )
+    # A delay of all inputs is for records: nothing is drawn for them.
+    if options.delay is not None:
+        raise ValueError(
+            "key: expected a run without a delay to draw noise for, got one with delay"
+        )
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
+    dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
+    # Drawn for all samples at once: the same key gives the same record, whatever the solver does.
+    if not isinstance(method, Exact) or args.discrete is None:
+        feedback = method.feedback if isinstance(method, StateFeedback) else None
+        draws = jax.random.normal(options.key, (n, states), dtype)
+        acting = args.inputs
+        if args.delays is not None:
+            # The model is linearised about the inputs as they act, which are read from here.
+            acting = delayed(args.inputs, args.delays, jnp.arange(n), linear)
+        args = args._replace(inputs=(args.inputs, acting, tuple(draws.T)))
+        return WithProcessNoise(
+            method, functools.partial(add_process_noise, model, args, feedback)
+        ), args
+    # The recurrence of a linear model takes draws as it takes inputs: L beside Bd, no step more.
+    L = square_root(process_noise(model, args.params, options.dt))
+    draws = jax.random.normal(options.key, (n, L.shape[0]), L.dtype)
+    # The draws are no inputs: nothing of them comes late or from the next sample.
+    none, discrete = jnp.zeros_like(L), args.discrete
+    discrete = Discrete(
+        discrete.Ad,
+        jnp.concatenate([discrete.Bd, L], axis=1),
+        None if discrete.Bp is None else jnp.concatenate([discrete.Bp, none], axis=1),
+        None if discrete.Bn is None else jnp.concatenate([discrete.Bn, none], axis=1),
+    )
+    return method, args._replace(inputs=(args.inputs, tuple(draws.T)), discrete=discrete)
+
+
+def add_process_noise(
+    model: Model,
+    args: ZeroOrderHoldArgs,
+    feedback: Callable[..., Any] | None,
+    state: Record,
+    inputs: Record,
+    draws: Sequence[Scalar],
+) -> Record:
+    """The state after a sample with the noise of that sample, of the model linearised there.
+
+    Args:
+        feedback: None, or what makes the acting inputs of the given ones.
+    """
+    params, dt = args.params, args.dt
+    # The linearisation is at the inputs that acted, which the solver within keeps to itself.
+    if feedback is not None:
+        inputs = feedback(state, inputs)
+    x = naming.ravel(state)
+
+    # The model itself filters the drive of a sample: its covariance is not g g^T dt, in which
+    # states without a drive of their own would get none.
+    def rates(x: Array) -> Array:
+        derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
+        return naming.ravel(derivatives, x.dtype, naming.names(model.State))
+
+    assert model.noise_intensity is not None
+    g = naming.ravel(model.noise_intensity(params), x.dtype, naming.names(model.State))
+    L = square_root(van_loan(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
+    return naming.unravel(model.State, x + L @ jnp.stack(draws))
+
+
+# The arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, the state at its
+# begin, and what is known beside it; none of the solvers here keeps a state between steps.
+
+
+class StateFeedback(SolverWrapper):
+    """A per-sample solver whose inputs are a function of the state at the sample.
+
+    feedback(state, given inputs of that sample) gives the inputs that are held.
+    """
+
+    feedback: Callable[..., Any]
+
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """A sample with the inputs that the feedback makes of the state at its begin."""
+        # One sample, index 0, stands for all: `at` takes the last where the index is past the end.
+        u = self.feedback(y0, at(args.inputs, sample_index(t0)))
+        held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
+        return self.solver.stepped(terms, t0, t1, y0, held)
+
+
+class Stopping(SolverWrapper):
+    """A per-sample solver that stays where it is after the first sample at which `over` holds.
+
+    y = (state, going), where going is 1 until then and 0 from there on.
+    """
+
+    # A number and not a truth value for `going`: diffrax takes derivatives of all that it carries.
+    over: Callable[..., Any]
+    linear: tuple[bool, ...] = eqx.field(static=True, default=())
+
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """A sample, or none where the run is over."""
+        # A batch cannot stop for one of its runs, so the step is made and its result not taken.
+        state, going = y0
+        new, result = self.solver.stepped(terms, t0, t1, state, args)
+        new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
+        result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
+        # The inputs at the end of the interval: those held since its begin, or the next ones.
+        ended = self.over(new, at_end(args.inputs, sample_index(t0), self.linear))
+        y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
+        return y1, result
+
+
+class WithProcessNoise(SolverWrapper):
+    """A per-sample solver whose state gets its process noise after every sample.
+
+    The inputs are (the model's, the same as they act, standard normal numbers); add_noise(state,
+    acting inputs, numbers of that sample) gives the new state.
+    """
+
+    add_noise: Callable[..., Any]
+
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """A sample, and the noise that comes in over it."""
+        # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
+        inputs, acting, draws = args.inputs
+        held = args._replace(inputs=inputs)
+        y, result = self.solver.stepped(terms, t0, t1, y0, held)
+        k = sample_index(t0)
+        y1 = self.add_noise(y, at(acting, k), at(draws, k))
+        return y1, result

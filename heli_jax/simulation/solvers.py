@@ -5,6 +5,7 @@ error of first order. Here the input of an interval is picked once and held whil
 one that is linear between samples is followed along its line by every stage.
 """
 
+import abc
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,9 +18,8 @@ from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from heli_jax.errors import nearest
 from heli_jax.naming import Record, Scalar
-from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import delayed, segments
+from heli_jax.simulation.hold import Delays, at, delayed, segments
 
 type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
 """as diffrax takes it, which has no NumPy scalars among its types"""
@@ -46,13 +46,7 @@ class ZeroOrderHoldArgs(NamedTuple):
 
 
 def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bool, ...]) -> Record:
-    """The inputs as they act at sample k.
-
-    Args:
-        args: with the model's inputs, nothing beside them.
-        k: the sample.
-        linear: of each input whether it is linear between samples; () holds all.
-    """
+    """The inputs as they act at sample k."""
     if args.delays is None:
         return at(args.inputs, k)
     return delayed(args.inputs, args.delays, k, linear)
@@ -91,6 +85,9 @@ def sample_index(t: Time) -> Int[Array, ""]:
 # the begin of a step within it.
 
 
+type Stepped = tuple[PyTree, dfx.RESULTS]
+
+
 class _Stateless(dfx.AbstractSolver):
     """What all solvers here share: straight lines between samples, nothing kept between steps."""
 
@@ -102,11 +99,32 @@ class _Stateless(dfx.AbstractSolver):
     def init(self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree) -> None:
         return None
 
+    def step(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> Any:
+        """One step, in the five parts that diffrax asks for."""
+        y1, result = self.stepped(terms, t0, t1, y0, args)
+        return y1, None, {"y0": y0, "y1": y1}, None, result
+
+    @abc.abstractmethod
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
+    ) -> Stepped:
+        """The state at t1 and diffrax's result."""
+
 
 class SolverWrapper(_Stateless):
-    """A solver of whole samples around another (see also `heli_jax.simulation.wrappers`)."""
+    """A solver of whole samples around another (see also `heli_jax.simulation.simulate`)."""
 
-    solver: dfx.AbstractSolver
+    solver: Any
+    """one of ours; that of `PerSample` any of diffrax's"""
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
@@ -125,21 +143,10 @@ class Exact(_Stateless):
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: ZeroOrderHoldArgs,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
-        """One sample of the recurrence.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
-        """
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """One sample of the recurrence."""
         assert args.discrete is not None
         # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
         k, late = sample_index(t0), args.delays
@@ -149,7 +156,7 @@ class Exact(_Stateless):
         u = jax.tree.leaves(at(args.inputs, k, late))
         new = advance(args.discrete, jax.tree.leaves(y0), u, before, after)
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
-        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+        return y1, dfx.RESULTS.successful
 
 
 def advance(
@@ -162,9 +169,6 @@ def advance(
     """x[k+1] from x[k] and the inputs.
 
     Args:
-        discrete: the recurrence, in scalars.
-        x: the n states at sample k.
-        u: the m inputs at sample k.
         before: those of the sample before, where the recurrence has a Bp.
         after: those of the next sample, where it has a Bn.
     """
@@ -203,21 +207,10 @@ class RK4(_Stateless):
     def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
-        """One step of the method.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in s.
-        """
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree
+    ) -> Stepped:
+        """One step of the method."""
         h: Any = t1 - t0
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
@@ -233,7 +226,7 @@ class RK4(_Stateless):
         # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
         if self.rolled:
             y1 = self._rolled(f, along, t0, h, y0)
-            return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+            return y1, dfx.RESULTS.successful
         k1 = f(t0, y0)
         k2 = f(t0 + 0.5 * h, along(y0, k1, 0.5 * h))
         k3 = f(t0 + 0.5 * h, along(y0, k2, 0.5 * h))
@@ -241,7 +234,7 @@ class RK4(_Stateless):
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + (h / 6.0) * (a + 2.0 * (b + c) + d), y0, k1, k2, k3, k4
         )
-        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+        return y1, dfx.RESULTS.successful
 
     @staticmethod
     def _rolled(
@@ -281,27 +274,16 @@ class PerSample(SolverWrapper):
             terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
 
-    def step(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: Time,
-        t1: Time,
-        y0: PyTree,
-        args: ZeroOrderHoldArgs,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> Any:
-        """One sample in its parts.
-
-        Args:
-            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
-        """
+    def stepped(
+        self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: ZeroOrderHoldArgs
+    ) -> Stepped:
+        """One sample in its parts."""
         # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
-        return y, None, {"y0": y0, "y1": y}, None, result
+        return y, result
 
     def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""

@@ -16,9 +16,8 @@ from heli_jax.dynamics.check_model import check_params
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import columns
-from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import discretize
-from heli_jax.simulation.hold import FlightOrInputs, delayed
+from heli_jax.simulation.hold import FlightOrInputs, delayed, delays_of
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.solvers import (
     RK4,
@@ -35,7 +34,6 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
     """The model's Inputs as arrays (N,) and the sample time, from a Flight or from Inputs with dt.
 
     Args:
-        model: of which the names of the inputs count.
         flight: a Flight, or Inputs with arrays (N,).
         dt: [s]; that of the Flight unless given.
 
@@ -81,12 +79,6 @@ def start_state(
 ) -> Record:
     """The initial state in the dtype that the parameters and inputs give together.
 
-    Args:
-        model: whose `initial_state` counts unless one is given.
-        params: the model's Params, SI.
-        initial_state: the model's State, or None.
-        inputs: the model's Inputs.
-
     Raises:
         TypeError: `params` are none of the model's.
     """
@@ -104,7 +96,6 @@ def check_countable(samples: int, dtype: Any) -> None:
     """Refuse a run of so many samples that their numbers are not told apart in its precision.
 
     Args:
-        samples: of the run.
         dtype: of its states, in which diffrax counts the samples.
 
     Raises:
@@ -151,11 +142,7 @@ def per_sample(
     """The solver, its arguments and the term for time counted in samples.
 
     Args:
-        model: of one machine.
-        params: the model's Params, SI.
-        inputs: the model's Inputs, arrays (N,).
         options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
-        linear: of each input whether it is linear between samples; () holds all.
     """
     # "exact" and "rk4" have no error estimate to adapt to; a controller alone means Dopri8.
     controller, solver = options.controller, options.solver
@@ -223,12 +210,7 @@ def held_columns(
     """x[k+1] = Ad x[k] + B U[k] for a linear model: Ad, B, U, and the inputs that act at k.
 
     Args:
-        model: linear, with n states and m inputs.
-        params: the model's Params, SI.
-        inputs: the model's Inputs, arrays (N,).
         dt: [s].
-        delay: as in `SimulationOptions`.
-        linear: of each input whether it is linear between samples; () holds all.
     """
     options = SimulationOptions(dt=dt, solver="exact", delay=delay)
     _, args, _ = per_sample(model, params, inputs, options, linear)

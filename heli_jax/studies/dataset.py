@@ -33,10 +33,7 @@ def dataset(
     """The Dataset of a study.
 
     Args:
-        study: what was fitted.
-        names: the directories of its fits.
         fits: by fit what its fit.json or failed.json holds; None where it has not been run.
-        versions: of what computed.
     """
     axes = tuple(study.axes)
     estimates = [_estimates(fit) for fit in fits]
@@ -57,8 +54,8 @@ def dataset(
         values = over_fits(numbers, float, (len(parameters),))
         variables[name] = ((*axes, "parameter"), values, {"long_name": words})
     texts = {
-        "status": [_status(fit) for fit in fits],
-        "verdict": [_verdict(fit) for fit in fits],
+        "status": [NOT_RUN if f is None else str(f.get("status", FAILED)) for f in fits],
+        "verdict": [str(f["verdict"]["text"]) if _is_fit(f) else "" for f in fits],
         "untrusted": [", ".join(f["untrusted"]) if _is_fit(f) else "" for f in fits],
         "adequate": ["" if not _is_fit(f) else ADEQUATE[f["adequate"]] for f in fits],
         "sentence": ["" if fit is None else str(fit.get("sentence", "")) for fit in fits],
@@ -110,16 +107,6 @@ def _coordinate(values: Sequence[Any]) -> np.ndarray:
 
 def _is_fit(fit: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
     return fit is not None and "status" in fit
-
-
-def _status(fit: Mapping[str, Any] | None) -> str:
-    if fit is None:
-        return NOT_RUN
-    return str(fit.get("status", FAILED))
-
-
-def _verdict(fit: Mapping[str, Any] | None) -> str:
-    return str(fit["verdict"]["text"]) if _is_fit(fit) else ""
 
 
 def _estimates(fit: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:

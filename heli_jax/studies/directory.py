@@ -11,7 +11,7 @@ from heli_jax.config.study import Study
 from heli_jax.errors import InputError
 from heli_jax.regular_file import read_regular
 from heli_jax.studies.point import Outcome
-from heli_jax.sweeps.description import differences
+from heli_jax.sweeps import description
 from heli_jax.yaml_file import as_yaml
 
 FITS = "fits"
@@ -26,33 +26,20 @@ _LIMIT_BYTES = 1_000_000_000
 def create(out: Path, study: Study, described: dict[str, Any], versions: dict[str, str]) -> None:
     """A new directory without any fit; it appears whole or not at all.
 
-    Args:
-        out: where.
-        study: what is to be fitted.
-        described: of the study.
-        versions: of what computes.
-
     Raises:
         InputError: it cannot be written to.
     """
-    try:
-        with run_directory.whole(out) as folder:
-            text = as_yaml({**study.content, "study": described["axes"]})
-            place = f"# Relative paths in it begin at {study.path.absolute().parent}.\n"
-            (folder / "study.yaml").write_text(place + text, encoding="utf-8")
-            content = {**described, "versions": versions}
-            (folder / _DESCRIPTION).write_text(json.dumps(content, indent=1), encoding="utf-8")
-            (folder / FITS).mkdir()
-    except OSError as e:
-        raise InputError(f"--out {out}: cannot be written ({e.strerror or e})") from e
+    with run_directory.whole(out) as folder:
+        text = as_yaml({**study.content, "study": described["axes"]})
+        place = f"# Relative paths in it begin at {study.path.absolute().parent}.\n"
+        (folder / "study.yaml").write_text(place + text, encoding="utf-8")
+        content = {**described, "versions": versions}
+        (folder / _DESCRIPTION).write_text(json.dumps(content, indent=1), encoding="utf-8")
+        (folder / FITS).mkdir()
 
 
 def require_same(out: Path, described: dict[str, Any]) -> dict[str, str]:
     """Refuse the directory of another study; returns the versions that it was begun with.
-
-    Args:
-        out: the directory.
-        described: of the study that goes on.
 
     Raises:
         InputError: it is of another, or of none.
@@ -64,13 +51,7 @@ def require_same(out: Path, described: dict[str, Any]) -> dict[str, str]:
         versions = old.pop("versions")
     except (ValueError, KeyError, AttributeError, TypeError) as e:
         raise InputError(f"{where}: {_DESCRIPTION} is not what a study writes ({e})") from e
-    # Through JSON and back, as the stored one went: a tuple is a list there.
-    changes = differences(old, json.loads(json.dumps(described)))
-    if changes:
-        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
-        raise InputError(
-            f"{where}: is of another study: {changes[0]}{more}; expected the same, or another --out"
-        )
+    description.require_same(old, described, f"{where}: is of another study")
     return versions
 
 
@@ -105,9 +86,6 @@ def _word(value: Any) -> str:
 def read_fit(place: Path) -> dict[str, Any] | None:
     """What fit.json or failed.json in a fit's directory holds; None where there is neither.
 
-    Args:
-        place: the directory.
-
     Raises:
         InputError: it cannot be read.
     """
@@ -125,32 +103,18 @@ def read_fit(place: Path) -> dict[str, Any] | None:
     return None
 
 
-def is_done(place: Path) -> bool:
-    """Whether there is a fit in its directory."""
-    return (place / "fit.json").is_file()
-
-
 def write_fit(place: Path, outcome: Outcome) -> None:
     """Write a fit's directory, in place of that of one that failed.
-
-    Args:
-        place: the directory.
-        outcome: of the fit.
 
     Raises:
         InputError: it cannot be written.
     """
-    try:
-        shutil.rmtree(place, ignore_errors=True)
-        with run_directory.whole(place) as folder:
-            for name, data in outcome.files.items():
-                file = folder / name
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_bytes(data)
-    except OSError as e:
-        raise InputError(
-            f"{place}: cannot be written ({e.strerror or e}); what is finished is kept"
-        ) from e
+    shutil.rmtree(place, ignore_errors=True)
+    with run_directory.whole(place) as folder:
+        for name, data in outcome.files.items():
+            file = folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(data)
 
 
 def remove_remains(out: Path) -> None:

@@ -44,11 +44,7 @@ class Outcome(NamedTuple):
 
 
 def fit_point(task: Task) -> Outcome:
-    """Fit one point of a study. Whatever goes wrong is in the outcome: it costs no other fit.
-
-    Args:
-        task: what to fit.
-    """
+    """Fit one point of a study. Whatever goes wrong is in the outcome: it costs no other fit."""
     try:
         return _fitted(task)
     except InputError as e:
@@ -61,13 +57,7 @@ def fit_point(task: Task) -> Outcome:
 
 
 def failure(sentence: str, task: Task, trace: str = "") -> Outcome:
-    """The outcome of a fit that there is not.
-
-    Args:
-        sentence: why.
-        task: what was to be fitted.
-        trace: the traceback where it is a fault of the program.
-    """
+    """The outcome of a fit that there is not."""
     content = {"sentence": sentence, "point": task.point} | ({"traceback": trace} if trace else {})
     text = json.dumps(content, indent=1)
     return Outcome({"failed.json": text.encode()}, sentence)

@@ -7,13 +7,13 @@ them, and its pools end as a whole where one process dies.
 import contextlib
 import json
 import os
-import queue
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -84,98 +84,57 @@ class _Process:
 
 
 class _Pool:
-    """Threads of this process, each with a worker of its own."""
+    """Workers of this process, one a thread."""
 
-    def __init__(self, tasks: Sequence[Task], cache: str) -> None:
-        self.cache, self.over = cache, threading.Event()
-        self.todo: queue.SimpleQueue[tuple[int, Task]] = queue.SimpleQueue()
-        for item in enumerate(tasks):
-            self.todo.put(item)
-        # Any: an error of ours, which is raised where the outcomes are taken.
-        self.done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    def __init__(self, cache: str) -> None:
+        self.cache, self.over = cache, False
+        self.own = threading.local()
         self.processes: set[_Process] = set()
         self.lock = threading.Lock()
 
-    def work(self) -> None:
-        """Have one task after the other computed, until there is none."""
-        worker: _Process | None = None
-        try:
-            while not self.over.is_set():
-                try:
-                    number, task = self.todo.get_nowait()
-                except queue.Empty:
-                    return
-                worker, outcome = self._attempt(worker, task)
-                self.done.put((number, outcome))
-        except Exception as e:
-            self.done.put(e)
-        finally:
-            self._end(worker)
-
-    def _attempt(self, worker: _Process | None, task: Task) -> tuple[_Process | None, Outcome]:
+    def fit(self, task: Task) -> Outcome:
+        """The outcome of a task by the worker of the thread that calls it."""
         words = ""
         for _ in range(_ATTEMPTS):
-            worker = worker or self._started()
-            outcome = worker.run(task)
+            process = getattr(self.own, "process", None) or self._started()
+            outcome = process.run(task)
             if outcome is not None:
-                return worker, outcome
-            words = "" if self.over.is_set() else worker.last_words()
-            self._end(worker)
-            worker = None
-            if self.over.is_set():
+                return outcome
+            words = "" if self.over else process.last_words()
+            self.own.process = None
+            with self.lock:
+                self.processes.discard(process)
+            process.end()
+            if self.over:
                 break
-        return None, failure(f"the process that fitted it ended {words}", task)
+        return failure(f"the process that fitted it ended {words}", task)
 
     def _started(self) -> _Process:
         with self.lock:
-            worker = _Process(self.cache)
-            self.processes.add(worker)
+            self.own.process = process = _Process(self.cache)
+            self.processes.add(process)
             # Begun as the others were being ended.
-            if self.over.is_set():
-                worker.process.kill()
-        return worker
-
-    def _end(self, worker: _Process | None) -> None:
-        if worker is not None:
-            worker.end()
-            with self.lock:
-                self.processes.discard(worker)
+            if self.over:
+                process.process.kill()
+        return process
 
     def end(self) -> None:
-        """End all processes."""
-        self.over.set()
+        """End all processes, whatever they are doing."""
+        self.over = True
         with self.lock:
-            for worker in self.processes:
-                worker.process.kill()
+            for process in self.processes:
+                process.end()
 
 
 def computed(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Outcome]]:
-    """The fits as they are done, in any order.
-
-    Args:
-        tasks: what to fit.
-        workers: processes.
-
-    Yields:
-        The place of a task in `tasks`, and its outcome.
-    """
+    """Fit tasks by so many processes; yields the place of each and its outcome, as it is done."""
     with contextlib.ExitStack() as stack:
-        pool = _Pool(tasks, _cache(stack))
-        threads = [threading.Thread(target=pool.work, daemon=True) for _ in range(workers)]
-        stack.callback(_join, threads)
+        pool, threads = _Pool(_cache(stack)), ThreadPoolExecutor(workers)
+        stack.callback(threads.shutdown, cancel_futures=True)
         stack.callback(pool.end)
-        for thread in threads:
-            thread.start()
-        for _ in tasks:
-            done = pool.done.get()
-            if isinstance(done, Exception):
-                raise done
-            yield done
-
-
-def _join(threads: Sequence[threading.Thread]) -> None:
-    for thread in threads:
-        thread.join()
+        places = {threads.submit(pool.fit, task): k for k, task in enumerate(tasks)}
+        for done in as_completed(places):
+            yield places[done], done.result()
 
 
 def _cache(stack: contextlib.ExitStack) -> str:

@@ -1,16 +1,14 @@
 """run_study: many fits of one configuration, each written when it is done."""
 
-import math
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import xarray as xr
 
-from heli_jax import run_directory
+from heli_jax import run_directory, stages
 from heli_jax.config.experiment import from_content
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
@@ -20,9 +18,9 @@ from heli_jax.stages import Note
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
 from heli_jax.studies.point import Outcome, Task, failure, fit_point
-from heli_jax.sweeps.run import Progress
-from heli_jax.sweeps.store import only_writer, writable
-from heli_jax.versions import versions
+from heli_jax.sweeps.run import Pace, Progress
+from heli_jax.sweeps.store import only_writer
+from heli_jax.versions import changed_since, versions
 
 STORE = "study.zarr"
 
@@ -83,46 +81,33 @@ def run_study(
 def run(study: Study, out: Path, options: Options) -> xr.Dataset:
     """Carry out a study.
 
-    Args:
-        study: what is to be fitted.
-        out: its directory.
-        options: how.
-
     Raises:
         InputError: as `run_study`.
     """
     if options.workers is not None and options.workers < 1:
         raise InputError(f"workers: expected at least 1, got {options.workers}")
-    # An empty directory counts as none, as for a sweep: a job on a cluster is started and restarted
-    # by the same command.
-    empty = out.is_dir() and not any(out.iterdir())
-    new = not (options.resume and out.exists() and not empty)
-    if new and not (options.resume and empty):
-        run_directory.require_free(out, ", or --resume")
+    new = run_directory.is_new(out, options.resume)
     described = study.described()
     tasks = _tasks(study, options.reports)
     if new:
         directory.create(out, study, described, versions())
-    if not writable(out):
-        raise InputError(f"--out {out}: expected a directory that can be written to")
+    run_directory.require_writable(out)
     begun_with = directory.require_same(out, described)
     with only_writer(out, f"--out {out}"):
         directory.remove_remains(out)
-        _say_changes(begun_with, options.say)
+        if changed := changed_since(begun_with):
+            options.say(Note(changed))
         names = directory.names(study)
         places = [out / directory.FITS / name for name in names]
-        _compute(tasks, places, options)
+        with stages.stage("study", total=len(tasks)):
+            _compute(tasks, places, options)
         result = dataset(study, names, [directory.read_fit(p) for p in places], begun_with)
         _write(out, result)
     return result
 
 
 def _tasks(study: Study, reports: bool) -> list[Task]:
-    """What workers are told; a value that the configuration cannot have is refused now.
-
-    Raises:
-        InputError: it names the point.
-    """
+    """What workers are told; a value that the configuration cannot have is refused now."""
     tasks = []
     path = str(study.path.absolute())
     for point in study.points():
@@ -135,19 +120,12 @@ def _tasks(study: Study, reports: bool) -> list[Task]:
     return tasks
 
 
-def _say_changes(old: Mapping[str, str], say: Callable[[str], None]) -> None:
-    changed = [f"{n} {old[n]} then, {v} now" for n, v in versions().items() if old.get(n, v) != v]
-    if changed:
-        say(Note(f"begun with other versions ({', '.join(changed)}): numbers may differ"))
-
-
 def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) -> None:
     """Fit what is not there yet, and write each fit as it is done."""
-    todo = [k for k, place in enumerate(places) if not directory.is_done(place)]
+    todo = [k for k, place in enumerate(places) if not (place / "fit.json").is_file()]
     if not todo:
         return
-    done = len(tasks) - len(todo)
-    first: tuple[float, int] | None = None
+    done, pace = len(tasks) - len(todo), Pace(len(tasks), options.progress)
     said: set[str] = set()
     for number, outcome in _outcomes([tasks[k] for k in todo], options):
         place = places[todo[number]]
@@ -160,14 +138,7 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
         if outcome.sentence is not None:
             options.say(Note(f"{place.name}: no fit: {outcome.sentence}"))
         done += 1
-        # The first waited for imports and the compiler: counted, it would make what is left look
-        # longer than it is.
-        rate = math.nan
-        if first is None:
-            first = time.perf_counter(), done
-        else:
-            rate = (done - first[1]) / max(time.perf_counter() - first[0], 1e-9)
-        options.progress(Progress(done, len(tasks), rate, (len(tasks) - done) / rate))
+        pace(done)
 
 
 def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Outcome]]:
@@ -187,9 +158,6 @@ def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Ou
 def _write(out: Path, result: xr.Dataset) -> None:
     """The Dataset in a Zarr store, in place of an earlier one."""
     target = out / STORE
-    try:
-        with run_directory.whole(target) as folder:
-            result.to_zarr(folder, mode="w", consolidated=False, zarr_format=3)
-            shutil.rmtree(target, ignore_errors=True)
-    except OSError as e:
-        raise InputError(f"--out {out}: {STORE} cannot be written ({e.strerror or e})") from e
+    with run_directory.whole(target) as folder:
+        result.to_zarr(folder, mode="w", consolidated=False, zarr_format=3)
+        shutil.rmtree(target, ignore_errors=True)

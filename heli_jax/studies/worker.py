@@ -22,12 +22,7 @@ SCRATCH = "HELI_JAX_STUDY_SCRATCH"
 
 
 def write_outcome(stream: IO[bytes], outcome: Outcome) -> None:
-    """Write an outcome so that `read_outcome` reads it.
-
-    Args:
-        stream: where to.
-        outcome: of a fit.
-    """
+    """Write an outcome so that `read_outcome` reads it."""
     sizes = {name: len(data) for name, data in outcome.files.items()}
     content = {"sentence": outcome.sentence, "files": sizes, "notes": outcome.notes}
     head = json.dumps(content)
@@ -38,11 +33,7 @@ def write_outcome(stream: IO[bytes], outcome: Outcome) -> None:
 
 
 def read_outcome(stream: IO[bytes]) -> Outcome | None:
-    """The next outcome; None where the other process has ended.
-
-    Args:
-        stream: of a worker.
-    """
+    """The next outcome; None where the other process has ended."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None

@@ -5,12 +5,12 @@ run; `sweep` computes chunks of elements and writes each when it is done.
 """
 
 import importlib
-import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from heli_jax.sweeps.axes import Range as Range
+    from heli_jax.sweeps.datasets import as_grid as as_grid
     from heli_jax.sweeps.design import Design as Design
+    from heli_jax.sweeps.design import Range as Range
     from heli_jax.sweeps.design import grid as grid
     from heli_jax.sweeps.design import lhs as lhs
     from heli_jax.sweeps.design import paired as paired
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from heli_jax.sweeps.design import sobol as sobol
     from heli_jax.sweeps.design import table as table
     from heli_jax.sweeps.design import zipped as zipped
-    from heli_jax.sweeps.gridded import as_grid as as_grid
     from heli_jax.sweeps.reducers import Reduce as Reduce
     from heli_jax.sweeps.reducers import Streaming as Streaming
     from heli_jax.sweeps.run import sweep as sweep
@@ -28,32 +27,18 @@ if TYPE_CHECKING:
 # Loaded when they are first used: the store's libraries take a second that other commands spare.
 _HOMES = {
     **dict.fromkeys(
-        ("Design", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),
+        ("Design", "Range", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),
         "design",
     ),
     **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
     **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
-    "Range": "axes",
-    "as_grid": "gridded",
+    "as_grid": "datasets",
     "sweep": "run",
 }
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-# Names of before, and what they are called now.
-_OLD = {"Between": "Range", "listed": "paired"}
-
-
 def __getattr__(name: str) -> Any:
-    # Not in __all__, so that only those who ask for an old name are warned.
-    if name in _OLD:
-        new = _OLD[name]
-        warnings.warn(
-            f"heli_jax.sweeps.{name} is deprecated, expected {new}",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        name = new
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax.sweeps' has no attribute {name!r}")
     return getattr(importlib.import_module(f"heli_jax.sweeps.{_HOMES[name]}"), name)

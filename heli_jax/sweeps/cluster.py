@@ -176,11 +176,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _answering() -> Iterator[None]:
-    """What dask says of lost schedulers and of workers that cannot compute, as a sentence.
-
-    Raises:
-        InputError: the scheduler or too many workers are gone, or one's own modules are not there.
-    """
+    """What dask says of lost schedulers and of workers that cannot compute, as a sentence."""
     try:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
@@ -230,7 +226,6 @@ def _check_versions(client: Client, where: str) -> None:
 def split_there(client: Client, job: Job, **options: Any) -> Split:
     """How a worker would cut the sweep, with `options` of `split_for`: it may have other devices
     than this process."""
-    options.pop("memory", None)  # a file of this machine
     options["shares"] = _threads(client)
     with _answering():
         # Not pure: dask would give the answer that it remembers of an equal job, which may be of
@@ -255,12 +250,6 @@ def computed(
 ) -> Iterable[tuple[int, dict[str, np.ndarray]]]:
     """The chunks as they are done, in any order.
 
-    Args:
-        client: of the scheduler whose workers compute.
-        job: the sweep.
-        split: how it is cut.
-        todo: numbers of the chunks to compute.
-
     Yields:
         The number of a chunk and its variables, arrays (elements of the chunk, ...).
 
@@ -272,24 +261,12 @@ def computed(
     token = uuid.uuid4().hex
     # A task and no scattered data: where its copies die with their workers, dask makes it again.
     shipped = client.submit(_received, job, key=f"job-{token}")
-    threads = _threads(client)
-    waiting = iter(todo)
 
-    def submitted(chunk: int) -> Any:
+    def submit(chunk: int) -> Any:
         key = f"chunk-{chunk}-{token}"
         return client.submit(_chunk, shipped, tuple(split), chunk, token, key=key, retries=_RETRIES)
 
-    first = [submitted(k) for _, k in zip(range(_AHEAD * threads), waiting, strict=False)]
-    running = _gathered(first)
-    for future, result in _as_they_end(client, running):
-        with _answering():
-            chunk, results = result()
-        # Before the chunk is written, or the worker would keep its results for as long.
-        future.release()
-        following = next(waiting, None)
-        if following is not None:
-            running.add(submitted(following))
-        yield chunk, results
+    return _each(client, submit, todo)
 
 
 # Any: dask's futures and as_completed have no types.
@@ -302,10 +279,6 @@ def _gathered(futures: list[Any]) -> Any:
 def _as_they_end(client: Client, running: Any) -> Iterator[tuple[Any, Callable[[], Any]]]:
     """The futures as they end, in any order, each with what gives its result or raises its error;
     more may be added meanwhile.
-
-    Raises:
-        InputError: the scheduler is gone, or has had no worker for long that takes work: tasks
-            would wait for one without end, and nobody would be told.
     """
     seen = looked = time.monotonic()
     while not running.is_empty():
@@ -350,11 +323,6 @@ def mapped[T, R](
 ) -> Iterator[tuple[int, R | None]]:
     """A function of each item as they are done, in any order.
 
-    Args:
-        client: of the scheduler whose workers compute.
-        function: of a module that workers can import.
-        items: its arguments.
-
     Yields:
         The place of an item, and what the function gave; None where workers died over it.
 
@@ -362,27 +330,42 @@ def mapped[T, R](
         InputError: the scheduler or its workers are gone.
     """
     token = uuid.uuid4().hex  # as in `computed`
-    waiting = iter(range(len(items)))
-    places: dict[str, int] = {}
 
-    def submitted(k: int) -> Any:
-        places[f"item-{k}-{token}"] = k
+    def submit(k: int) -> Any:
         return client.submit(function, items[k], key=f"item-{k}-{token}", pure=False)
 
-    at_once = _AHEAD * _threads(client)
-    running = _gathered([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
+    return _each(client, submit, range(len(items)), may_die=True)
+
+
+def _each(
+    client: Client, submit: Callable[[int], Any], numbers: Iterable[int], *, may_die: bool = False
+) -> Iterator[tuple[int, Any]]:
+    """Submit tasks, a few ahead of those that end, and give the result of each by its number; None
+    of a task that workers died over, where such a one `may_die`."""
+    waiting, of = iter(numbers), {}
+
+    def submitted(number: int) -> Any:
+        future = submit(number)
+        of[future.key] = number
+        return future
+
+    ahead = zip(range(_AHEAD * _threads(client)), waiting, strict=False)
+    running = _gathered([submitted(number) for _, number in ahead])
     for future, result in _as_they_end(client, running):
         with _answering():
             try:
-                found = result()
+                value = result()
             # dask counts how many workers died over one task: the others go on.
             except KilledWorker:
-                found = None
+                if not may_die:
+                    raise
+                value = None
+        # Before it is written, or the worker would keep its results for as long.
         future.release()
         following = next(waiting, None)
         if following is not None:
             running.add(submitted(following))
-        yield places.pop(future.key), found
+        yield of.pop(future.key), value
 
 
 def _received(job: Job) -> Job:
@@ -390,13 +373,11 @@ def _received(job: Job) -> Job:
     return job
 
 
-def _chunk(
-    job: Job, split: tuple[int, int], chunk: int, token: str
-) -> tuple[int, dict[str, np.ndarray]]:
+def _chunk(job: Job, split: tuple[int, int], chunk: int, token: str) -> dict[str, np.ndarray]:
     """In a worker process: a chunk, with the program compiled at the first."""
     with _building:
         if token not in _workers:
             _workers.clear()  # of an earlier sweep: its programs would stay in memory
             _workers[token] = Worker(job, Split(*split))
         worker = _workers[token]
-    return chunk, worker.run(chunk)
+    return worker.run(chunk)

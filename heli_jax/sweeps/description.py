@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.regular_file import read_regular
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.axes import digest
+from heli_jax.sweeps.design import digest
 from heli_jax.sweeps.reducers import Reduce
 from heli_jax.sweeps.spec import Job, moving_inputs_of
 
@@ -96,21 +97,28 @@ def _source(function: Callable[..., Any]) -> str:
         return ""
 
 
-def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
-    """The keys in which two descriptions differ, each with what was and what is.
+def require_same(old: Mapping[str, Any], new: Mapping[str, Any], where: str) -> None:
+    """Refuse to go on with what was described otherwise.
 
-    Args:
-        old: of the store.
-        new: of the sweep that would go on with it.
-        above: the keys that lead to these, with a dot behind each.
+    Raises:
+        InputError: naming the first key in which the two differ; `where` begins the sentence.
     """
+    # Through JSON and back, as the stored one went: a tuple is a list there.
+    changes = _differences(old, json.loads(json.dumps(new)))
+    if changes:
+        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
+        raise InputError(f"{where}: {changes[0]}{more}; expected the same, or another --out")
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
+    """The keys in which two descriptions differ, each with what was and what is."""
     changes = []
     for key in {**old, **new}:
         a, b = old.get(key), new.get(key)
         if a == b:
             continue
         if isinstance(a, dict) and isinstance(b, dict):
-            changes += differences(a, b, f"{above}{key}.")
+            changes += _differences(a, b, f"{above}{key}.")
         else:
             changes.append(f"{above}{key} was {_short(a)} and is {_short(b)}")
     return changes

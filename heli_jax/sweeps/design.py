@@ -2,18 +2,131 @@
 
 A design gives its values in slices, so that a sweep of any size takes little memory: a grid and a
 Sobol sequence are computed where they are needed (a Latin hypercube and a table are held whole).
+Values are in SI; a configuration's units are converted before.
 """
 
 import dataclasses
 import functools
+import hashlib
 import math
+import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from heli_jax.sweeps.axes import Columns, Range, axis_values, check_axes, check_range, digest
-from heli_jax.sweeps.sobol_points import MOST, scrambled_sobol
+_MOST_SOBOL = 2**30
+"""points, after which SciPy's sequence would begin again"""
+_engines = threading.Lock()
+Columns = dict[str, np.ndarray]
+
+
+class Range(NamedTuple):
+    """An axis from `lower` to `upper`, in SI, evenly in the value or in its logarithm."""
+
+    lower: float
+    upper: float
+    scale: Literal["linear", "log"] = "linear"
+    n: int | None = None
+    """points, for a grid"""
+
+    def at(self, fraction: np.ndarray) -> np.ndarray:
+        """The value at fractions (k,) of the way, 0 to 1; the ends are exact."""
+        # A weighted mean and no difference: that of two huge ends would overflow.
+        low, high = float(self.lower), float(self.upper)
+        if self.scale == "log":
+            # Both ends are negative or both positive, which was checked; the logarithm is of their
+            # size.
+            sign = math.copysign(1.0, low)
+            values = sign * np.exp(
+                (1.0 - fraction) * math.log(abs(low)) + fraction * math.log(abs(high))
+            )
+        else:
+            values = (1.0 - fraction) * low + fraction * high
+        # exp(log(0.1)) is not 0.1: who asks for an end gets it to the last bit.
+        return np.where(fraction == 0.0, low, np.where(fraction == 1.0, high, values))
+
+
+def digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of named arrays, whatever their order."""
+    sha = hashlib.sha256()
+    # In order of the names, since two dictionaries with the same arrays may have been filled in
+    # another order.
+    for name in sorted(arrays):
+        v = np.ascontiguousarray(arrays[name])
+        # Type and shape too: the bytes of two arrays may be equal where their numbers are not.
+        sha.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
+        sha.update(v.tobytes())
+    return sha.hexdigest()
+
+
+def check_range(name: str, axis: Range) -> None:
+    """Refuse an axis without a beginning below its end.
+
+    Raises:
+        ValueError: naming the axis.
+    """
+    low, high = axis.lower, axis.upper
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(f"axes.{name}: expected finite lower < upper, got {low:g} and {high:g}")
+    if axis.scale not in ("linear", "log"):
+        raise ValueError(f"axes.{name}.scale: expected linear or log, got {axis.scale!r}")
+    if axis.scale == "log" and low * high <= 0:
+        raise ValueError(
+            f"axes.{name}: expected lower and upper of one sign on a log scale, got {low:g} and "
+            f"{high:g}"
+        )
+
+
+def check_axes(axes: Mapping[str, object]) -> None:
+    """Refuse a design without axes.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if not axes:
+        raise ValueError("axes: none given, expected at least one")
+
+
+def axis_values(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray:
+    """The values (k,) of one axis of a grid or a list.
+
+    Raises:
+        ValueError: there is none, or they are no numbers.
+    """
+    if isinstance(axis, Range):
+        check_range(name, axis)
+        if axis.n is None or axis.n < 2:
+            got = "none" if axis.n is None else axis.n
+            raise ValueError(f"axes.{name}.n: expected at least 2 points, got {got}")
+        values = axis.at(np.linspace(0.0, 1.0, axis.n))
+        even = axis.scale == "linear" and (axis.upper - axis.lower) % (axis.n - 1) == 0.0
+        # From 0 to 9 in ten points: 7 and not 6.999999999999999, which as a seed would be 6.
+        return np.round(values) if even and axis.lower == round(axis.lower) else values
+    values = np.asarray(axis)
+    if values.ndim != 1 or values.size == 0:
+        raise ValueError(f"axes.{name}: no values, expected at least one")
+    if values.dtype.kind not in "iuf":
+        raise ValueError(f"axes.{name}: expected numbers, got {values[0]!r:.40}")
+    # Whole numbers stay whole, so that seeds stand as integers in the store.
+    return values if values.dtype.kind in "iu" else values.astype(np.float64)
+
+
+def whole_seeds(values: np.ndarray) -> np.ndarray:
+    """Seeds (k,) as whole numbers.
+
+    Raises:
+        ValueError: one is none.
+    """
+    # Refused and not rounded: 6.999, from a range that was not meant for seeds, would be seed 6.
+    # They reach JAX as uint32, so larger ones would draw what smaller ones do.
+    whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
+    wrong = values[~(whole & (values < 2**32))]
+    if wrong.size:
+        raise ValueError(
+            f"axes.seed: expected whole numbers from 0 to 2^32 - 1, got {wrong[0]:.10g}"
+        )
+    return values.astype(np.int64)
 
 
 @runtime_checkable
@@ -103,8 +216,8 @@ class _Sampled:
             check_range(name, axis)
         if n < 1:
             raise ValueError(f"n must be at least 1, got {n}")
-        if kind == "sobol" and n > MOST:
-            raise ValueError(f"n must be at most {MOST} in a Sobol sequence, got {n}")
+        if kind == "sobol" and n > _MOST_SOBOL:
+            raise ValueError(f"n must be at most {_MOST_SOBOL} in a Sobol sequence, got {n}")
         self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
 
     @property
@@ -127,12 +240,35 @@ class _Sampled:
         if self.kind == "lhs":
             points = self._hypercube[start:stop]
         else:
-            points = scrambled_sobol(len(self.axes), self.seed, start, stop)
+            points = _sobol_points(len(self.axes), self.seed, start, stop)
         return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
 
     def describe(self) -> dict[str, Any]:
         axes = {n: [a.lower, a.upper, a.scale] for n, a in self.axes.items()}
         return {"design": self.kind, "axes": axes, "n": self._n, "seed": self.seed}
+
+
+@functools.lru_cache(maxsize=8)
+def _sobol_engine(axes: int, seed: int) -> Any:
+    import scipy.stats.qmc  # not before it is needed: slow
+
+    return scipy.stats.qmc.Sobol(axes, rng=np.random.default_rng(seed))
+
+
+def _sobol_points(axes: int, seed: int, start: int, stop: int) -> np.ndarray:
+    """Points start to stop (stop - start, axes) of a scrambled sequence in the unit cube."""
+    # One engine goes along with the slices in turn: to come to a point takes as long as to draw all
+    # before it.
+    with _engines:
+        engine = _sobol_engine(axes, seed)
+        if engine.num_generated > start:
+            engine.reset()
+        if start > engine.num_generated:
+            engine.fast_forward(start - engine.num_generated)
+        # SciPy warns of numbers that are no power of two, which is right for a sequence and not for
+        # a slice: the first point alone is 1.
+        first = [engine.random(1)] if start == 0 < stop else []
+        return np.concatenate([*first, engine.random(stop - start - len(first))])
 
 
 @dataclasses.dataclass(frozen=True)

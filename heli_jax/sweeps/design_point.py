@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.accumulate import Steps, accumulated, in_steps
@@ -18,14 +19,115 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.flight_numbers import (
-    FlightNumbers,
-    InitialTrim,
-    Scalars,
-    params_of,
-)
-from heli_jax.sweeps.reducers import Measured, Reduce
-from heli_jax.sweeps.spec import Plan
+from heli_jax.sweeps.reducers import Measured
+from heli_jax.sweeps.spec import Job, Plan
+
+Scalars = dict[str, jax.Array]
+"""numbers () by name"""
+
+# Accelerations [SI] below which a flight is steady. `trim` asks for 1e-10 and tries from several
+# places; an element of a batch has one try, and may end a little above.
+_TRIMMED = 1e-6
+
+
+class FlightNumbers(NamedTuple):
+    """The numbers of a flight and of the vehicle, in the sweep's precision."""
+
+    # Arguments of the compiled part and no constants in it: another flight of the same length, or
+    # another vehicle, needs no new program.
+
+    base: dict[str, Any]
+    """the vehicle's"""
+    dt: Any
+    inputs: Any
+    known: dict[str, Any]
+    measured: dict[str, Measured]
+    """by result, of those that compare with the flight"""
+    pilot: Any
+
+
+def flight_numbers(job: Job, index: int) -> FlightNumbers:
+    """The numbers of one of the job's flights."""
+    # All numbers are cast here, once: a single float64 among them would make JAX compute in
+    # float64.
+    dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
+    inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
+    against = {
+        name: reducers.measured(flight.outputs[str(r.signal)], dtype)
+        for name, r in job.reduce.items()
+        if (s := reducers.streaming(r)) is not None and s.against_flight
+    }
+    return FlightNumbers(
+        {n: np.asarray(v, dtype) for n, v in job.params.items()},
+        np.asarray(flight.dt, dtype),
+        model.Inputs(**inputs),
+        {n: np.asarray(v, dtype) for n, v in flight.known.items()},
+        against,
+        jax.tree.map(lambda v: np.asarray(v, dtype), job.pilot),
+    )
+
+
+class InitialTrim(NamedTuple):
+    """The steady flight that an element begins in."""
+
+    state: Any
+    sticks: Any
+    """the model's Inputs, added to the flight's"""
+    sound: Any
+    """whether there is such a flight"""
+
+
+def params_of(plan: Plan, numbers: FlightNumbers, values: Scalars) -> tuple[Any, Scalars]:
+    """The element's parameters, and the axes that are not among them."""
+    names = naming.names(plan.model.Params)
+    swept = {n: v for n, v in values.items() if n in names}
+    # In this order: what a flight knows of its machine goes before the vehicle's, an axis before
+    # both.
+    params = plan.model.Params(**{**numbers.base, **numbers.known, **swept})
+    return params, {n: v for n, v in values.items() if n not in names}
+
+
+def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
+    """The steady flight of one element.
+
+    Args:
+        plan: what is compiled; its `trimmed` says which flight.
+        numbers: of the flight and the vehicle, SI.
+        values: of the axes, scalars, SI.
+    """
+    assert plan.trimmed is not None
+    whole, dtype = plan.trimmed.of or plan.model, numbers.dt.dtype
+    params, _ = params_of(plan, numbers, values)
+    plain = whole.Params(**{n: getattr(params, n) for n in naming.names(whole.Params)})
+    # In the default precision whatever the sweep's: an iteration in float32 ends at residuals that
+    # are no proof of a steady flight.
+    plain, condition, wind = jax.tree.map(
+        lambda v: jnp.asarray(v, jnp.result_type(float)),
+        (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
+    )
+    # Of the model without a disturbance: a steady flight is one in still air or steady wind.
+    trim = equilibrium(whole, plain, condition, wind)
+    sound = _is_trimmed(trim)
+    # The states of a disturbance have no trim and keep their own beginning.
+    state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
+    share = 1.0 if plan.trimmed.sticks else 0.0
+    sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
+    state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
+    return InitialTrim(state, sticks, sound)
+
+
+def _is_trimmed(trim: Trim) -> jax.Array:
+    """Whether it is a steady flight that the sticks' travel allows."""
+    # `trim` raises where there is none; one of a batch can only be flagged.
+    sound = plausible(trim) & (trim.residual < _TRIMMED)
+    for name, (low, high) in STICKS.items():
+        if not hasattr(trim.inputs, name):
+            continue
+        stick = getattr(trim.inputs, name)
+        # A governor's stick stands at its end, which rounding may pass.
+        sound = sound & (stick >= low - _TRIMMED) & (stick <= high + _TRIMMED)
+    return sound
+
 
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
 """results, trajectories (samples kept,), the last State, and whether each limit was left"""
@@ -68,7 +170,6 @@ def design_point(
     """One element.
 
     Args:
-        plan: what is compiled.
         numbers: of the flight and the vehicle, SI.
         values: of the axes, scalars, SI.
         trim: the steady flight to begin in; None for the model's initial state.
@@ -122,8 +223,6 @@ def of_steps(
 
     Args:
         plan, numbers, values, trim: as `design_point` has them.
-        reduced: the running values after the last sample, the State there, and by name whether a
-            limit was left.
     """
     return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, *reduced))
 
@@ -199,7 +298,7 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
     """What all streaming reducers do at a sample, their values before the first, and the measured
     signals (N,) that they compare with."""
     dtype = numbers.dt.dtype
-    reduce = dict(plan.reduce)
+    signals = {n: r.signal for n, r in plan.reduce}
     streams = {n: s for n, r in plan.reduce if (s := reducers.streaming(r)) is not None}
     start = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), s.start) for n, s in streams.items()}
     data = {n: (m.values, m.seen) for n, m in numbers.measured.items()}
@@ -211,23 +310,14 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
         return numbers.measured[name]._replace(values=now[name][0], seen=now[name][1])
 
     def update(value: dict[str, Any], outputs: Any, now: dict[str, Any]) -> dict[str, Any]:
-        """The running values with one sample more.
-
-        Args:
-            value: running values by result.
-            outputs: the model's Outputs at the sample, scalars.
-            now: what was measured there and whether, by result.
-        """
-        return {
-            name: stream.update(value[name], _signal(reduce[name], outputs), measured(name, now))
-            for name, stream in streams.items()
-        }
+        """The running values with one sample more."""
+        new = {}
+        for name, stream in streams.items():
+            y = outputs if (signal := signals[name]) is None else getattr(outputs, signal)
+            new[name] = stream.update(value[name], y, measured(name, now))
+        return new
 
     return update, start, data
-
-
-def _signal(reducer: Reduce, outputs: Any) -> Any:
-    return outputs if reducer.signal is None else getattr(outputs, reducer.signal)
 
 
 def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int) -> Scalars:
@@ -243,11 +333,7 @@ def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int)
 
 
 def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
-    """What a function of the user's gives for a run, by name.
-
-    Raises:
-        ValueError: it fails, or gives no real number.
-    """
+    """What a function of the user's gives for a run, by name."""
     called = getattr(function, "__qualname__", str(function))
     try:
         results = {n: jnp.asarray(v) for n, v in _named(name, function(run)).items()}

@@ -12,12 +12,14 @@ from heli_jax.fused.code import UnsupportedError, translating
 from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.traced import Traced, traced
 from heli_jax.simulation.accumulate import Steps
-from heli_jax.sweeps.design_point import ElementResults, of_steps, steps_of
-from heli_jax.sweeps.flight_numbers import (
+from heli_jax.sweeps.design_point import (
+    ElementResults,
     FlightNumbers,
     Scalars,
     flight_numbers,
+    of_steps,
     steady,
+    steps_of,
 )
 from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
@@ -44,13 +46,7 @@ class _Parts(NamedTuple):
 
 
 def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
-    """Why the job's runs cannot be one program each; None where they can.
-
-    Args:
-        job: the sweep.
-        devices: of JAX, that would compute it.
-        lanes: as a program takes it.
-    """
+    """Why the job's runs cannot be one program each; None where they can."""
     if devices[0].platform != "cpu":
         return "it is for CPUs alone"
     if not job.streamed or not job.simulated:
@@ -88,18 +84,14 @@ class FusedProgram:
         mapped = jax.device_put((filled, trims), parts.split)
         carry, own = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        carry, own = _rows((carry, own))
+        # With the elements as the last dimension, where it takes no copy.
+        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), (carry, own))
         stays = parts.run.stays(own, parts.common(numbers, *first))
         stored = jax.tree.leaves(_records(numbers))
         stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
         results = parts.kernel(stays, stored, carry, self._threads)
         reduced = jax.tree.unflatten(parts.run.results, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
-
-
-def _rows(tree: Any) -> Any:
-    """The same with the elements as the last dimension, where it takes no copy."""
-    return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), tree)
 
 
 def _records(numbers: FlightNumbers) -> Any:

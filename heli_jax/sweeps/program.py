@@ -12,11 +12,12 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from heli_jax import naming
-from heli_jax.sweeps.design_point import ElementResults, design_point
-from heli_jax.sweeps.flight_numbers import (
+from heli_jax.sweeps.design_point import (
+    ElementResults,
     FlightNumbers,
     InitialTrim,
     Scalars,
+    design_point,
     flight_numbers,
     steady,
 )

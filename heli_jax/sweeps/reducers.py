@@ -8,7 +8,6 @@ place; the runs of one block are then held while it works.
 # `Any` below: the running values of a Streaming of the user's are any pytree, and without a signal
 # it gets the model's Outputs. Those here have scalars, ().
 
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -31,13 +30,6 @@ class Measured(NamedTuple):
     """sum of squares about the mean, as R^2 has it"""
     power: Any
     """sum of squares"""
-
-    @property
-    def spread(self) -> Any:
-        """Deprecated: the name that `total_squares` had."""
-        # A Streaming of the user's may read it.
-        warnings.warn("spread is deprecated, expected total_squares", DeprecationWarning, 2)
-        return self.total_squares
 
 
 class Streaming(NamedTuple):
@@ -88,91 +80,61 @@ def measured(values: np.ndarray, dtype: np.dtype) -> Measured:
     )
 
 
-_Two = tuple[Array, Array]
-
-# Updates (value, y, measured) and finishes (value, n, measured) of the reducers below; what one of
-# them does not need it calls _.
-
-
-def _summed(value: Array, y: Array, _: Measured | None) -> Array:
-    return value + y
-
-
-def _squared(value: Array, y: Array, _: Measured | None) -> Array:
-    return value + y * y
-
-
-def _mean(value: Array, n: Array, _: Measured | None) -> Array:
-    return value / n
-
-
-def _root_mean(value: Array, n: Array, _: Measured | None) -> Array:
-    return jnp.sqrt(value / n)
-
-
-def _same(value: Array, n: Array, _: Measured | None) -> Array:
-    return value
-
-
-def _where(v: Array, m: Measured) -> Array:
+def _seen(v: Array, m: Measured) -> Array:
     """Zero where nothing was measured."""
     return v if m.seen is None else v * m.seen
 
 
-def _misfit(value: Array, y: Array, m: Measured) -> Array:
-    e = _where(m.values - y, m)
-    return value + e * e
+def _squares(v: Array, y: Array, m: Measured) -> Array:
+    e = _seen(m.values - y, m)
+    return v + e * e
 
 
-def _rmse(value: Array, n: Array, m: Measured) -> Array:
-    return jnp.sqrt(value / m.count)
+def _squares_and_sum(v: tuple[Array, Array], y: Array, m: Measured) -> tuple[Array, Array]:
+    e = _seen(m.values - y, m)
+    return v[0] + e * e, v[1] + e
 
 
-def _nrmse(value: Array, n: Array, m: Measured) -> Array:
-    return jnp.sqrt(value / m.total_squares)
+def _squares_and_power(v: tuple[Array, Array], y: Array, m: Measured) -> tuple[Array, Array]:
+    seen = _seen(y, m)
+    return _squares(v[0], y, m), v[1] + seen * seen
 
 
-def _fit_percent(value: Array, n: Array, m: Measured) -> Array:
-    # As MATLAB's `compare`: 100 is perfect, 0 is no better than the measured mean.
-    return 100.0 * (1.0 - jnp.sqrt(value / m.total_squares))
-
-
-def _misfit_and_sum(value: _Two, y: Array, m: Measured) -> _Two:
-    e = _where(m.values - y, m)
-    return (value[0] + e * e, value[1] + e)
-
-
-def _vaf(value: _Two, n: Array, m: Measured) -> Array:
+def _vaf(v: tuple[Array, Array], n: Array, m: Measured) -> Array:
     # 1 - var(e) / var(measured): sum (e - mean e)^2 = sum e^2 - (sum e)^2 / count, in one pass.
-    squares, total = value
-    return 1.0 - (squares - total * total / m.count) / m.total_squares
+    return 1.0 - (v[0] - v[1] * v[1] / m.count) / m.total_squares
 
 
-def _misfit_and_power(value: _Two, y: Array, m: Measured) -> _Two:
-    e, seen = _where(m.values - y, m), _where(y, m)
-    return (value[0] + e * e, value[1] + seen * seen)
-
-
-def _theil(value: _Two, n: Array, m: Measured) -> Array:
+def _theil(v: tuple[Array, Array], n: Array, m: Measured) -> Array:
     # Theil's inequality coefficient, 0 to 1: rms(e) / (rms(y) + rms(measured)); the counts cancel.
-    return jnp.sqrt(value[0]) / (jnp.sqrt(value[1]) + jnp.sqrt(m.power))
+    return jnp.sqrt(v[0]) / (jnp.sqrt(v[1]) + jnp.sqrt(m.power))
 
 
+def _nrmse(v: Array, n: Array, m: Measured) -> Array:
+    return jnp.sqrt(v / m.total_squares)
+
+
+def _same(v: Array, n: Array, m: Measured | None) -> Array:
+    return v
+
+
+# Start, update (value, y, measured), finish (value, n, measured), whether it compares with the
+# flight, unit of the result.
 REDUCERS: dict[str, Streaming] = {
-    # Start, update, finish, whether it compares with the flight, unit of the result.
-    "rms": Streaming(0.0, _squared, _root_mean),
-    "mean": Streaming(0.0, _summed, _mean),
+    "rms": Streaming(0.0, lambda v, y, m: v + y * y, lambda v, n, m: jnp.sqrt(v / n)),
+    "mean": Streaming(0.0, lambda v, y, m: v + y, lambda v, n, m: v / n),
     # A magnitude is never below zero, so zero is no candidate that could win.
-    "peak": Streaming(0.0, lambda v, y, _: jnp.maximum(v, jnp.abs(y)), _same),
+    "peak": Streaming(0.0, lambda v, y, m: jnp.maximum(v, jnp.abs(y)), _same),
     # Beginning at infinity, so that the first sample is taken whatever it is.
-    "max": Streaming(-np.inf, lambda v, y, _: jnp.maximum(v, y), _same),
-    "min": Streaming(np.inf, lambda v, y, _: jnp.minimum(v, y), _same),
-    "final": Streaming(0.0, lambda v, y, _: y, _same),
-    "rmse": Streaming(0.0, _misfit, _rmse, True),
-    "nrmse": Streaming(0.0, _misfit, _nrmse, True, "1"),
-    "fit": Streaming(0.0, _misfit, _fit_percent, True, "%"),
-    "vaf": Streaming((0.0, 0.0), _misfit_and_sum, _vaf, True, "1"),
-    "tic": Streaming((0.0, 0.0), _misfit_and_power, _theil, True, "1"),
+    "max": Streaming(-np.inf, lambda v, y, m: jnp.maximum(v, y), _same),
+    "min": Streaming(np.inf, lambda v, y, m: jnp.minimum(v, y), _same),
+    "final": Streaming(0.0, lambda v, y, m: y, _same),
+    "rmse": Streaming(0.0, _squares, lambda v, n, m: jnp.sqrt(v / m.count), True),
+    "nrmse": Streaming(0.0, _squares, _nrmse, True, "1"),
+    # As MATLAB's `compare`: 100 is perfect, 0 is no better than the measured mean.
+    "fit": Streaming(0.0, _squares, lambda v, n, m: 100.0 * (1.0 - _nrmse(v, n, m)), True, "%"),
+    "vaf": Streaming((0.0, 0.0), _squares_and_sum, _vaf, True, "1"),
+    "tic": Streaming((0.0, 0.0), _squares_and_power, _theil, True, "1"),
 }
 """Of one signal: root mean square, mean, largest magnitude, largest, smallest and last value; and
 against the flight: root mean square error, that over the measured signal's spread (nrmse, 0 is

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from heli_jax import run_directory
+from heli_jax import run_directory, stages
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, as_data, note
@@ -24,7 +24,7 @@ from heli_jax.sweeps.spec import Job, RunOptions, unread
 from heli_jax.sweeps.spec import job as checked
 from heli_jax.sweeps.summary import write_summary
 from heli_jax.sweeps.worker import Split, Worker
-from heli_jax.versions import versions
+from heli_jax.versions import changed_since, versions
 
 # `Any` below: Params of the user's own class, what may stand in JSON, and a dask Client, which is
 # not imported where no worker is asked for.
@@ -45,6 +45,26 @@ class Progress(NamedTuple):
     """[s]; NaN likewise"""
 
 
+class Pace:
+    """Counts what is done as steps of the stage under way, and calls `progress` with it."""
+
+    def __init__(self, total: int, progress: Callable[[Progress], None]) -> None:
+        self.total, self.progress = total, progress
+        self.first: tuple[float, int] | None = None
+
+    def __call__(self, done: int) -> None:
+        """So many are done."""
+        stages.reach(done)
+        # The first waited for imports and the compiler: counted, it would make the time that is
+        # left look ten times as long.
+        now, rate = time.perf_counter(), math.nan
+        if self.first is None:
+            self.first = now, done
+        else:
+            rate = (done - self.first[1]) / max(now - self.first[0], 1e-9)
+        self.progress(Progress(done, self.total, rate, (self.total - done) / rate))
+
+
 class Options(NamedTuple):
     """How a sweep is carried out; nothing of it changes a number, but how it is cut may change the
     last digit."""
@@ -53,7 +73,7 @@ class Options(NamedTuple):
     chunk: int | None = None
     """elements written at a time; chosen unless given"""
     lanes: int | None = None
-    """elements computed side by side on a device; measured unless given"""
+    """elements computed side by side on a device; chosen unless given"""
     backend: str = "auto"
     """what computes a run over time: "xla" step by step, "fused" as one program of machine code (on
     CPUs), or "auto", fused where it can be"""
@@ -61,8 +81,6 @@ class Options(NamedTuple):
     """of this process: all unless given"""
     client: Any = None
     """a dask.distributed Client whose workers compute the chunks"""
-    memory: Path | None = None
-    """a file that keeps what was measured"""
     progress: Callable[[Progress], None] = lambda _: None
     say: Callable[[str], None] = lambda _: None
 
@@ -140,17 +158,13 @@ def run_sweep(
         store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
         _compute(job, store, store.done(), options)
         return store.dataset().load()
-    where = f"--out {out}"
-    # --resume takes what is not there, or is an empty folder, for a sweep that was killed before it
-    # began: a job on a cluster is then started and restarted by the same command.
-    empty = out.is_dir() and not any(out.iterdir())
-    if not (options.resume and out.exists() and not empty):
-        if not (options.resume and empty):
-            run_directory.require_free(out, ", or --resume")
-        _create(job, out, options, kept, files or {})
-    # Before the first chunk: what was computed for minutes could not be written.
-    if not out.is_dir() or not stores.writable(out):
-        raise InputError(f"{where}: expected a directory that can be written to")
+    if run_directory.is_new(out, options.resume):
+        cut = _cut(job, options, kept)
+        with run_directory.whole(out) as directory:
+            for name, text in (files or {}).items():
+                (directory / name).write_text(text, encoding="utf-8")
+            stores.create(directory / "sweep.zarr", job, *cut, f"--out {out}")
+    run_directory.require_writable(out)
     return _resume(job, out, options)
 
 
@@ -174,21 +188,6 @@ def _notes(job: Job) -> list[Finding]:
     return [*without_effect, *delayed]
 
 
-def _create(
-    job: Job, out: Path, options: Options, attributes: dict[str, Any], files: Mapping[str, str]
-) -> None:
-    """A new directory with an empty store; it appears whole or not at all."""
-    where = f"--out {out}"
-    split, attributes = _cut(job, options, attributes)
-    try:
-        with run_directory.whole(out) as directory:
-            for name, text in files.items():
-                (directory / name).write_text(text, encoding="utf-8")
-            stores.create(directory / "sweep.zarr", job, split, attributes, where)
-    except OSError as e:
-        raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
-
-
 def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
     """Compute what is missing in a store on disk, and write its summary."""
     where = f"--out {out}"
@@ -205,8 +204,8 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
             options.say(Note(f"{where}: {words} and computed again"))
         _same_cut(store, job, options, where)
         # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
-        for note in _changes(store.attributes.get("versions", {}), versions()):
-            options.say(Note(f"{where}: {note}"))
+        if changed := changed_since(store.attributes.get("versions", {})):
+            options.say(Note(f"{where}: {changed}"))
         timing = _compute(job, store, done, options)
         dataset = store.dataset()
         with stores.readable(where):
@@ -223,7 +222,6 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
     # More lanes than elements would fill the memory with copies of the last one.
     lanes = None if options.lanes is None else min(options.lanes, job.design.size)
     asked = {"chunk": options.chunk, "lanes": lanes, "backend": options.backend}
-    asked["memory"] = options.memory
     if options.client is not None:
         from heli_jax.sweeps.cluster import split_there
 
@@ -259,22 +257,7 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
     todo = [int(k) for k in np.flatnonzero(~done)]
     total, size = job.design.size, store.split.chunk
     before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))
-    begin, now = time.perf_counter(), before
-    first: tuple[float, int] | None = None
-
-    def written(chunk: int, results: dict[str, np.ndarray]) -> None:
-        nonlocal now, first
-        store.write(chunk, results)
-        now += len(results["status"])
-        # The first chunk waited for the compiler: counted, it would make the time that is left look
-        # ten times as long.
-        rate = math.nan
-        if first is None:
-            first = time.perf_counter(), now
-        else:
-            rate = (now - first[1]) / max(time.perf_counter() - first[0], 1e-9)
-        options.progress(Progress(now, total, rate, (total - now) / rate))
-
+    begin, now, pace = time.perf_counter(), before, Pace(total, options.progress)
     if options.client is not None:
         # Here, since dask is an extra that is not installed everywhere.
         from heli_jax.sweeps.cluster import computed
@@ -282,8 +265,11 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
         source: Iterable[Any] = computed(options.client, job, store.split, todo)
     else:
         source = _local(job, store.split, todo, options.devices)
-    for chunk, results in source:
-        written(chunk, results)
+    with stages.stage("sweep", total=total):
+        for chunk, results in source:
+            store.write(chunk, results)
+            now += len(results["status"])
+            pace(now)
     seconds = time.perf_counter() - begin
     return {
         "chunks": store.split.chunks(total),
@@ -335,11 +321,3 @@ def float32_error(job: Job) -> dict[str, float | str]:
         largest = size.max(initial=0.0)
         errors[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
     return errors
-
-
-def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
-    """That a store was begun with other versions, if it was."""
-    changed = [f"{n} {old[n]} then, {v} now" for n, v in new.items() if n in old and old[n] != v]
-    if not changed:
-        return []
-    return [f"begun with other versions ({', '.join(changed)}): the last digits may differ"]

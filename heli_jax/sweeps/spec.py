@@ -17,8 +17,7 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.axes import whole_seeds
-from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.design import Design, whole_seeds
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]
@@ -137,7 +136,8 @@ class Job(NamedTuple):
     @property
     def streamed(self) -> bool:
         """Whether every run is reduced while it goes on, and nothing of it has to be kept."""
-        whole = any(_needs_whole_run(r) for r in self.reduce.values())
+        how = [r.how for r in self.reduce.values()]
+        whole = any(callable(h) and not isinstance(h, reducers.Streaming) for h in how)
         # `accumulate` has no delay, no noise and no feedback, which `simulate` has: such runs are
         # simulated whole and reduced then.
         drawn_or_late = {"delay", "seed"} & set(special_axes(self.model, self.design))
@@ -155,10 +155,6 @@ def moving_inputs_of(model: Model, flight: Flight) -> tuple[tuple[str, str], ...
     """The model's inputs that are not held between this flight's samples, with their holds."""
     holds = ((n, flight.hold.get(n, "zero-order")) for n in naming.names(model.Inputs))
     return tuple((n, hold) for n, hold in holds if hold != "zero-order")
-
-
-def _needs_whole_run(reduce: Reduce) -> bool:
-    return callable(reduce.how) and not isinstance(reduce.how, reducers.Streaming)
 
 
 def special_axes(model: Model, design: Design) -> list[str]:
@@ -185,12 +181,7 @@ def job(
     """Check a sweep and lay it out.
 
     Args:
-        model: what is simulated.
         params: the model's Params, SI; the axes of the design take the place of theirs.
-        flights: one or several, whose inputs are flown.
-        design: which values the axes take, by element.
-        reduce: by name, what is kept of each run.
-        options: how each run is made.
 
     Raises:
         ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
@@ -337,19 +328,15 @@ def _check_results(
         if name in design.names or name in ("status", "element"):
             raise ValueError(f"reduce.{name}: the name is taken, expected another")
         stream = reducers.streaming(reducer)
-        if stream is not None and stream.against_flight:
-            _check_measured(name, str(reducer.signal), flights)
+        signal = str(reducer.signal)
+        for flight in flights if stream is not None and stream.against_flight else ():
+            if signal not in flight.outputs:
+                raise ValueError(
+                    f"reduce.{name}: flight {flight.name!r} measured no {signal!r}"
+                    f"{nearest(signal, flight.outputs)}"
+                )
     if trajectories is not None:
         _check_trajectories(trajectories, outputs, flights)
-
-
-def _check_measured(name: str, signal: str, flights: tuple[Flight, ...]) -> None:
-    for flight in flights:
-        if signal not in flight.outputs:
-            raise ValueError(
-                f"reduce.{name}: flight {flight.name!r} measured no {signal!r}"
-                f"{nearest(signal, flight.outputs)}"
-            )
 
 
 def _check_trajectories(

@@ -21,7 +21,7 @@ from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
 from heli_jax.regular_file import require_regular
-from heli_jax.sweeps.description import described, differences
+from heli_jax.sweeps.description import described, require_same
 from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
@@ -150,10 +150,6 @@ def create(
 
     Args:
         path: where it is made; None for one in memory.
-        job: the sweep.
-        split: how it is cut; a chunk of the sweep is one of Zarr's, and so one file.
-        attributes: kept with the store, as JSON has them.
-        where: what a message begins with.
 
     Raises:
         OSError: the place cannot be written to.
@@ -228,11 +224,6 @@ def _labels(
 def reopen(path: Path, job: Job, where: str) -> Store:
     """The store of the same sweep, to go on with.
 
-    Args:
-        path: of the store.
-        job: the sweep that goes on.
-        where: what a message begins with.
-
     Raises:
         InputError: it is no store of a sweep, or one of another sweep.
     """
@@ -241,14 +232,7 @@ def reopen(path: Path, job: Job, where: str) -> Store:
         old = json.loads(store.attributes["description"])
     except (OSError, KeyError, ValueError, TypeError) as e:
         raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
-    # Through JSON and back, as the stored one went: a tuple is a list there.
-    changes = differences(old, json.loads(json.dumps(described(job))))
-    if changes:
-        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
-        raise InputError(
-            f"{where}: {path} is of another sweep: {changes[0]}{more}; expected the same, or "
-            "another --out"
-        )
+    require_same(old, described(job), f"{where}: {path} is of another sweep")
     # A variable's folder may have been taken away since the store was made.
     missing = sorted(variables(job).keys() - store.names)
     if missing:
@@ -316,9 +300,3 @@ def only_writer(directory: Path, where: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def writable(directory: Path) -> bool:
-    """Whether files can be made there."""
-    # Files are made in a directory by writing to it and passing through it.
-    return os.access(directory, os.W_OK | os.X_OK)

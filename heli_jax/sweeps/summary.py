@@ -12,7 +12,7 @@ import xarray as xr
 
 from heli_jax import run_directory
 from heli_jax.finding import as_data, note
-from heli_jax.sweeps.chunks import chunks_of
+from heli_jax.sweeps.datasets import chunks_of
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
@@ -24,13 +24,6 @@ def write_summary(
     path: Path, dataset: xr.Dataset, job: Job, timing: dict[str, Any], where: str
 ) -> None:
     """Write summary.json, which appears whole or not at all.
-
-    Args:
-        path: of the file.
-        dataset: the finished sweep.
-        job: what was computed.
-        timing: what it took, as JSON has it.
-        where: what a message begins with.
 
     Raises:
         InputError: it cannot be written.
@@ -49,11 +42,6 @@ def write_summary(
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
     """Counts by status, quantiles of every result over the elements that are ok, the worst and the
     best.
-
-    Args:
-        dataset: the finished sweep; read in pieces.
-        job: what was computed.
-        timing: what it took, as JSON has it.
     """
     # The status of all elements is held, a byte each; results are read in pieces.
     status = dataset["status"].values
@@ -70,8 +58,10 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "status": {word: int(np.count_nonzero(status == k)) for k, word in MEANINGS.items()},
         "axes": {n: ends for n in job.design.names if (ends := _ends(dataset[n]))},
         "results": results,
-        "worst": {name: _rows(dataset, job, name, k) for name, k in worst(dataset, job).items()},
-        "best": {name: _rows(dataset, job, name, k) for name, k in best(dataset, job).items()},
+        **{
+            words: {n: _rows(dataset, job, n, k) for n, k in worst(dataset, job, sign).items()}
+            for words, sign in (("worst", 1.0), ("best", -1.0))
+        },
         "split": dataset.attrs["split"],
         "timing": timing,
         "versions": dataset.attrs["versions"],
@@ -129,32 +119,10 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
     return {**_unit(variable), **counts, **dict(zip(names, map(float, q), strict=True))}
 
 
-def worst(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, np.ndarray]:
-    """By result, the elements that are ok and worst in it, worst first: the largest, or for what
-    agrees with a flight the smallest; of several flights the worst one counts.
-
-    Args:
-        dataset: the finished sweep; read in pieces.
-        job: what was computed.
-        count: elements of each result at most.
-    """
-    return _extreme(dataset, job, count, 1.0)
-
-
-def best(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, np.ndarray]:
-    """By result, the elements that are ok and best in it, best first: the reverse of `worst`; of
-    several flights the worst one counts.
-
-    Args:
-        dataset: the finished sweep; read in pieces.
-        job: what was computed.
-        count: elements of each result at most.
-    """
-    return _extreme(dataset, job, count, -1.0)
-
-
-def _extreme(dataset: xr.Dataset, job: Job, count: int, sign: float) -> dict[str, np.ndarray]:
-    """The worst elements of each result, or with a sign of -1 the best."""
+def worst(dataset: xr.Dataset, job: Job, sign: float = 1.0) -> dict[str, np.ndarray]:
+    """By result, the elements that are ok and worst in it, worst first, `_WORST_COUNT` at most: the
+    largest, or for what agrees with a flight the smallest; of several flights the worst one counts.
+    With a `sign` of -1 the best, best first."""
     fine = dataset["status"].values == OK
     by_result = {}
     for name, reduce in job.reduce.items():
@@ -163,7 +131,7 @@ def _extreme(dataset: xr.Dataset, job: Job, count: int, sign: float) -> dict[str
         if name not in dataset.data_vars:
             continue
         badness = functools.partial(_badness, small_is_bad=reduce.how in _SMALL_IS_BAD, sign=sign)
-        elements = _worst(dataset[name], fine, badness, count)
+        elements = _worst(dataset[name], fine, badness, _WORST_COUNT)
         if elements.size:
             by_result[name] = elements
     return by_result

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Helicopter, Model, models, naming
+from heli_jax import Helicopter, Model, models
 from heli_jax.analysis.linear import frequency_response, modes, transfer_function
 from tests.dynamics.paper import BENCH, matrices, scattered
 
@@ -31,13 +31,6 @@ def test_frequency_response(response, seed):
     np.testing.assert_allclose(found[:, 1, 0], 1j * OMEGA * found[:, 0, 0], rtol=1e-8)
 
 
-def test_frequency_response_is_what_a_sine_settles_to(bench30):
-    num, den = transfer_function(models.roll_on_stand, bench30, "roll", "x_roll")
-    found = np.asarray(frequency_response(models.roll_on_stand, bench30, jnp.asarray(OMEGA)))
-    wanted = np.polyval(num, 1j * OMEGA) / np.polyval(den, 1j * OMEGA)
-    np.testing.assert_allclose(found[:, 0, 0], wanted, rtol=1e-8)
-
-
 @pytest.mark.parametrize("stand", [False, True])
 def test_modes_are_sorted_eigenvalues(bench30, stand):
     model = models.roll_on_stand if stand else models.roll
@@ -46,26 +39,6 @@ def test_modes_are_sorted_eigenvalues(bench30, stand):
     found = modes(model, bench30)
     assert np.all(np.diff(np.abs(found)) >= -1e-9)
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-8)
-
-
-def test_transfer_function_of_the_rate_has_one_zero_more(bench30):
-    angle, den = transfer_function(models.roll_on_stand, bench30, "roll", "x_roll")
-    rate, same = transfer_function(models.roll_on_stand, bench30, "roll_rate", "x_roll")
-    np.testing.assert_allclose(den, same, rtol=1e-12)
-    np.testing.assert_allclose(rate[:-1], angle, rtol=1e-9)
-    assert abs(rate[-1]) < 1e-6 * abs(rate[-2])
-
-
-def test_transfer_function_wants_known_names(bench30):
-    with pytest.raises(ValueError, match="yaw"):
-        transfer_function(models.roll, bench30, "yaw", "x_roll")
-
-
-def test_no_lift_no_response(bench30):
-    p = naming.replace(bench30, a=jnp.asarray(0.0))
-    num, den = transfer_function(models.roll, p, "roll", "x_roll")
-    np.testing.assert_allclose(num, 0.0, atol=1e-9)
-    np.testing.assert_allclose(den, [1.0, 0.0, 150.0**2, 0.0, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1e-14, 1e-7, 1e7])

@@ -11,7 +11,6 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.analysis.operating_point import operating_point
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.excitation import sampling
 from heli_jax.report import frequency
@@ -60,19 +59,6 @@ def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering)
     assert abs(hovering(1.0)) > 10.0
     for w in (0.5, 1.0, 5.0):
         assert H(np.array([w]))[0] == pytest.approx(hovering(w), rel=1e-4)
-
-
-@pytest.mark.slow
-def test_a_disturbed_helicopter_is_trimmed_without_its_disturbance(xcell):
-    plain = models.helicopter("consistent")
-    model = with_disturbance(plain, "roll", 2)
-    params = model.Params(**{n: getattr(xcell, n) for n in type(xcell).__dataclass_fields__})
-    at = operating_point(model, params, STILL, {"z": np.zeros(N)}, DT)
-    assert at.words == "the trim in hover"
-    assert (float(at.state.w1_roll), float(at.state.w2_roll)) == (0.0, 0.0)
-    state, inputs = oracle.hover(oracle.XCELL)["consistent"]
-    assert float(at.state.Omega) == pytest.approx(state["Omega"], rel=1e-6)
-    assert float(at.inputs.x_throttle) == pytest.approx(inputs["x_throttle"], rel=1e-6)
 
 
 def test_a_record_of_forward_flight_is_linearised_there(xcell):
@@ -200,16 +186,3 @@ def test_what_the_windows_sidelobes_bring_is_no_response():
     exact = np.abs(0.1 / (1.0 - 0.9 * np.exp(-1j * found.omega * dt)))
     assert found.omega[-1] < 40.0  # rad/s, of 314
     np.testing.assert_allclose(np.abs(found.H), exact, rtol=0.15)
-
-
-def test_sidelobes_are_those_of_a_line_between_two_bins():
-    n, at = 256, 20.5
-    window = np.hanning(n + 1)[:-1]
-    phases = np.linspace(0, np.pi, 16, endpoint=False)[:, None]
-    tone = window * np.cos(2 * np.pi * at * np.arange(n) / n + phases)
-    power = np.mean(np.abs(np.fft.rfft(tone)) ** 2, axis=0)
-    line = np.zeros(n // 2 + 1)
-    line[20] = (n / 4) ** 2
-    far = np.arange(30, 110)
-    ratio = frequency.leakage(line)[far] / power[far]
-    assert np.all((ratio > 0.3) & (ratio < 3.0))

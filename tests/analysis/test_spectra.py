@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import mlab
 
-from heli_jax.analysis.spectra import spectra
+from heli_jax.analysis.spectral import spectra
 
 
 @pytest.fixture(scope="module")

@@ -75,16 +75,3 @@ def settled_tilt(v, axis="roll"):
 def tilt_per_rate(v, axis="p"):
     """Settled tilt (right, nose up) [rad] per shaft rate [rad/s], for a rate "p" or "q"."""
     return simulate(v, 18 * time_constant(v), **{axis: 1e-4})[-1] / 1e-4
-
-
-def main():
-    v = XCELL
-    K = v["rho"] * v["a"] * v["c"] * (v["R2"] ** 4 - v["R1"] ** 4) / (4 * v["If"])
-    print("tau: 2/(K Omega)", 2 / (K * v["Omega"]), "simulated", time_constant(v))
-    print("tilt (right, up) per x/L5: roll", settled_tilt(v), "pitch", settled_tilt(v, "pitch"))
-    print("tilt (right, up) per rate: p", tilt_per_rate(v), "q", tilt_per_rate(v, "q"))
-    print("1/Omega", 1 / v["Omega"])
-
-
-if __name__ == "__main__":
-    main()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax.numerics.sincos import sincos
+from heli_jax.dynamics.helicopter_equations import sincos
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 10.0, 1e3, 1e6])

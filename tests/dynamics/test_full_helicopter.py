@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from heli_jax import load_vehicle, models, naming
-from heli_jax.dynamics import governor
 from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.loads import throttle
 from heli_jax.dynamics.model import zeros
 from tests.dynamics import full_helicopter as oracle
 
@@ -80,14 +80,6 @@ def test_each_switch_acts_alone_on_what_it_is_about(switch):
     assert all(np.isfinite(float(x)) for x in after.values())
 
 
-def test_governor_and_measured_speed_are_one_or_the_other():
-    with pytest.raises(ValueError, match="expected governor or measured_speed, got both"):
-        helicopter(governor=True, measured_speed=True)
-    model = helicopter(measured_speed=True)
-    assert naming.names(model.Inputs)[-1] == "Omega"
-    assert not {"Omega", "governor"} & set(naming.names(model.State))
-
-
 def test_a_measured_rotor_speed_is_that_of_the_rotor():
     """All but the motor: what the fuselage feels is the torque that the rotor takes."""
     rng = np.random.default_rng(4)
@@ -120,13 +112,13 @@ def test_a_machine_without_a_flybar_needs_none(vehicles_folder):
 def test_the_governor_is_a_pi_with_limits():
     p = models.helicopter().Params(**oracle.FULL)
     for error, integral in ((2.0, 0.4), (-3.0, 0.5), (100.0, 0.2), (-157.1, 0.3)):
-        held, slope = governor.throttle(p, 157.1, 157.1 - error, integral)
+        held, slope = throttle(p, 157.1, 157.1 - error, integral)
         free = 0.01 * error + integral
         assert float(held) == pytest.approx(np.clip(free, 0.0, 1.0))
         if 0 < free < 1:
             assert float(slope) == pytest.approx(0.02 * error)
     # Switched off it comes to rest at no throttle and an empty integral.
-    held, slope = governor.throttle(p, 0.0, 157.1, 0.0)
+    held, slope = throttle(p, 0.0, 157.1, 0.0)
     assert float(held) == 0.0
     assert float(slope) == pytest.approx(0.0, abs=1e-12)
 
@@ -139,11 +131,3 @@ def test_nothing_is_not_a_number_at_rest():
     assert {n for n, v in found.items() if float(v) != 0.0} == {"dz"}
     for slopes in jacobians(model, p, at, still):
         assert np.isfinite(np.asarray(slopes)).all()
-
-
-def test_descents_are_inside_the_range():
-    model, p = helicopter(), models.helicopter().Params(**oracle.FULL)
-    u = model.Inputs(0.0, 0.0, -0.5, 0.3, 1.0)
-    for sinking in (-4.0, -8.0, -15.0):
-        state = naming.replace(model.initial_state(p), dz=sinking)
-        assert not any(bool(out) for out in model.limits(p, state, u).values())

@@ -8,14 +8,12 @@ import pytest
 from heli_jax import models, naming
 from heli_jax.dynamics import aerodynamics
 from heli_jax.dynamics.flybar import flybar_rate, flybar_time_constant
-from heli_jax.dynamics.helicopter import Corrections, helicopter
+from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import zeros as model_zeros
 from tests.dynamics import blade_element, rotating_bar
 from tests.dynamics import whole_helicopter as oracle
 
-CORRECTIONS = Corrections._fields[: Corrections._fields.index("dynamic_inflow") + 1]
-"""Those of the paper's equations; `test_full_helicopter` has what is beyond them."""
 SCALES = {
     "phi": 0.4, "theta": 0.4, "psi": 2.0, "beta_roll": 0.2, "beta_pitch": 0.2,
     "dx": 6.0, "dy": 4.0, "dz": 2.0,
@@ -53,36 +51,6 @@ def test_every_derivative_is_the_second_program_s(variant):
         assert set(found) == set(wanted)
         for name, value in wanted.items():
             assert float(found[name]) == pytest.approx(value, rel=1e-9, abs=1e-9), name
-
-
-@pytest.mark.slow
-def test_each_correction_can_be_turned_on_alone():
-    rng = np.random.default_rng(2)
-    v, s, u = scattered(rng)
-    s |= {"vi": 4.0}
-    plain = naming.asdict(rates(helicopter("paper"), v, s, u))
-    all_on = oracle.RATES["consistent"](v, s, u)
-    changes = {
-        "direction": {"dx", "dy"},
-        "rigid_body": {"dphi", "dtheta", "dpsi", "dbeta_roll", "dbeta_pitch"},
-        "reaction": {"dpsi"},
-        "tail": {"dpsi"},
-        "tied_torque": {"dpsi"},
-        "drag": {"dx", "dy", "dz"},
-        "first_order_bar": {"beta_roll", "beta_pitch"},
-        "rotor_moment": {"dphi", "dtheta"},
-    }
-    for name in CORRECTIONS:
-        model = helicopter("paper", **{name: True})
-        assert model.name == f"helicopter-paper+{name}"
-        found = naming.asdict(rates(model, v, s, u))
-        assert all(np.isfinite(float(x)) for x in found.values())
-        moved = {n for n in plain if n in found and float(found[n]) != float(plain[n])}
-        assert moved
-        assert moved == changes.get(name, moved)
-    both = helicopter("paper", **dict.fromkeys(CORRECTIONS[:-1], True))
-    for name, value in naming.asdict(rates(both, v, s, u)).items():
-        assert float(value) == pytest.approx(all_on[name], rel=1e-9, abs=1e-9)
 
 
 def test_unknown_variants_and_switches_are_refused():

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.optimize
 
-from heli_jax.dynamics.inflow import induced_velocity, mass_flow
+from heli_jax.dynamics.aerodynamics import induced_velocity, mass_flow
 from tests.dynamics import whole_helicopter as oracle
 
 solve = jax.jit(jax.vmap(induced_velocity))
@@ -84,20 +83,6 @@ def test_every_root_is_the_only_one():
     assert T0.min() > 0
 
 
-def test_it_is_momentum_theory_in_climb_hover_and_slow_descent():
-    flows = scattered(400)
-    found, checked = np.asarray(solve(*map(jnp.asarray, flows))), 0
-    for v, V2, W, T0, b in zip(found, *flows, strict=True):
-        if 0.5 * v > -W:
-            wanted = scipy.optimize.brentq(
-                lambda x, V2=V2, W=W, T0=T0, b=b: 2 * x * np.hypot(V2**0.5, W + x) + b * x - T0,
-                max(0.0, -2 * W), T0 / b, xtol=1e-15, rtol=1e-15,
-            )  # fmt: skip
-            assert v == pytest.approx(wanted, rel=1e-12)
-            checked += 1
-    assert 100 < checked < 300
-
-
 @pytest.mark.parametrize("mu", [0.0, 0.25, 0.5, 0.8])
 def test_descents_are_those_that_were_measured(mu):
     """At a given thrust, b = 0; momentum theory's own cliff at c = -2 is left out."""
@@ -107,8 +92,8 @@ def test_descents_are_those_that_were_measured(mu):
     np.testing.assert_allclose(found, [johnson(x, mu) for x in c], rtol=0.08)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_derivatives_are_those_of_the_root(mode):
+def test_derivatives_are_those_of_the_root():
+    mode = jax.jacrev
     V2, W, T0, b = scattered(60)
     # A difference to below V2 = 0 has no root.
     flows = np.stack([V2 + 1e-2, W, T0, b], axis=1)

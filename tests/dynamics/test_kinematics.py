@@ -16,8 +16,6 @@ from heli_jax.config.kinematics import (
     prepared,
     sharpened,
 )
-from heli_jax.config.preset_signals import resolve
-from heli_jax.config.schema import SignalsConfig
 from heli_jax.dynamics import kinematics
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal
@@ -124,23 +122,6 @@ def test_a_configuration_may_leave_out_what_follows_from_its_signals():
     assert completed(other, "a.yaml") is other
     for wrong in ({"flights": 3}, {"flights": [3]}, {"fit": [1]}, {"fit": {"nuisance": 3}}):
         completed(a_configuration(**wrong), "a.yaml")  # the validation refuses it
-
-
-def test_further_logs_and_presets_are_asked_for_the_model():
-    further = a_configuration()
-    forces = {"inputs": {n: {"signal": n} for n in ("ax", "ay", "az")}}
-    further["flights"][0]["also"] = [{"signals": {**forces, "outputs": {"vn": {"signal": "v"}}}}]
-    assert completed(further, "a.yaml")["model"] == "kinematics-velocity"
-    preset = {"preset": "px4-helicopter"}
-    for asked, model in ((["phi"], kinematics.attitude), (["phi", "u"], kinematics.velocity)):
-        signals = {**preset, "preset_outputs": asked}
-        content = {"model": "kinematics", "flights": [{"log": "a", "signals": signals}]}
-        assert completed(content, "a.yaml")["model"] == model.name
-        # What is an output of a helicopter is an input here.
-        found = resolve(model, SignalsConfig(**signals), "a.yaml", None, None, ())
-        assert set(found.inputs) == set(model.Inputs._fields)
-        assert found.inputs["p"].signal == "vehicle_angular_velocity.xyz[0]"
-        assert list(found.outputs) == asked
 
 
 def test_rates_move_between_samples_unless_the_configuration_says_otherwise():

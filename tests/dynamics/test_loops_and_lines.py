@@ -9,7 +9,6 @@ import scipy.signal
 from heli_jax import linear_model, models, naming, simulate
 from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.dynamics.model import Model
 from tests.dynamics.full_helicopter import FULL
 
 ROLL = linear_model("roll-flybarless")
@@ -99,23 +98,8 @@ def test_the_rate_of_a_loop_may_be_named():
     assert paper.body_rates is None
 
 
-def test_a_loop_about_what_is_no_rate_is_refused():
-    with pytest.raises(ValueError, match=r"lat: 'b' of model .* is in rad, expected the state"):
-        models.with_rate_loop(ROLL.model, {"lat": "b"})
-    heave = linear_model("heave").model
-    with pytest.raises(ValueError, match="'w' of model heave is in m/s, expected"):
-        models.with_gyro(heave, {"col": "w"})
-
-
 def turning(s):
     return {"yaw": s.p}
-
-
-def test_rates_of_the_body_are_checked_as_other_functions_are():
-    parts = ROLL.model.Params, ROLL.model.State, ROLL.model.Inputs, ROLL.model.State
-    model = Model("own", lambda p, s, u: s, lambda p, s, u: s, *parts, body_rates=turning)
-    with pytest.raises(ValueError, match=r"body_rates .*expected names of rates \(p, q, r\)"):
-        models.with_rate_loop(model, {"lat": "p"})
 
 
 def late(delay):

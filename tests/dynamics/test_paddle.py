@@ -2,20 +2,18 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
 
-from heli_jax import Free, Problem, check, fit, load_vehicle, models, naming
+from heli_jax import Free, Problem, fit, load_vehicle, models, naming
 from heli_jax.analysis.linear import transfer_function
 from heli_jax.dynamics.flybar import flapping_rate_gain, flybar_time_constant
 from heli_jax.dynamics.model import needed_but_missing, reads
 from heli_jax.dynamics.roll import ratios_from_denominator, roll_transfer_function
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import baseline
-from heli_jax.sweeps.spec import unread
 from tests.identification.bench import BENCH, denominators, record, response, vehicle
 
 C, A = 0.03, 3.4
@@ -55,26 +53,6 @@ def test_either_may_be_given_alone(given, factor):
     assert found == pytest.approx(factor * float(flapping_rate_gain(v)), rel=1e-14)
 
 
-def test_without_them_no_number_changes():
-    """The blade's own values written out are the same to the last digit, derivatives too."""
-    v = vehicle(BENCH)
-    same = naming.replace(v, c_paddle=v.c, a_paddle=v.a)
-    for model in (models.roll, models.helicopter("consistent")):
-        x = model.State(*(jnp.asarray(0.1 + 0.01 * i) for i in range(len(model.State._fields))))
-        u = model.Inputs(*(jnp.asarray(0.01) for _ in model.Inputs._fields))
-        if model is not models.roll:
-            x = x._replace(Omega=jnp.asarray(150.0))
-        bar = "beta_roll" if model is not models.roll else "dbeta_roll"
-        one, other = (getattr(model.vector_field(p, x, u), bar) for p in (v, same))
-        assert float(one) == float(other)
-    slope = jax.grad(flapping_rate_gain)(v)
-    assert float(slope.a) == pytest.approx(float(flapping_rate_gain(v)) / BENCH["a"], rel=1e-14)
-    assert float(slope.c) == pytest.approx(float(flapping_rate_gain(v)) / BENCH["c"], rel=1e-14)
-    given = jax.grad(flapping_rate_gain)(with_paddle())
-    assert float(given.a) == 0.0
-    assert float(given.a_paddle) == pytest.approx(float(flapping_rate_gain(with_paddle())) / A)
-
-
 def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
     v = vehicle(BENCH)
     assert needed_but_missing(models.roll, v) == []
@@ -90,16 +68,6 @@ def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
         load_vehicle(path)
 
 
-def test_a_sweep_over_them_is_read():
-    class Job:
-        model, params = models.roll, {n: float(v) for n, v in naming.asdict(vehicle(BENCH)).items()}
-
-        class design:
-            names = ("a_paddle", "c_paddle", "hr")
-
-    assert unread(Job) == ["hr"]
-
-
 def flight(noise=2e-3):
     """A run of the machine with the small paddle, by the independent program."""
     made = record(OWN, seed=6, n=1000, dt=0.02, noise=noise)
@@ -107,20 +75,6 @@ def flight(noise=2e-3):
 
 
 FREE = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(4.0)}
-
-
-@pytest.mark.slow
-def test_with_the_paddle_known_if_is_determined_alone():
-    shared = check(Problem(models.roll_on_stand, vehicle(BENCH), [flight()], FREE)).verdict
-    assert not shared.identifiable
-    assert {c.name for c in shared.combinations} == {"a/Ixx", "a/If"}
-    apart = check(Problem(models.roll_on_stand, with_paddle(), [flight()], FREE)).verdict
-    assert not apart.identifiable
-    assert set(apart.undetermined) == {"Ixx", "a"}
-    assert {c.name for c in apart.combinations} == {"a/Ixx"}
-    # With a known too, both inertias stand.
-    two = {n: FREE[n] for n in ("Ixx", "If")}
-    assert check(Problem(models.roll_on_stand, with_paddle(), [flight()], two)).verdict.identifiable
 
 
 def test_a_fit_finds_the_flybar_that_was_swung():

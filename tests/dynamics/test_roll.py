@@ -12,7 +12,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.roll import ratios_from_denominator, roll_transfer_function
 from tests.dynamics.paper import BENCH, matrices, rates, scattered
 
-SEEDS = range(8)
+SEEDS = range(3)
 
 
 @jax.jit
@@ -26,7 +26,7 @@ def free_and_stand(p, state, inputs):
 def test_equations_21_and_22(seed):
     rng = np.random.default_rng(1000 + seed)
     v = scattered(seed)
-    for _ in range(5):
+    for _ in range(8):
         x, u = rng.standard_normal(4) * [0.3, 2.0, 0.1, 10.0], 1e-3 * rng.standard_normal()
         state = models.roll.State(*(jnp.asarray(s) for s in x))
         found = free_and_stand(Helicopter(**v), state, models.roll.Inputs(jnp.asarray(u)))
@@ -34,13 +34,6 @@ def test_equations_21_and_22(seed):
             wanted = rates(v, x, u, stand)
             scale = np.abs(rates(v, np.abs(x), 0.0, stand)) + np.abs(rates(v, 0 * x, u, stand))
             assert np.all(np.abs(np.array(one) - wanted) <= 1e-12 * (scale + np.abs(wanted)))
-
-
-def test_outputs_are_angle_and_rate(bench30):
-    state = models.roll.State(phi=0.1, dphi=0.2, beta_roll=0.3, dbeta_roll=0.4)
-    assert models.roll.output(bench30, state, models.roll.Inputs(0.0)) == (0.1, 0.2)
-    state = models.pitch.State(theta=0.1, dtheta=0.2, beta_pitch=0.3, dbeta_pitch=0.4)
-    assert models.pitch.output(bench30, state, models.pitch.Inputs(0.0)) == (0.1, 0.2)
 
 
 @pytest.mark.parametrize("stand", [False, True], ids=["free", "stand"])
@@ -93,12 +86,6 @@ def test_stable_if_and_only_if(seed, side):
     assert (found[1:].real.max() < 0) == (side < 1)
 
 
-def test_bench_has_a_slow_pole_as_in_equation_35(bench30):
-    found = modes(models.roll, bench30)
-    assert found[1] == pytest.approx(-5.6, abs=0.2)
-    assert np.all(found[1:].real < 0)
-
-
 @pytest.mark.parametrize("factor", [0.1, 3.0, 17.0])
 def test_ixx_if_a_times_one_number_change_nothing(bench30, factor):
     p = naming.replace(bench30, **{n: factor * getattr(bench30, n) for n in ("Ixx", "If", "a")})
@@ -142,14 +129,6 @@ def test_the_stand_stays_what_it_is_when_inertia_is_added(bench30, added):
     assert float(torque) == pytest.approx(-(0.096 * 0.1 + 0.0048 * 0.7), rel=1e-13)
 
 
-def test_added_inertia_on_a_free_machine_is_inertia(bench30):
-    heavy = naming.replace(bench30, Ixx_added=jnp.asarray(0.012))
-    same = naming.replace(bench30, Ixx=jnp.asarray(0.036))
-    np.testing.assert_allclose(
-        jacobians(models.roll, heavy).A, jacobians(models.roll, same).A, rtol=1e-14
-    )
-
-
 def test_pitch_is_roll_with_the_other_inertia():
     v = scattered(5)
     p = Helicopter(**{**v, "Iyy": v["Ixx"], "Iyy_added": v["Ixx_added"]})
@@ -161,19 +140,6 @@ def test_pitch_is_roll_with_the_other_inertia():
             np.testing.assert_array_equal(a, b)
     q = naming.replace(p, Ixx=jnp.asarray(9.0), Ixx_added=jnp.asarray(9.0))
     np.testing.assert_array_equal(jacobians(models.pitch, q).A, jacobians(models.pitch, p).A)
-
-
-def test_field_gives_what_its_class_says(bench30):
-    for model in (models.roll, models.pitch, models.roll_on_stand, models.pitch_on_stand):
-        x = model.initial_state(bench30)
-        u = model.Inputs(*[jnp.zeros(())])
-        assert isinstance(model.vector_field(bench30, x, u), model.State)
-        assert isinstance(model.output(bench30, x, u), model.Outputs)
-        assert naming.names(type(model.Inputs(0.0))) == naming.names(model.Inputs)
-        for record in (model.State, model.Inputs, model.Outputs):
-            for name in naming.names(record):
-                assert naming.unit(record, name)
-        assert model.linear
 
 
 def test_on_stand_needs_an_axis():
@@ -196,15 +162,6 @@ def test_ratios_from_a_denominator(seed, stand):
     assert float(found.values["a/Ixx"]) == pytest.approx(v["a"] / v["Ixx"], rel=1e-6)
     assert float(found.values["a/If"]) == pytest.approx(v["a"] / v["If"], rel=1e-6)
     assert float(found.p2) == pytest.approx(float(found.p2_expected), rel=1e-8)
-
-
-def test_ratios_of_pitch():
-    v = {**scattered(2)}
-    A, _ = matrices(v, True)
-    p = Helicopter(**{**v, "Iyy": v["Ixx"], "Iyy_added": v["Ixx_added"], "Ixx": 7.0})
-    found = ratios_from_denominator(p, np.poly(A), "pitch")
-    assert set(found.values) == {"a/Iyy", "a/If"}
-    assert float(found.values["a/Iyy"]) == pytest.approx(v["a"] / v["Ixx"], rel=1e-6)
 
 
 def test_another_structure_is_seen_in_the_coefficient_left_over(bench30):

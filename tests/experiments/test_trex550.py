@@ -35,13 +35,3 @@ def test_the_rest_is_predicted_where_the_lateral_stick_moves():
     assert 10.0 < seconds < 25.0
     # The more the stick moves, the more of the rate is its answer.
     assert found[0.2][1] < agreed < found[0.3][1]
-
-
-@pytest.mark.skipif(not LOG.exists(), reason="the T-Rex 550 log is not part of the project")
-def test_a_stick_moves_where_a_loop_over_the_samples_says_so():
-    experiment = runpy.run_path(str(ROOT / "experiments" / "trex550.py"))
-    log = experiment["read"](str(LOG))
-    found = experiment["stick_sd"](log)
-    lat = np.asarray(log.inputs["lat"])
-    for i in (1000, 2500, 5000):
-        assert found[i] == pytest.approx(np.std(lat[i - 200 : i + 200]), rel=1e-6)

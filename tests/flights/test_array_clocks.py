@@ -8,8 +8,6 @@ import scipy.io
 
 from heli_jax import cli, load_config
 from heli_jax.config import read_flights
-from heli_jax.errors import InputError
-from heli_jax.finding import LEFT_OUT
 from heli_jax.flights import describe_log
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import open_hdf5, open_mat
@@ -19,15 +17,12 @@ STICK = np.where(SLOW < 6, 0.0, 0.4 * np.sign(np.sin(2.1 * SLOW)))
 RATE = np.interp(FAST, SLOW, np.convolve(STICK, 0.2 * np.exp(-(SLOW - 5.0) / 0.2))[: SLOW.size])
 
 
-def test_new_takes_the_clock_of_each_group(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_new_takes_the_clock_of_each_group(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mat", tmp_path / "run.yaml"
     imu = {"time_ms": 1e3 * FAST, "gyro": np.column_stack([RATE, 0 * RATE, 0 * RATE])}
     log = {"imu": imu, "rc": {"t": SLOW, "aileron": STICK}, "temperature": np.arange(77.0)}
     scipy.io.savemat(path, {"log": log})
     assert cli.main(["new", str(path), "--out", str(out), "--model", "linear:roll"]) == 0
-    assert "left out, since no time of their length" in capsys.readouterr().err
     assert [n.value for n in describe_log(path).notes if n.code == "clock.of-arrays"] == [2]
     assert "time:" not in out.read_text()
     text = out.read_text().replace("rate: 50 ", "rate: 100")
@@ -40,10 +35,9 @@ def test_new_takes_the_clock_of_each_group(
 @pytest.mark.parametrize(
     ("names", "of"),
     [
-        # By the group, by the nearest above, and by the word before at one level.
+        # By the group, and by the nearest above.
         (("imu.t", "rc.t", "imu.x", "rc.x"), {"imu.x": "imu.t", "rc.x": "rc.t"}),
         (("time", "rc.t", "imu.x", "rc.x"), {"imu.x": "time", "rc.x": "rc.t"}),
-        (("imu_t", "t_rc", "imu_x", "rc_x"), {"imu_x": "imu_t", "rc_x": "t_rc"}),
     ],
 )
 def test_clocks_of_one_length_are_told_apart(tmp_path: Path, names, of) -> None:
@@ -72,16 +66,9 @@ def test_of_two_clocks_the_one_of_the_other_groups(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.channel("gps.speed").times, SLOW)
 
 
-def test_one_clock_is_none_of_several_and_ambiguous_ones_are_left(tmp_path: Path) -> None:
+def test_one_clock_is_none_of_several(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "a.mat", {"t": SLOW, "u": STICK, "p": STICK})
     assert by_clocks(open_mat(tmp_path / "a.mat")) is None
-    both = {"a_t": SLOW, "b_t": 2 * SLOW, "a_x": STICK, "b_x": STICK, "y": STICK}
-    scipy.io.savemat(tmp_path / "a.mat", both)
-    log = by_clocks(open_mat(tmp_path / "a.mat"))
-    assert log is not None
-    assert [n.subjects for n in log.notes if n.code == LEFT_OUT] == [("y",)]
-    with pytest.raises(InputError, match="no channel 'y'"):
-        log.topic_of("y")
 
 
 def test_groups_of_hdf5(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from heli_jax.config.logs import as_configured
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.named import by_preset
 
-from .test_convert_and_info import refused, table_of
+from .test_convert_and_info import table_of
 from .test_presets import ARDUPILOT, PHI, STICK, P, ardupilot_log
 
 
@@ -57,19 +57,3 @@ def test_the_signals_of_a_configuration(log, tmp_path):
     # Of two servos that stand 60 degrees from the nose, in whole microseconds.
     lift = 0.002 * np.round(STICK * 0.75**0.5 / 0.002) / 0.75**0.5
     np.testing.assert_allclose(unmixed["ccpm.roll"], lift, atol=1e-12)
-
-
-def test_names_that_are_refused(log, tmp_path, capsys):
-    out = tmp_path / "out.csv"
-    refused(capsys, ["convert", log, out, "--signals", "ccpm.roll"], "geometry", "signals.ccpm")
-    refused(capsys, ["convert", log, out, "--signals", "euler(ATT.Roll)"], "expected euler(Q).roll")
-    refused(capsys, ["convert", log, out, "--preset", "px4"], "no preset 'px4'; known are")
-    refused(
-        capsys,
-        ["convert", log, out, "--preset", "px4-helicopter"],
-        "holds no channel of preset px4-helicopter",
-        "preset ardupilot-helicopter",
-    )
-    wrong = ["--preset", "rotorflight", "--signals", "ATT.*"]
-    refused(capsys, ["convert", log, out, *wrong], "expected it without --signals")
-    assert not out.exists()

@@ -22,7 +22,7 @@ from .test_blackbox import some_flight
 FUZZ = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "fuzz_logs.py"))
 damaged, outcome = FUZZ["damaged"], FUZZ["outcome"]
 T, X = np.arange(60) / 50, np.sin(np.arange(60) / 3)
-COUNT = 30
+COUNT = 20
 
 
 def text(path):

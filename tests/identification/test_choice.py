@@ -1,38 +1,18 @@
 """The table of models prefers the one that made the record."""
 
-from typing import Annotated, Any, NamedTuple
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models, naming
+from heli_jax import Flight, Free, Problem, fit, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.model_selection import Candidate, _test, alternatives, choose
 from tests.identification.bench import steps
-from tests.identification.test_filter_error import FREE, made
-
-INERTIAS = {name: FREE[name] for name in ("Ixx", "If")}
-
-
-@pytest.mark.slow
-def test_two_poles_are_seen(bench30):
-    model, _, start, flight = made(bench30, 3, poles=2)
-    problem = Problem(model, start, [flight], INERTIAS, method="filter-error")
-    rivals = alternatives(problem, models.roll_on_stand, "roll")
-    assert list(rivals.problems) == ["no disturbance", "one pole", "two poles"]
-    found = choose(rivals.problems, rivals.nested)
-    assert [c.name for c in found.candidates] == ["two poles", "one pole", "no disturbance"]
-    assert found.candidates[0].white
-    one, two = (next(c for c in found.candidates if c.name == n) for n in ("one pole", "two poles"))
-    assert two.unknowns == one.unknowns
-    assert one.aic - two.aic > 10
-    assert found.sentences[0] == "AIC and BIC prefer: two poles."
-    for test in found.nested:
-        assert test.small == "no disturbance"
-        assert test.degrees == 2
-        assert test.p_value < 1e-6
+from tests.identification.test_filter_error import FREE
+from tests.identification.test_noise_guesses import W
+from tests.identification.test_noise_guesses import problem as swing
 
 
 @pytest.fixture(scope="module")
@@ -77,60 +57,19 @@ def test_no_unknown_more_is_no_test():
     assert test.p_value == pytest.approx(np.exp(-2.0), rel=1e-12)
 
 
-class Oscillator(NamedTuple):
-    w: Annotated[Any, "rad/s"]
-    b: Annotated[Any, "1/s^2"]
-
-
-class Motion(NamedTuple):
-    x: Annotated[Any, "rad"]
-    v: Annotated[Any, "rad/s"]
-
-
-class Push(NamedTuple):
-    u: Annotated[Any, "1"]
-
-
-class Angle(NamedTuple):
-    x: Annotated[Any, "rad"]
-
-
 @pytest.mark.slow
 def test_a_model_never_ends_below_one_nested_in_it():
-    # Undamped, and with a wrong frequency: the likelihood has an optimum at every beat.
-    model = Model(
-        "oscillator",
-        lambda q, s, u: Motion(s.v, q.b * u.u - q.w**2 * s.x),
-        lambda q, s, u: Angle(s.x),
-        Oscillator,
-        Motion,
-        Push,
-        Angle,
-        linear=True,
-        start=lambda q: Motion(0.0 * q.b, 0.0 * q.b),
-    )
-    n, dt = 1500, 0.02
-    rng = np.random.default_rng(0)
-    u = steps(rng, n, dt, 1.0)
-    system = scipy.signal.cont2discrete(([1.0], [1.0, 0.0, 4.0]), dt)
-    y = scipy.signal.lfilter(np.ravel(system[0]), system[1], u) + 0.01 * rng.standard_normal(n)
-    flight = Flight(dt=dt, inputs={"u": u}, outputs={"x": y})
-
-    def problem(free):
-        params = Oscillator(jnp.asarray(2.0), jnp.asarray(1.0))
-        return Problem(model, params, [flight], free, Nuisance(False, False))
-
-    both = {
-        "fixed": problem({"b": Free(0.5)}),
-        "free": problem({"b": Free(0.5), "w": Free(3.0)}),
-    }
+    # A wrong frequency: the likelihood has an optimum at every beat.
+    wrong = swing(0, 3.0)
+    record = wrong.flights[0]
+    wrong = replace(wrong, flights=[replace(record, outputs={"x": record.outputs["x"]})])
+    both = {"fixed": replace(wrong, free={"b": wrong.free["b"]}), "free": wrong}
     # From one start: where little is explained others would be gone to.
     alone = fit(both["free"], starts=1)
     found = choose(both, [("fixed", "free")], starts=1)
     small, large = (next(c for c in found.candidates if c.name == n) for n in ("fixed", "free"))
     assert alone.log_likelihood < small.log_likelihood - 100
     assert large.log_likelihood >= small.log_likelihood
-    assert large.estimates["w"] == pytest.approx(2.0, abs=0.01)
+    assert large.estimates["w"] == pytest.approx(W, abs=0.01)
     [test] = found.nested
     assert test.ratio >= 0
-    assert "free first ended below fixed, which is nested in it" in " ".join(found.sentences)

@@ -50,15 +50,6 @@ def test_few_missing_samples_leave_the_band_as_it_is():
     assert severities(without(f, slice(2000, 2100))) == ["ok"]
 
 
-def test_a_bridged_hole_is_a_straight_line():
-    f = swept()
-    [part] = seen_parts([without(f, slice(100, 103))]).parts
-    y = f.outputs["phi"]
-    expected = y[99] + (y[103] - y[99]) * np.array([0.25, 0.5, 0.75])
-    np.testing.assert_allclose(part.outputs["phi"][100:103], expected)
-    assert part.outputs["phi"][99] == y[99]
-
-
 def test_no_coherence_is_no_tick():
     f = swept()
     sparse = np.full(4000, np.nan)

@@ -81,8 +81,7 @@ def test_a_combination_may_be_wider_than_its_parts():
     assert parts[1] < both < parts[0]
 
 
-@pytest.mark.parametrize("missing", ["none", "every second", "a random half"])
-def test_deviations_and_intervals_hold_with_missing_samples(missing):
+def test_deviations_and_intervals_hold_with_missing_samples():
     """A line and slow waves fitted to AR(0.9) noise of 60 s: sd 0.9-1.1 of the real one, and 95 %
     of the intervals cover."""
     n, runs, rho = 3000, 200, 0.9
@@ -92,11 +91,7 @@ def test_deviations_and_intervals_hold_with_missing_samples(missing):
     rng = np.random.default_rng(6)
     errors, sds, quantiles = [], [], []
     for seed in range(runs):
-        seen = {
-            "none": np.ones(n, bool),
-            "every second": np.arange(n) % 2 == 0,
-            "a random half": rng.uniform(size=n) < 0.5,
-        }[missing]
+        seen = rng.uniform(size=n) < 0.5
         J = np.where(seen[:, None], whole, 0.0)
         y = np.where(seen, ar1(rho, seed, n), 0.0)
         estimate, *_ = np.linalg.lstsq(J, y, rcond=None)

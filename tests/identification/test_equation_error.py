@@ -1,7 +1,6 @@
 """Starts by equation error: against least squares by hand and known truth, with gaps, hidden
 states, stepwise selection, and in sentences where nothing can be done."""
 
-import json
 import math
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, linear_model, load_config, models, run_fit
+from heli_jax import Flight, Free, Model, linear_model, load_config, models
 from heli_jax.config import problem
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.errors import basis_of, covariance, partial_f
@@ -72,7 +71,7 @@ def values(start):
     return {n: v.value for n, v in start.values.items()}
 
 
-@pytest.mark.parametrize("half", [4, 8, 16])
+@pytest.mark.parametrize("half", [4, 16])
 def test_smoothing_keeps_polynomials_and_a_held_equation(half):
     t = DT * np.arange(200)
     y, first, second = smoothed(1.0 + 2.0 * t - 3.0 * t**2, DT, half)
@@ -117,7 +116,6 @@ def test_without_any_value_it_finds_what_least_squares_by_hand_finds():
     assert abs(found["Lphi"]) < 0.05
     assert [e.name for e in start.equations] == ["p"]
     assert start.equations[0].r_squared > 0.99
-    assert "the fit begins there, they are not its result" in start.sentences[0]
 
 
 def test_standard_errors_allow_for_residuals_with_a_memory():
@@ -180,24 +178,24 @@ def test_products_with_a_state_that_is_not_measured():
     assert start.hidden == ("b",)
     # A time constant of what is not measured needs a value from somewhere.
     without = p._replace(tau_f=math.nan)
-    with pytest.raises(ValueError, match=r"free\.tau_f\.start: missing.*time constant"):
+    with pytest.raises(ValueError, match=r"free\.tau_f\.start"):
         equation_error_start(file.model, without, [flight], dict.fromkeys(truth, UNKNOWN))
 
 
-def test_what_cannot_be_regressed_is_said(bench30):
+def test_what_cannot_be_regressed_is_refused(bench30):
     flight = record(n=300)
     sum_alone = Model("sum", vector_field, total, Params, State, Inputs, Total, linear=True)
     only = Flight(dt=DT, inputs=flight.inputs, outputs={"total": flight.outputs["p"]})
-    with pytest.raises(ValueError, match=r"no output \(total\) shows a state.*expected a start"):
+    with pytest.raises(ValueError, match="total"):
         equation_error_start(sum_alone, NOTHING, [only], FREE)
-    with pytest.raises(ValueError, match=r"is for linear models, and .* is none"):
+    with pytest.raises(ValueError, match="linear"):
         equation_error_start(models.helicopter("paper"), bench30, [flight], {"Ixx": UNKNOWN})
     short = Flight(
         dt=DT,
         inputs={"da": flight.inputs["da"][:20]},
         outputs={"p": flight.outputs["p"][:20], "phi": flight.outputs["phi"][:20]},
     )
-    with pytest.raises(ValueError, match="no stretch without missing samples"):
+    with pytest.raises(ValueError, match="missing samples"):
         equation_error_start(ROLL, NOTHING, [short], FREE)
 
 
@@ -212,8 +210,9 @@ B: {p: {da: K/tau}}
 """
 
 
-@pytest.mark.parametrize("vehicle", [{}, {"tau": 3.0, "K": -1.0}, {"tau": -0.2, "K": 1.0}])
-@pytest.mark.parametrize("stepwise", [None, (20.0, 10.0)])
+@pytest.mark.parametrize(
+    ("vehicle", "stepwise"), [({}, None), ({"tau": -0.2, "K": 1.0}, (20.0, 10.0))]
+)
 def test_a_parameter_that_something_is_divided_by(tmp_path, vehicle, stepwise):
     (tmp_path / "lag.yaml").write_text(LAG)
     model = linear_model(tmp_path / "lag.yaml").model
@@ -237,7 +236,7 @@ def test_equations_that_are_finite_nowhere_are_said(tmp_path, monkeypatch):
     only = replace(flight, outputs={"p": flight.outputs["p"]})
     monkeypatch.setattr("heli_jax.identification.equation_error.start._TRIED", (0.0,))
     free = {"tau": UNKNOWN, "K": UNKNOWN}
-    with pytest.raises(ValueError, match="not finite at any value tried of tau, K"):
+    with pytest.raises(ValueError, match="tau, K"):
         equation_error_start(model, model.Params(math.nan, math.nan), [only], free)
 
 
@@ -283,40 +282,17 @@ def config(tmp_path):
     return tmp_path / "fit.yaml"
 
 
-@pytest.mark.slow
-def test_a_configuration_without_starts_is_fitted(config, capsys):
-    from heli_jax.output import print_fit
-
-    said = []
-    run = run_fit(config, config.parent / "run", progress=said.append)
-    assert any("Start by equation error of Lp, Lda" in line for line in said)
-    assert run.fit.estimates["Lp"].value == pytest.approx(-4.0, rel=0.1)
-    content = json.loads((config.parent / "run" / "fit.json").read_text())
-    guess = content["equation_error_start"]
-    assert guess["values"]["Lp"]["origin"] == "equation error"
-    assert guess["values"]["Lp"]["sd"] > 0
-    assert guess["values"]["Lda"]["value"] > 26.0  # moved inside its bound
-    assert content["parameters"]["Lp"]["start"] == guess["values"]["Lp"]["value"]
-    page = (config.parent / "run" / "report.html").read_text()
-    assert "By equation error: where the fit began, not its result" in page
-    print_fit(run)
-    assert "Where the fit began, by equation error (no result)" in capsys.readouterr().out
-    # The copy runs again: what was left out is left out there too.
-    again = problem(load_config(config.parent / "run" / "config.yaml"))
-    assert again.free["Lp"].start == run.problem.free["Lp"].start
-
-
-def test_wrong_starts_are_said_in_a_sentence(config):
-    for override, words in (
+@pytest.mark.parametrize(
+    ("place", "override"),
+    [
         # Its own file's value, which a bound of the fit leaves out.
-        ({"fit.start": "given"}, r"fit: free\.Lda\.start: expected a value inside 26"),
-        (
-            {"fit.free": {"Lpp": {}}},
-            r"fit\.free: model aileron has no parameter 'Lpp'; did you mean 'Lp'",
-        ),
-        ({"fit.start": "guess"}, r"fit\.start\.method.*'guess'"),
-        ({"fit.start": {"method": "given", "stepwise": True}}, "stepwise: expected method"),
-        ({"fit.start.f_remove": 30}, "f_remove: expected at most f_enter"),
-    ):
-        with pytest.raises(InputError, match=words):
-            problem(load_config(config, override))
+        (r"free\.Lda\.start", {"fit.start": "given"}),
+        (r"fit\.free", {"fit.free": {"Lpp": {}}}),
+        (r"fit\.start\.method", {"fit.start": "guess"}),
+        ("stepwise", {"fit.start": {"method": "given", "stepwise": True}}),
+        ("f_remove", {"fit.start.f_remove": 30}),
+    ],
+)
+def test_wrong_starts_are_refused_with_their_place(config, place, override):
+    with pytest.raises(InputError, match=place):
+        problem(load_config(config, override))

@@ -9,7 +9,6 @@ from heli_jax.identification.estimation.estimator import Estimator, Residuals
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.methods import METHODS, Method
 from heli_jax.identification.uncertainty.comparison import intervals
-from heli_jax.report.card import card
 from heli_jax.report.drawings import Analysis
 from heli_jax.report.html import write_report
 from tests.identification.bench import BENCH, record, vehicle
@@ -66,32 +65,5 @@ def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     assert found.noise["flight 1/roll"] == pytest.approx(1e-3, rel=0.15)
     by = intervals(found, profiles=[], runs=40).by_parameter["Ixx"]
     assert by["bootstrap"][0] < BENCH["Ixx"] < by["bootstrap"][1]
-    assert {g.passed for g in card(problem, found) if g.what.startswith("Cramer")} <= {True, None}
     write_report(tmp_path, Analysis(found, problem), "differences", {})
     assert "least squares on differences" in (tmp_path / "report.html").read_text()
-
-
-@pytest.mark.slow
-def test_three_parameters_are_no_more_identifiable_by_another_method(differences):
-    free = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0)}
-    problem = Problem(
-        models.roll_on_stand,
-        vehicle(BENCH),
-        [record(BENCH, seed=3, n=1500, noise=1e-3)],
-        free,
-        Nuisance(bias=False),
-        method="differences",
-    )
-    assert set(check(problem).verdict.undetermined) == {"Ixx", "If", "a"}
-
-
-def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(
-        ValueError,
-        match="expected one of output-error, filter-error, frequency-error, frequency-response, "
-        "got 'x'",
-    ):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [record(BENCH, seed=3, n=1500)],
-            {"Ixx": Free(0.03)}, method="x",
-        )  # fmt: skip

@@ -1,22 +1,19 @@
 """What slopes at one point do not tell: sums that look like products, parameters that may be
 exchanged, bounds, and swings that the samples hardly show."""
 
-from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
-from heli_jax.identification.frequency_start import frequency_error_start
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.problem import MAX_TIME_SHIFT
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.uncertainty.estimates import with_limits
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
-from heli_jax.report.document import VerdictContent, written
 from tests.identification.test_enough import steps
 
 DT, N = 0.02, 1000
@@ -89,22 +86,16 @@ def fitted(model, record, **free):
     return fit(Problem(model, TRUTH, [record], free, Nuisance(bias=False)))
 
 
-@pytest.mark.parametrize(
-    "starts", [(-1.0, -1.0), pytest.param((-0.5, -2.5), marks=pytest.mark.slow)]
-)
-def test_of_a_sum_nothing_but_the_sum_is_said_to_be_determined(starts):
-    record, (La, Lb) = FIRST, starts
-    found = fitted(SUM, record, La=Free(La), Lb=Free(Lb), K=Free(3.0))
+def test_of_a_sum_nothing_but_the_sum_is_determined():
+    found = fitted(SUM, FIRST, La=Free(-1.0), Lb=Free(-1.0), K=Free(3.0))
     assert found.status == "not-identifiable"
     [c] = found.verdict.combinations
     assert (c.name, c.kind, c.exponents) == ("La + Lb", "sum", {"La": 1.0, "Lb": 1.0})
     assert c.lower95 < -3.0 < c.upper95
     # The oracle: one of the two known, the other is as sure as the sum.
-    alone = fitted(SUM, record, La=Free(La), K=Free(3.0)).estimates["La"]
+    alone = fitted(SUM, FIRST, La=Free(-1.0), K=Free(3.0)).estimates["La"]
     assert c.value == pytest.approx(alone.value + TRUTH.Lb, rel=1e-4)
     assert c.sd == pytest.approx(alone.sd, rel=0.02)
-    assert "The data determine only La + Lb of La and Lb" in found.verdict.text
-    assert written(VerdictContent, found.verdict)["determined_combinations"][0]["kind"] == "sum"
 
 
 def test_a_product_is_one_far_from_the_optimum_too():
@@ -114,47 +105,19 @@ def test_a_product_is_one_far_from_the_optimum_too():
     assert c.lower95 < 10.0 < c.upper95
 
 
-@pytest.mark.parametrize("starts", [(0.06, 0.3), (0.4, 0.03)])
-def test_two_lags_in_series_are_told_to_be_exchangeable(starts):
-    T1, T2 = (Free(s, sign="keep") for s in starts)
+def test_two_lags_in_series_are_told_to_be_exchangeable():
+    T1, T2 = (Free(s, sign="keep") for s in (0.4, 0.03))
     found = fitted(LAGS, SECOND, T1=T1, T2=T2, K=Free(3.0))
-    assert found.verdict.twins == (("T1", "T2"),)
+    assert [other.changed for other in found.verdict.second] == [("T1", "T2")]
     assert found.status == "not-identifiable"
     assert found.not_identifiable == ("T1", "T2")
-    assert "T1 and T2 can be exchanged" in found.verdict.text
-    assert "The data determine K." in found.verdict.text
     assert sorted(found.estimates[n].value for n in ("T1", "T2")) == pytest.approx(
         [0.06, 0.3], rel=0.1
     )
 
 
-@pytest.mark.slow
-def test_a_start_by_frequency_error_takes_either_of_two_solutions():
-    free = {"T1": Free(0.6), "T2": Free(0.02)}
-    problem = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
-    guess = frequency_error_start(problem)
-    assert {v.origin for v in guess.values.values()} == {"frequency error"}
-    assert sorted(v.value for v in guess.values.values()) == pytest.approx([0.06, 0.3], rel=0.1)
-    assert "at one of the solutions that the spectra do not tell apart" in " ".join(guess.sentences)
-
-
-@pytest.mark.slow
-def test_bounds_that_tell_lags_apart_are_enough():
-    T1, T2 = Free(0.2, lower=0.12, upper=2.0), Free(0.05, lower=0.01, upper=0.12)
-    problem = Problem(LAGS, TRUTH, [SECOND], {"T1": T1, "T2": T2}, Nuisance(bias=False))
-    assert fit(problem).verdict.twins == ()
-    assert check(problem).verdict.twins == ()
-    free = {"T1": Free(0.2, sign="keep"), "T2": Free(0.05, sign="keep")}
-    open_ = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
-    assert check(open_).verdict.twins == (("T1", "T2"),)
-
-
-@pytest.mark.parametrize(
-    "method", ["output-error", pytest.param("frequency-error", marks=pytest.mark.slow)]
-)
-def test_a_parameter_at_its_bound_is_not_determined_and_no_failure(method):
-    free = {"La": Free(-0.1, lower=-0.5), "K": Free(3.0)}
-    found = fit(Problem(SUM, TRUTH, [FIRST], free, Nuisance(bias=False), method=method))
+def test_a_parameter_at_its_bound_is_not_determined_and_no_failure():
+    found = fitted(SUM, FIRST, La=Free(-0.1, lower=-0.5), K=Free(3.0))
     assert found.status == "converged"
     bound = found.findings[0]
     assert (bound.code, bound.subjects) == ("fit.at-bound", ("La",))
@@ -162,8 +125,6 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure(method):
     # What the others are is that of a bound which the data do not bear out.
     assert "K" in found.untrusted
     assert found.exit_code == 3
-    assert "La is at its bound, -0.5" in found.verdict.text
-    assert "determine La" not in found.verdict.text
     estimate = found.estimates["La"]
     assert estimate.at_bound
     assert estimate.lower95 in (None, -0.5)
@@ -176,16 +137,6 @@ def test_no_interval_of_a_time_shift_is_wider_than_its_search():
     shift = Estimate(end, 0.18, 0.1, 0.85, "s", 0.0, 0.0, at_bound=True)
     found = with_limits({"time_shift": shift}, {"time_shift": (0.003, 1.26)})["time_shift"]
     assert (found.lower95, found.upper95) == (0.003, MAX_TIME_SHIFT)
-
-
-@pytest.mark.slow
-def test_a_shift_beyond_its_search_ends_there():
-    late = replace(FIRST, inputs={"u": np.roll(U, -40)})
-    free = {"K": Free(8.0)}
-    fitted = fit(Problem(SUM, TRUTH, [late], free, Nuisance(bias=False, time_shift=True)))
-    estimate = fitted.nuisance["time_shift"]
-    assert estimate.at_bound
-    assert estimate.upper95 is None or estimate.upper95 <= MAX_TIME_SHIFT
 
 
 def test_a_fast_swing_is_no_white_noise():
@@ -201,36 +152,17 @@ def test_a_fast_swing_is_no_white_noise():
     assert white_part(slow) == noise_guess(slow)
 
 
-@pytest.mark.parametrize(
-    "method", ["frequency-error", pytest.param("frequency-response", marks=pytest.mark.slow)]
-)
-def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate(method):
+def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate():
     rng = np.random.default_rng(3)
     drift = scipy.signal.lfilter([0.05], [1.0, -0.95], rng.standard_normal(N))
     record = flight(drift, noise=0.0)
     free = {"La": Free(-1.0), "K": Free(3.0)}
-    problem = Problem(SUM, TRUTH, [record], free, Nuisance(bias=False), method=method)
+    problem = Problem(SUM, TRUTH, [record], free, Nuisance(bias=False), method="frequency-error")
     assert outputs_against_excitation(problem)["p"] > 0.01
-    found = fit(problem)
+    found = fit(problem, starts=1)
     assert not found.adequate
     assert found.adequacy.by_chance
     [none] = [f for f in found.findings if f.denies]
     assert (none.code, none.severity) == ("excitation.no-output-follows", "refuse")
     assert "loop.no-instrument" not in {f.code for f in found.findings}
     assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
-
-
-@pytest.mark.slow
-def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
-    phi = np.full(N, np.deg2rad(3.0))
-    record = Flight(dt=DT, inputs={"u": U}, outputs={"p": FIRST.outputs["p"], "s": phi})
-    both = Model(
-        "both",
-        LAGS.vector_field,
-        lambda q, x, i: x,
-        Params, Two, Inputs, Two, linear=True,
-    )  # fmt: skip
-    free = {"T1": Free(0.3), "K": Free(10.0)}
-    found = fit(Problem(both, TRUTH, [record], free, Nuisance(bias=False)), starts=1)
-    [still] = [f for f in found.findings if f.code == "quality.never-moves"]
-    assert still.subjects == ("s",)

@@ -7,8 +7,11 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, linear_model
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.model import Axis
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.follows_response import feedback
+from heli_jax.naming import asdict
 from tests.identification.test_equation_error import ROLL, Params
 
 DT, LATE = 0.02, 5
@@ -36,13 +39,13 @@ def record(seed, gain, kind="steps", n=1000, gust=1.0):
 
 @pytest.mark.parametrize("kind", ["steps", "smooth"])
 def test_in_an_open_loop_there_are_hardly_false_alarms(kind):
-    alarms = [any(f.present for f in feedback(record(s, 0.0, kind))) for s in range(50)]
-    assert sum(alarms) <= 2
+    alarms = [any(f.present for f in feedback(record(s, 0.0, kind))) for s in range(20)]
+    assert sum(alarms) <= 1
 
 
 def test_a_pilot_who_holds_the_bank_angle_is_found():
-    found = [feedback(record(s, 0.3)) for s in range(10)]
-    assert sum(any(f.present for f in one) for one in found) >= 9
+    found = [feedback(record(s, 0.3)) for s in range(5)]
+    assert sum(any(f.present for f in one) for one in found) >= 4
     (one,) = found[0]
     # He takes the stick against the motion, no sooner than he sees it.
     assert one.correlation < 0
@@ -72,14 +75,13 @@ def seen(seed, gain, noise, frequency, machine, rate=100.0):
 
 
 def test_slow_feedback_shows_through_a_noisy_sensor():
-    found = [feedback(seen(s, 0.15, 0.7, 1.0, (0.7, -14.0, 0.1))) for s in range(6)]
-    assert sum(one[0].present for one in found) >= 5
+    found = [feedback(seen(s, 0.15, 0.7, 1.0, (0.7, -14.0, 0.1))) for s in range(4)]
+    assert sum(one[0].present for one in found) >= 3
 
 
-@pytest.mark.parametrize("rate", [50.0, 100.0])
-def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback(rate):
+def test_a_quick_stick_before_a_quiet_sensor_is_no_feedback():
     # What the stick does within a sample moves the machine, and the stick goes on from there.
-    records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), rate) for s in range(6)]
+    records = [seen(s, 0.0, 1e-4, 8.0, (5.0, 5.0, 0.02), 50.0) for s in range(4)]
     assert sum(feedback(record)[0].present for record in records) <= 1
 
 
@@ -104,9 +106,9 @@ def logged_late(seed, samples, n=2000):
 
 
 def test_a_stick_that_is_logged_late_is_taken_when_it_acted():
-    late = [logged_late(s, 3) for s in range(4)]
+    late = [logged_late(s, 3) for s in range(2)]
     # As logged it follows what it caused itself.
-    assert sum(any(f.present for f in feedback(flight)) for flight in late) >= 3
+    assert sum(any(f.present for f in feedback(flight)) for flight in late) == 2
     # 0.06 s, and a little more than it was: as the interval of an estimate has it.
     for earlier in (0.06, 0.063):
         found = [feedback(flight, 1, {"da": earlier}) for flight in late]
@@ -160,12 +162,11 @@ def test_steps_without_any_other_motion_are_no_feedback():
     assert feedback(short) == ()
 
 
-@pytest.mark.parametrize("tau", [0.08, 0.12])
-def test_programmed_doublets_that_a_filter_rounded_are_no_feedback(tau):
+def test_programmed_doublets_that_a_filter_rounded_are_no_feedback():
     # A command as autopilots shape it: no corner of it is a single jump, and it comes to rest by
     # and by. Nothing follows anything, and nothing is measured with noise.
     pattern = np.repeat([0.0, 0.3, -0.3, 0.0], [100, 40, 40, 170])
-    keep = np.exp(-DT / tau)
+    keep = np.exp(-DT / 0.08)
     u = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], np.tile(pattern, 12))
     phi, p, v = np.zeros(u.size), np.zeros(u.size), 0.0
     for k in range(u.size - 1):
@@ -200,10 +201,7 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     opened = tuple(f._replace(p_value=0.5) for f in found)
     assert feedback_notes(problem, opened) == []
     # Filter error asks for nothing but whiteness.
-    from heli_jax.dynamics.disturbance import with_disturbance
-    from heli_jax.naming import asdict
-
-    axes = replace_axes(ROLL)
+    axes = replace(ROLL, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
     model = with_disturbance(axes, "roll")
     params = model.Params(**asdict(Params(-4.0, 25.0, 0.0)))
     filtered = Problem(model, params, [flight], {"Lp": Free(-3.0)}, method="filter-error")
@@ -212,13 +210,30 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     assert feedback_notes(filtered, found)
 
 
-def replace_axes(model):
-    from heli_jax.dynamics.model import Axis
-
-    return replace(model, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
-
-
 def test_a_record_of_less_than_a_block_tells_nothing():
     times = 1e-7 * np.arange(6000)
     flight = Flight(1e-7, {"u": np.sin(1e4 * times)}, {"p": np.cos(1e4 * times)})
     assert feedback(flight) == ()
+
+
+def shared_line(loop, shared):
+    """Roll by a chirp, with a rotor's line at 24 Hz in the rate, or in the stick too, or with a
+    pilot."""
+    rng, dt, n = np.random.default_rng(4), 0.01, 4000
+    t = np.arange(n) * dt
+    wander = scipy.signal.lfilter([0.02], [1, -0.98], rng.standard_normal(n))
+    turned = np.cumsum(48 * np.pi * (1 + 0.01 * wander)) * dt
+    gust = scipy.signal.lfilter([0.01], [1, -0.97], rng.standard_normal(n))
+    stick, rate = 0.4 * np.sin(0.5 * t + 0.25 * t**2), np.zeros(n)
+    for k in range(1, n):
+        stick[k] -= loop * rate[k - 1]
+        rate[k] = 0.9 * rate[k - 1] + 0.2 * stick[k - 1] + gust[k] * bool(loop)
+    rate = rate + 0.01 * rng.standard_normal(n) + 0.2 * np.sin(turned)
+    stick = stick + shared * np.sin(turned + 1) + 1e-4 * rng.standard_normal(n)
+    return Flight(dt=dt, inputs={"lat": stick}, outputs={"p": rate})
+
+
+@pytest.mark.parametrize(("loop", "shared"), [(0.0, 0.02), (0.0, 0.1), (0.05, 0.0)])
+def test_a_line_in_stick_and_gyro_is_no_feedback(loop, shared):
+    (found,) = feedback(shared_line(loop, shared))
+    assert found.present == bool(loop)

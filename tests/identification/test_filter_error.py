@@ -23,9 +23,8 @@ from heli_jax.identification.validation.inputs_explain import (
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
-from tests.dynamics.paper import BENCH, matrices
 
-DT, N = 0.02, 2000
+DT, N = 0.02, 1000
 TRUTH = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 1.0}
 FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
 
@@ -56,13 +55,12 @@ def disturbed(bench30):
 def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
     # A record of gusts alone: what follows of it for the machine stands and falls with the noise.
     _, problem, first = disturbed
-    record = made(bench30, 1, amplitude=1e-10)[3]
-    found = fit(dataclasses.replace(problem, flights=[record]))
-    assert found.status == "not-identifiable"
-    said = unless_inputs_explain_nothing(*point(found), first.verdict)
+    gusts = dataclasses.replace(problem, flights=[made(bench30, 1, amplitude=1e-10)[3]])
+    at = first.reached._replace(data=data_of(gusts, gusts.training))
+    e = evaluate(at.layout, at.data, at.noise, at.z)
+    said = unless_inputs_explain_nothing(at, e, first.verdict)
     assert not said.identifiable
     assert said.undetermined == ("Ixx", "If", "kappa")
-    assert "do not determine Ixx, If or kappa: x_roll explains nothing" in said.text
     # With the stick as it was the verdict stands, and where none moves, as in a free decay.
     assert gain_of_inputs(*point(first)) > 100.0
     assert first.verdict.identifiable
@@ -84,19 +82,17 @@ def errors(found, params):
     return {n: (e.value - float(getattr(params, n))) / e.sd for n, e in found.estimates.items()}
 
 
-def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(bench30, disturbed):
-    params, problem, first = disturbed
-    other = dataclasses.replace(problem, flights=[made(bench30, 0)[3]])
-    for found in (first, fit(other)):
-        assert found.status == "converged"
-        assert found.steps <= 40
-        assert all(abs(e) < 4 for e in errors(found, params).values())
-        assert found.estimates["Ixx"].sd < 0.1 * float(params.Ixx)
-        for name in ("sigma_w", "tau_w"):
-            one = found.nuisance[name]
-            assert abs(np.log(one.value / TRUTH[name])) < 4 * one.sd / one.value
-        assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
-        assert found.white
+def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(disturbed):
+    params, _, found = disturbed
+    assert found.status == "converged"
+    assert found.steps <= 40
+    assert all(abs(e) < 4 for e in errors(found, params).values())
+    assert found.estimates["Ixx"].sd < 0.15 * float(params.Ixx)
+    for name in ("sigma_w", "tau_w"):
+        one = found.nuisance[name]
+        assert abs(np.log(one.value / TRUTH[name])) < 4 * one.sd / one.value
+    assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
+    assert found.white
 
 
 def test_white_noise_alone_ends_as_output_error(bench30):
@@ -111,136 +107,19 @@ def test_white_noise_alone_ends_as_output_error(bench30):
     assert "noise.no-disturbance" in {f.code for f in filtered.findings}
 
 
-@pytest.mark.slow
-def test_damping_of_stand_and_flybar_are_named_together(bench30):
-    model, _, start, flight = made(bench30, 0)
-    found = fit(Problem(model, start, [flight], {**FREE, "zeta": Free(0.3)}, method="filter-error"))
-    text = found.verdict.text
-    assert all(part in text for part in ("If", "zeta", "fix one of"))
-
-
-def test_a_model_without_disturbance_is_refused(bench30):
-    _, _, _, flight = made(bench30, 0)
-    with pytest.raises(ValueError, match="has no disturbance"):
-        Problem(models.roll_on_stand, bench30, [flight], FREE, method="filter-error")
-
-
-@pytest.mark.parametrize(
-    "fixed",
-    [
-        ("sigma_y", "tau_w"),
-        ("sigma_w", "tau_w", "sigma_y"),
-    ],
-    ids=" ".join,
-)
-@pytest.mark.slow
-def test_noise_may_be_fixed(disturbed, fixed):
-    params, problem, free = disturbed
-    start = replace(problem.vehicle, sigma_w=params.sigma_w, tau_w=params.tau_w)
-    flights = [dataclasses.replace(problem.flights[0], sd={"roll": 2e-3})]
-    found = fit(dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed))
-    assert found.status == "converged"
-    assert found.nuisance.keys().isdisjoint(fixed)
-    assert all(abs(e) < 4 for e in errors(found, params).values())
-    for name, one in found.estimates.items():
-        assert one.sd == pytest.approx(free.estimates[name].sd, rel=0.4)
-        assert one.value == pytest.approx(free.estimates[name].value, abs=one.sd)
-    assert 0.0 <= free.log_likelihood - found.log_likelihood < 8.0
-    assert found.noise == {"flight 1/roll": 2e-3}
-
-
 def test_missing_samples_cost_information_and_no_more(disturbed):
     params, problem, _ = disturbed
     [flight] = problem.flights
     roll = flight.outputs["roll"].copy()
     gone = np.random.default_rng(0).uniform(size=N) < 0.3
-    gone[400:600] = True
+    gone[400:500] = True
     flight = dataclasses.replace(flight, outputs={"roll": np.where(gone, np.nan, roll)})
-    for method in ("filter-error", "output-error"):
-        found = fit(dataclasses.replace(problem, flights=[flight], method=method))
-        assert found.status == "converged"
-        assert found.n_samples == np.count_nonzero(~gone)
-        assert all(abs(e) < 4 for e in errors(found, params).values())
-        simulated = found.signals[0].simulated["roll"]
-        assert np.isfinite(simulated).all()
-        assert np.isfinite(found.metrics["roll"].vaf)
-
-
-def test_an_output_of_every_tenth_sample(disturbed):
-    """The same programs as above: a slow sensor is one of which most samples are missing."""
-    params, problem, first = disturbed
-    [flight] = problem.flights
-    roll = np.where(np.arange(N) % 10 == 7, flight.outputs["roll"], np.nan)
-    flight = dataclasses.replace(flight, outputs={"roll": roll})
     found = fit(dataclasses.replace(problem, flights=[flight]))
     assert found.status == "converged"
-    assert found.n_samples == N // 10
+    assert found.n_samples == np.count_nonzero(~gone)
     assert all(abs(e) < 4 for e in errors(found, params).values())
-    for name, one in found.estimates.items():
-        full = first.estimates[name]
-        # At other estimates the same information is another sd: not exactly larger.
-        assert one.sd > 0.9 * full.sd
-        assert one.value == pytest.approx(full.value, abs=2.0 * one.sd)
-
-
-@pytest.mark.slow
-def test_outputs_of_different_quality_get_each_its_noise(bench30):
-    model, params, start, flight = made(bench30, 2)
-    rng = np.random.default_rng(7)
-    run = simulate(
-        model,
-        params,
-        model.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"])),
-        dt=DT,
-        key=jax.random.key(2),
-    )
-    rate = np.asarray(run.outputs.roll_rate) + 0.05 * rng.standard_normal(N)
-    both = Flight(dt=DT, inputs=flight.inputs, outputs={**flight.outputs, "roll_rate": rate})
-    found = fit(Problem(model, start, [both], FREE, method="filter-error"))
-    assert found.status == "converged"
-    assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
-    assert found.noise["flight 1/roll_rate"] == pytest.approx(0.05, rel=0.05)
-    assert all(abs(e) < 4 for e in errors(found, params).values())
-
-
-@pytest.mark.slow
-def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
-    """Truth by Euler-Maruyama in NumPy; the stand's spring is a sine."""
-    n, fine = 1500, 40
-    A, B, *_ = (np.asarray(m) for m in matrices(BENCH, True))
-    A = A.copy()
-    A[1, 0] = 0.0
-    rng = np.random.default_rng(11)
-    u = 3e-6 * random_steps(n, DT, rng, (0.2, 1.5))
-    h = DT / fine
-    x, w, y = np.zeros(4), 0.0, np.empty(n)
-    kicks = rng.standard_normal((n, fine)) * 1.04 * np.sqrt(2.0 * h)
-    for k in range(n):
-        y[k] = x[0]
-        for j in range(fine):
-            rates = A @ x + B[:, 0] * u[k]
-            rates[1] += w - 4.0 * np.sin(6.0 * x[0]) / 6.0
-            x, w = x + h * rates, w - h * w + kicks[k, j]
-    y += 2e-3 * rng.standard_normal(n)
-    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
-
-    def field(p, s, u):
-        rates = models.roll_on_stand.vector_field(p, s, u)
-        return replace(rates, dphi=rates.dphi - p.kappa * (jnp.sin(6.0 * s.phi) / 6.0 - s.phi))
-
-    spring = dataclasses.replace(
-        models.roll_on_stand, name="sine spring", vector_field=field, linear=False
-    )
-    model = with_disturbance(spring, "roll")
-    _, params, start, _ = made(bench30, 0)
-    problem = Problem(
-        model, start, [flight], {"Ixx": Free(0.03), "kappa": Free(3.0)}, method="filter-error",
-        substeps=2,
-    )  # fmt: skip
-    found = fit(problem)
-    assert found.status == "converged"
-    assert found.white
-    assert all(abs(e) < 4 for e in errors(found, params).values())
+    assert np.isfinite(found.signals[0].simulated["roll"]).all()
+    assert np.isfinite(found.metrics["roll"].vaf)
 
 
 def test_noise_that_cannot_be_is_told(disturbed):
@@ -248,17 +127,17 @@ def test_noise_that_cannot_be_is_told(disturbed):
     [flight] = problem.flights
     start = replace(problem.vehicle, sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(1.0))
 
-    def run(sd):
+    def run(sd, steps):
         flights = [dataclasses.replace(flight, sd={"roll": sd})]
         fixed = ("sigma_w", "tau_w", "sigma_y")
         fixed_ = dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed)
-        return fit(fixed_, max_steps=30)
+        return fit(fixed_, max_steps=steps)
 
-    too_small = run(2e-4)
+    too_small = run(2e-4, 30)
     [size] = [f for f in too_small.findings if f.code == "noise.innovations-size"]
     assert size.value == pytest.approx(10.0, rel=0.2)
     assert too_small.untrusted == tuple(too_small.estimates)
-    no_digits = run(1e-13)
+    no_digits = run(1e-13, 5)
     assert no_digits.status == "not-converged"
     # Of rounding nothing is known: no interval, and no word of where the optimiser stopped.
     assert all(e.sd is None and e.lower95 is None for e in no_digits.estimates.values())

@@ -103,16 +103,6 @@ def test_noise_before_a_slow_filter_is_no_gust_and_no_faster_rotor(roll):
     assert abs(noise.value - true) < 3 * noise.sd
 
 
-@pytest.mark.slow
-def test_white_noise_over_it_does_not_hide_it(roll):
-    # Taken for white: sigma_w 19, tau_w gone, Lb, tau_f and Blat not determined.
-    found = fit(problem(roll, record(2, 10.0, 0.027), 10.0))
-    assert found.adequate is True
-    for name, true in (("Lb", 120.0), ("tau_f", 0.06), ("Blat", 0.14)):
-        estimate = found.estimates[name]
-        assert estimate.lower95 < true < estimate.upper95, name
-
-
 def test_it_is_unknown_only_where_the_samples_bear_it_out(roll):
     assert problem(roll, record(2, 10.0, 5e-4), 10.0).filtered_noise
     # As much white noise over it, which is all that the fastest differences see.

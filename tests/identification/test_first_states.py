@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 from heli_jax import Helicopter, models, naming
-from heli_jax.dynamics.start import starting_at
+from heli_jax.dynamics.check_model import starting_at
 from heli_jax.identification.unknowns.initial_guess import own_start
 from tests.dynamics import full_helicopter as oracle
 

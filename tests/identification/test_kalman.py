@@ -95,29 +95,29 @@ def likelihood(model, params, u, y, x0, **how):
 
 
 @pytest.mark.parametrize("poles", [1, 2])
-@pytest.mark.parametrize("missing", [False, True], ids=["whole", "with missing samples"])
-def test_log_likelihood_is_that_of_the_dense_gaussian(bench30, poles, missing):
+def test_log_likelihood_is_that_of_the_dense_gaussian(bench30, poles):
     model, params, u, y = case(bench30, poles)
-    if missing:
-        y["roll"][[0, 7, 8]] = np.nan
-        y["roll_rate"][8:20] = np.nan
+    y["roll"][[0, 7, 8]] = np.nan
+    y["roll_rate"][8:20] = np.nan
     x0 = [0.01, -0.2, 1e-5, 1e-3, *[0.0] * poles]
     wanted = dense(model, params, u, y, x0)
     assert float(likelihood(model, params, u, y, x0)) == pytest.approx(wanted, rel=1e-8)
 
 
-@pytest.mark.parametrize("name", ["Ixx", "If", "sigma_w", "tau_w"])
-def test_gradient_is_that_of_finite_differences(bench30, name):
+def test_gradient_is_that_of_finite_differences(bench30):
     model, params, u, y = case(bench30, 1)
     x0 = [0.01, -0.2, 1e-5, 1e-3, 0.0]
+    moved = ("Ixx", "If", "sigma_w", "tau_w")
 
+    @jax.jit
     def at(z):
-        return likelihood(model, replace(params, **{name: jnp.exp(z)}), u, y, x0)
+        values = dict(zip(moved, jnp.exp(z), strict=True))
+        return likelihood(model, replace(params, **values), u, y, x0)
 
-    z = float(np.log(float(getattr(params, name))))
-    h = 1e-5
-    wanted = (float(at(jnp.asarray(z + h))) - float(at(jnp.asarray(z - h)))) / (2 * h)
-    assert float(jax.jacfwd(at)(jnp.asarray(z))) == pytest.approx(wanted, rel=1e-5)
+    z = np.log([float(getattr(params, n)) for n in moved])
+    steps = 1e-5 * np.eye(4)
+    wanted = [(at(jnp.asarray(z + h)) - at(jnp.asarray(z - h))) / 2e-5 for h in steps]
+    np.testing.assert_allclose(jax.jacfwd(at)(jnp.asarray(z)), wanted, rtol=1e-5)
 
 
 def test_without_a_disturbance_the_innovations_are_the_simulation_error(bench30):
@@ -139,12 +139,10 @@ def test_a_late_input_acts_late(bench30):
     assert float(a) == pytest.approx(float(b), rel=1e-9)
 
 
-@pytest.mark.parametrize("poles", [1, 2])
-@pytest.mark.parametrize("delay", [None, 0.033], ids=["at once", "late"])
-def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30, poles, delay):
-    model, params, u, y = case(bench30, poles)
+def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30):
+    model, params, u, y = case(bench30, 2)
     y["roll"][[0, 7, 8]] = np.nan
-    delay = None if delay is None else jnp.asarray(delay)
+    delay = jnp.asarray(0.033)
 
     def run(model):
         inputs = model.Inputs(x_roll=jnp.asarray(u))
@@ -155,17 +153,6 @@ def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30, poles,
     for n, sd in SD.items():
         np.testing.assert_allclose(extended.error[n], exact.error[n], rtol=1e-10, atol=1e-10 * sd)
         np.testing.assert_allclose(extended.variance[n], exact.variance[n], rtol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({}, "expected dt, .* got None"), ({"dt": DT, "solver": "rk4"}, "expected no solver")],
-)
-def test_an_option_of_simulations_alone_is_refused(bench30, options, message):
-    model, params, u, y = case(bench30, 1)
-    inputs = model.Inputs(x_roll=jnp.asarray(u))
-    with pytest.raises(TypeError, match=message):
-        innovations(model, params, inputs, y, SD, **options)
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero-order"])
@@ -256,7 +243,7 @@ def joint_filter(y, u, Nr, Nped, sigma, tau, sd):
     return total
 
 
-@pytest.mark.parametrize("Nr", [-0.5, 0.5, 0.8, 2.0])
+@pytest.mark.parametrize("Nr", [-0.5, 2.0])
 def test_an_unstable_machine_over_a_long_record(tmp_path, Nr):
     # exp(2.0 * 60 s) is 1e52: what rounding leaves that no correction sees grows by that.
     model, params = unstable_yaw(tmp_path, Nr)

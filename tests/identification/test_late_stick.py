@@ -3,49 +3,19 @@
 Records are made by SciPy at 1 kHz and logged at 50 Hz.
 """
 
-from typing import NamedTuple
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
-from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax import Flight, Free, Nuisance, Problem, check, fit
 from heli_jax.flights.holds import decide
-from heli_jax.identification.validation.own_samples import own_samples
+from tests.identification.lag import LAG, Params, response
 
 FINE, EVERY = 0.001, 20
 LOGGED = FINE * EVERY
 N = 40_000
 
 
-class Params(NamedTuple):
-    Lp: float
-    Ll: float
-
-
-class State(NamedTuple):
-    p: float
-
-
-class Inputs(NamedTuple):
-    lat: float
-
-
-class Outputs(NamedTuple):
-    p: float
-
-
-roll = Model(
-    "first order",
-    lambda q, x, u: State(p=q.Lp * x.p + q.Ll * u.lat),
-    lambda q, x, u: Outputs(p=x.p),
-    Params, State, Inputs, Outputs, linear=True,
-)  # fmt: skip
-
-
-def problem(grid, *, shift=False, start=(-6.0, 20.0), filtered=False):
+def problem(grid, *, shift=False, start=(-6.0, 20.0)):
     """Steps at multiples of `grid` [ms], the stick read at the logger's samples."""
     rng = np.random.default_rng(5)
     u, k = np.zeros(N), 0
@@ -53,25 +23,16 @@ def problem(grid, *, shift=False, start=(-6.0, 20.0), filtered=False):
         n = grid * int(rng.integers(150 // grid, 600 // grid))
         u[k : k + n] = rng.uniform(-0.1, 0.1)
         k += n
-    a = np.exp(-12.0 * FINE)
-    p = scipy.signal.lfilter([0.0, 60.0 * (1 - a) / 12.0], [1.0, -a], u)[::EVERY]
+    p = response(-12.0, 60.0, u, FINE)[::EVERY]
     p = p + 0.002 * rng.standard_normal(p.size)
     stick = u[::EVERY]
     taken = decide(stick)
     flight = Flight(
-        dt=LOGGED, inputs={"lat": stick}, outputs={"p": p},
-        hold={"lat": taken.hold}, hold_reason={"lat": taken.reason},
+        dt=LOGGED, inputs={"d": stick}, outputs={"p": p},
+        hold={"d": taken.hold}, hold_reason={"d": taken.reason},
     )  # fmt: skip
-    free = {"Lp": Free(start[0]), "Ll": Free(start[1])}
-    if not filtered:
-        return Problem(
-            roll, Params(*start), [flight], free, method="output-error",
-            nuisance=Nuisance(time_shift=shift),
-        )  # fmt: skip
-    model = with_disturbance(roll, "p")
-    gust = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
-    known = model.Params(*map(jnp.asarray, start), **gust)
-    return Problem(model, known, [flight], free, method="filter-error")
+    free = {"Lp": Free(start[0]), "Ld": Free(start[1])}
+    return Problem(LAG, Params(*start), [flight], free, Nuisance(time_shift=shift))
 
 
 def late_ones(found):
@@ -81,7 +42,7 @@ def late_ones(found):
 def test_a_stick_that_is_late_takes_the_interval_that_it_moves():
     found = fit(problem(1))
     [late] = late_ones(found)
-    assert late.subjects == ("lat",)
+    assert late.subjects == ("d",)
     # Half of the logger's 20 ms on average, of the derivative at the optimum.
     assert 0.005 < late.value < 0.014
     # True is -12: the shift is towards it.
@@ -97,7 +58,7 @@ def test_a_free_shift_leaves_what_each_step_was_late_by():
     found = fit(problem(1, shift=True))
     assert found.nuisance["time_shift"].value == pytest.approx(-0.01, abs=0.002)
     [late] = [f for f in found.findings if f.code == "timing.steps-between-stamps"]
-    assert (late.severity, late.subjects) == ("note", ("lat",))
+    assert (late.severity, late.subjects) == ("note", ("d",))
     assert late.value == pytest.approx(0.01, abs=0.002)
 
 
@@ -109,31 +70,9 @@ def test_a_stick_whose_steps_fall_on_samples_is_not():
     assert found.estimates["Lp"].value == pytest.approx(-12.0, rel=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("grid", [1, EVERY])
-def test_a_filter_says_it_too(grid):
-    late = late_ones(fit(problem(grid, filtered=True)))
-    assert len(late) == (grid != EVERY)
-    assert all(0.004 < one.value < 0.016 for one in late)
-
-
 def test_check_says_what_half_a_sample_of_the_stick_does():
     found = check(problem(1, start=(-14.0, 70.0))).findings
     [finding] = [f for f in found if f.code == "timing.slow-stick"]
     assert finding.severity == "doubt"
     # exp(Lp t) is as much off by 10 ms as Lp is by a tenth or two.
     assert 0.1 < finding.value < 0.3
-
-
-def test_own_samples_of_a_slower_clock():
-    seen = np.zeros(100, bool)
-    seen[3::4] = True
-    own = own_samples(seen)
-    assert own is not None
-    assert own.every == 4
-    u = np.arange(100.0)
-    np.testing.assert_allclose(own.of_input(u), u[3::4] - 1.5)
-    assert own_samples(np.random.default_rng(1).random(100) < 0.5) is None
-    whole = own_samples(np.ones(9, bool))
-    assert whole is not None
-    assert whole.every == 1

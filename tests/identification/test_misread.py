@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
+from heli_jax import Flight, linear_model, models
 from heli_jax import config as configuration
-from heli_jax import models
 from heli_jax.config.logs import read_flights
+from heli_jax.flights.flight import Signal, Source
 from heli_jax.identification.validation.late_angles import lateness
 from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
 from heli_jax.identification.validation.signal_quality import cut_off, facts_of
@@ -34,7 +35,7 @@ def facts(problem):
 
 @pytest.fixture
 def load(tmp_path):
-    """load(p, u, unit=..., **p's keys) -> the problem of a table of them."""
+    """load(p, u, unit=..., **p's keys) -> the flights of a table of them."""
 
     def load(p, u=U, unit="", unit_of_p=None, **of_p):
         of_p |= {} if unit_of_p is None else {"unit": unit_of_p}
@@ -53,13 +54,9 @@ def load(tmp_path):
         }
         path = tmp_path / "config.yaml"
         path.write_text(yaml.safe_dump(content))
-        return configuration.load(path)
+        return read_flights(configuration.load(path))
 
     return load
-
-
-def flights(experiment):
-    return read_flights(experiment)
 
 
 def denied(found):
@@ -72,52 +69,50 @@ IN_DOUBT = ("units.in-doubt", ("p",))
 
 def of(found):
     """The parts of a problem that these questions ask for."""
-    from heli_jax import linear_model
-
     return SimpleNamespace(training=found, model=linear_model("roll-flybarless").model)
 
 
 def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
-    [flight] = flights(load(np.degrees(P), unit="deg/s"))
+    [flight] = load(np.degrees(P), unit="deg/s")
     np.testing.assert_allclose(flight.outputs["p"], P, rtol=1e-7, atol=1e-9)
     assert ("units.assumed", ("p",)) in [(n.code, n.subjects) for n in flight.source.notes]
-    [plain] = flights(load(P))
+    [plain] = load(P)
     np.testing.assert_allclose(plain.outputs["p"], P, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [1.0, 20.0])
 def test_a_unit_against_that_of_the_file_is_doubted(load, size):
-    found = of(flights(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s")))
+    found = of(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s"))
     assert [(f.code, f.subjects) for f in misread(found)] == [IN_DOUBT, IN_DOUBT]
     assert denied(found) == [IN_DOUBT]
     # What is small either way is doubted, and no reason by itself.
-    small = of(flights(load(0.1 * P, unit="deg/s", unit_of_p="rad/s")))
+    small = of(load(0.1 * P, unit="deg/s", unit_of_p="rad/s"))
     [one] = misread(small)
     assert (one.code, one.severity, one.denies) == ("units.in-doubt", "doubt", False)
-    assert misread(of(flights(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s")))) == []
+    assert misread(of(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s"))) == []
 
 
 def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_is_only_doubted(load):
     fast = P * 12.0 / np.percentile(np.abs(P), 99)
-    [one] = record_doubts(of(flights(load(fast))))
+    [one] = record_doubts(of(load(fast)))
     assert (one.code, one.subjects, one.denies) == (*IN_DOUBT, False)
     assert one.value == pytest.approx(12.0, rel=1e-6)
 
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):
-    found = of(flights(load(np.degrees(P))))
+    found = of(load(np.degrees(P)))
     assert denied(found) == [IN_DOUBT]
     assert len(misread(found)) == 1
-    assert record_doubts(of(flights(load(P)))) == []
+    assert record_doubts(of(load(P))) == []
 
 
 def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
-    found = of(flights(load(p)))
+    found = of(load(p))
     assert denied(found) == [("quality.dropouts", ("p",))]
     assert len(dropouts(found, facts(found))) == 1
-    [flight] = flights(load(p, missing=0))
+    [flight] = load(p, missing=0)
     assert np.isnan(flight.outputs["p"]).sum() == 20
     problem = of([flight])
     assert dropouts(problem, facts(problem)) == []
@@ -127,18 +122,13 @@ def test_flat_tops_are_no_measurements(load):
     rng = np.random.default_rng(2)
     noisy = P + 0.01 * rng.standard_normal(N)
     for limit, count in ((0.4, 1), (np.inf, 0)):
-        problem = of(flights(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s")))
+        problem = of(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s"))
         assert len(cut_off([("one", *facts(problem))])) == count
         assert [subjects for _, subjects in denied(problem)] == count * [("p",)]
 
 
 @pytest.mark.parametrize("every", [1, 10], ids=["every sample", "a tenth of them"])
 def test_a_roll_that_was_flown_is_no_wrong_unit(every):
-    from types import SimpleNamespace
-
-    from heli_jax import Flight, linear_model
-    from heli_jax.flights.flight import Signal, Source
-
     p = np.where((T > 5) & (T < 8), 1.9, 0.0) + 0.1 * np.sin(3 * T)
     # An attitude is often logged more slowly than a gyro.
     phi = np.where(np.arange(p.size) % every == 0, np.cumsum(p) * DT, np.nan)
@@ -171,7 +161,7 @@ def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
 
 
 def test_the_shaft_of_a_motor_may_turn(load):
-    found = of(flights(load(100.0 * P, unit_of_p="rad/s")))
+    found = of(load(100.0 * P, unit_of_p="rad/s"))
     assert denied(found) == [IN_DOUBT]
     [flight] = found.training
     renamed = dataclasses.replace(

@@ -67,12 +67,6 @@ def test_a_search_by_a_part_that_finds_no_step_is_followed_by_one_by_all_lines()
     assert estimator.searches >= 2
 
 
-def test_a_large_move_does_not_say_how_small_ones_fall():
-    # What is fast is done at once, and what is slow goes on as it would have alone.
-    slow = [0.2 * 0.8**k for k in range(100)]
-    assert relaxed(Slowly([2.5, *slow]), 1.0) == pytest.approx(3.5, abs=0.3)
-
-
 def test_rounds_that_run_out_before_a_spectrum_settles_are_said():
     (said,) = optimum_of(Slowly([0.95**k for k in range(100)]), 1.0).notes
     assert (said.code, said.severity) == ("search.noise-not-settled", "doubt")

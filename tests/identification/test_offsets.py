@@ -6,10 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import Scalar
@@ -28,9 +26,8 @@ def flown(seed: int, share: float) -> tuple[Flight, float]:
     return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y}), share * amplitude
 
 
-@pytest.mark.parametrize("share", [0.007, 0.03])
-def test_an_offset_of_the_stick_does_not_move_the_inertia(share):
-    flight, offset = flown(3, share)
+def test_an_offset_of_the_stick_does_not_move_the_inertia():
+    flight, offset = flown(3, 0.03)
     found = fit(Problem(models.roll, vehicle(BENCH), [flight], FREE))
     assert found.white
     for name in FREE:
@@ -41,41 +38,6 @@ def test_an_offset_of_the_stick_does_not_move_the_inertia(share):
     assert e.unit == "m"
     assert e.value == pytest.approx(offset, abs=4 * e.sd)
     assert e.sd < 0.02 * offset
-
-
-@pytest.mark.slow
-def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
-    flights, offsets = zip(
-        *(flown(seed, share) for seed, share in ((1, 0.02), (2, -0.03))), strict=True
-    )
-    problem = Problem(models.roll, vehicle(BENCH), flights, FREE, window=10.0)
-    found = fit(problem)
-    for name in FREE:
-        e = found.estimates[name]
-        assert e.lower95 < BENCH[name] < e.upper95
-    for i, offset in enumerate(offsets):
-        e = found.nuisance[f"flight {i + 1}/offset x_roll"]
-        assert e.value == pytest.approx(offset, abs=4 * e.sd)
-    # The derivatives of many windows at once are the derivatives.
-    at = found.reached
-    J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
-    column = at.layout.size - 1
-    h = 1e-4
-    low, high = (rows_of(at.layout, at.data, at.noise, at.z.at[column].add(s)) for s in (-h, h))
-    slope = (np.asarray(high) - np.asarray(low)) / (2 * h)
-    assert np.abs(J[:, column] - slope).max() < 1e-6 * np.abs(slope).max()
-
-
-@pytest.mark.slow
-def test_the_identifiability_analysis_knows_the_offset():
-    flight, _ = flown(3, 0.0)
-    sds = []
-    for asked in (None, False):
-        nuisance = Nuisance(input_offset=asked)
-        verdict = check(Problem(models.roll, vehicle(BENCH), [flight], FREE, nuisance)).verdict
-        sds.append(np.sqrt(np.diag(verdict.covariance)))
-    assert np.all(sds[0] >= sds[1])
-    assert sds[0][1] > 1.02 * sds[1][1]
 
 
 class Params(NamedTuple):
@@ -93,20 +55,12 @@ class Inputs(NamedTuple):
     d: Annotated[Scalar, "1", "stick"]
 
 
-class Outputs(NamedTuple):
-    p: Annotated[Scalar, "rad/s", "rate"]
-    phi: Annotated[Scalar, "rad", "angle"]
-
-
 AIRCRAFT = Model(
     "aircraft-roll",
     lambda p, s, u: State(p=p.Lp * s.p + p.Ld * u.d + p.L0, phi=s.p),
-    lambda p, s, u: Outputs(p=s.p, phi=s.phi),
-    Params,
-    State,
-    Inputs,
-    Outputs,
-)
+    lambda p, s, u: s,
+    Params, State, Inputs, State,
+)  # fmt: skip
 
 
 def problem_of(free: dict[str, Free], outputs: tuple[str, ...], nuisance: Nuisance) -> Problem:
@@ -142,11 +96,6 @@ def test_a_stand_takes_the_offset_up_in_the_bias():
     assert offset_inputs(Problem(models.roll_on_stand, limp, [flight], FREE)) == ("x_roll",)
 
 
-def test_an_input_that_the_model_lacks_is_named():
-    with pytest.raises(ValueError, match=r"input_offset: model aircraft-roll has no input 'dd'"):
-        problem_of({"Lp": Free(-2.0)}, ("p",), Nuisance(input_offset=("dd",)))
-
-
 def test_the_scale_of_the_offset_is_that_of_the_stick():
     flight, _ = flown(3, 0.0)
     problem = Problem(models.roll, vehicle(BENCH), [flight], FREE)
@@ -154,39 +103,3 @@ def test_the_scale_of_the_offset_is_that_of_the_stick():
     assert layout.size == len(FREE) + 4 + 1 + 1
     scale = float(data.flights[0].offset_scale["x_roll"])
     assert scale == pytest.approx(10 * np.std(flight.inputs["x_roll"]))
-
-
-@pytest.mark.slow
-def test_a_slow_mode_leaves_the_offset_to_be_found():
-    # The spiral of an aeroplane: what an aileron that is off by its own deflection does in the end
-    # is a bank of radians, which the record never sees; a constant cannot stand for all of that.
-    slow = Model(
-        "bank that decays",
-        lambda p, s, u: State(p=p.Lp * s.p + p.Ld * u.d, phi=s.p - 0.002 * s.phi),
-        lambda p, s, u: Outputs(p=s.p, phi=s.phi),
-        Params,
-        State,
-        Inputs,
-        Outputs,
-        linear=True,
-    )
-    n, dt = 800, 0.05
-    stick = steps(np.random.default_rng(2), n, dt, 0.02)
-    p, phi, measured = 0.0, 0.0, []
-    for u in stick:  # steps of Euler's method, a hundredth of them each
-        measured.append((p, phi))
-        for _ in range(100):
-            p, phi = p + dt / 100 * (-3.0 * p + 10.0 * u), phi + dt / 100 * (p - 0.002 * phi)
-    noisy = np.array(measured) + 0.002 * np.random.default_rng(3).standard_normal((n, 2))
-    flight = Flight(
-        dt=dt, inputs={"d": stick + 0.02}, outputs={"p": noisy[:, 0], "phi": noisy[:, 1]}
-    )
-    vehicle = Params(*(jnp.asarray(v) for v in (-1.0, 5.0, 0.0)))
-    problem = Problem(slow, vehicle, [flight], {"Lp": Free(-1.0), "Ld": Free(5.0)})
-    assert offset_inputs(problem) == ("d",)
-    found = fit(problem)
-    assert found.exit_code == 0
-    for name, true in (("Lp", -3.0), ("Ld", 10.0)):
-        one = found.estimates[name]
-        assert abs(one.value - true) < 3.5 * one.sd
-    assert found.nuisance["flight 1/offset d"].value == pytest.approx(-0.02, rel=0.05)

@@ -7,10 +7,6 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model, models, naming
-from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.estimation.delay_starts import delay_starts
-from heli_jax.identification.estimation.multistart import named_values
-from heli_jax.identification.fit import first_guess
 
 ROLL = linear_model("roll-flybarless")
 LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
@@ -61,91 +57,7 @@ def test_a_servo_and_two_delays_are_recovered():
     truth = {"Lb": LB, "omega_servo": OMEGA, "delay_lat": DELAY_LAT, "delay_phi": DELAY_PHI}
     for name, value in truth.items():
         estimate = found.estimates[name]
-        assert estimate.lower95 is not None
-        assert estimate.upper95 is not None
         assert estimate.lower95 < value < estimate.upper95, name
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
-
-
-@pytest.mark.slow
-def test_a_servo_that_is_left_out_is_named():
-    model = models.with_delays(ROLL.model, ["lat"])
-    flight = record(1)
-    rate = Flight(dt=DT, inputs=flight.inputs, outputs={"p": flight.outputs["p"]})
-    free = {"Lb": Free(120.0), "delay_lat": Free(0.01)}
-    found = fit(Problem(model, params(model, delay_lat=0.0), [rate], free))
-    # It passes for a delay of 2 zeta/omega, and all but one number look well.
-    absorbed = found.estimates["delay_lat"].value - DELAY_LAT
-    assert absorbed == pytest.approx(2.0 * ZETA / OMEGA, abs=4e-3)
-    assert found.metrics["p"].vaf > 0.99
-    assert not found.white
-    [left] = [f for f in found.findings if f.code == "dynamics.residual-follows-input"]
-    assert left.subjects == ("p", "lat")
-    assert 1 <= len(found.starts) <= 3
-    assert found.starts[0].optimum == 1
-
-
-@pytest.mark.slow
-def test_each_of_two_delays_starts_in_its_valley():
-    model = models.with_servos(ROLL.model, ["lat"])
-    model = models.with_delays(model, ["lat"], ["phi"])
-    start = params(model, omega_servo=OMEGA, zeta_servo=ZETA, delay_lat=0.15, delay_phi=0.01)
-    free = {"Lb": Free(120.0), "delay_lat": Free(0.15), "delay_phi": Free(0.01)}
-    problem = Problem(model, start, [record(2)], free)
-    layout, data, noise, z0, e, _ = first_guess(problem)
-    points = delay_starts(problem, layout, data, noise, z0, (e.r, e.J))
-    best = named_values(layout, data, points[0])
-    assert best["delay_lat"] == pytest.approx(DELAY_LAT, abs=DT)
-    assert best["delay_phi"] == pytest.approx(DELAY_PHI, abs=DT)
-
-
-LOOP = """
-name: pitch-rate
-states: {q: rad/s}
-inputs: {u: "1"}
-outputs: {q: rad/s}
-parameters:
-  K: {value: 200, unit: 1/s^2}
-  D: {value: 1, unit: 1/s}
-  tau: {value: 0.02, unit: s}
-A: {q: {q: -D}}
-B: {q: {u: K}}
-delays: {u: tau}
-axes: {pitch: {rate: q, stick: u}}
-"""
-
-
-def in_loop(late, seed, seconds=8.0):
-    """q' = 365 u(t - late) - 0.5 q in gusts and a loop of 250 Hz by a noisy gyro, at 1 kHz."""
-    rng, h, n = np.random.default_rng(seed), 0.001, round(1000 * seconds)
-    t = h * np.arange(n)
-    stick = 0.12 * np.sin(2 * np.pi * (0.2 * t + 0.9 * t**2 / seconds))
-    drive = math.sqrt(2 * h / 0.5) * rng.standard_normal(n)
-    q, u, gust, command, seen, before = np.zeros(n), np.zeros(n), 0.0, 0.0, 0.0, 0.0
-    for i in range(n - 1):
-        if i % 4 == 0:
-            seen += 0.5 * (q[i] + 0.003 * rng.standard_normal() - seen)
-            command = 0.1 * (stick[i] - seen) - 0.001 * (seen - before) / 0.004
-            before = seen
-        u[i] = command
-        gust += -h * gust / 0.5 + drive[i]
-        q[i + 1] = q[i] + h * (365.0 * u[max(i - round(late / h), 0)] - 0.5 * q[i] + gust)
-    measured = q[::4] + 0.001 * rng.standard_normal(n // 4)
-    return Flight(dt=0.004, inputs={"u": u[::4]}, outputs={"q": measured})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("late", "begin"), [(0.008, 0.02), (0.008, 0.12), (0.012, 0.001)])
-def test_a_delay_in_a_loop_is_found_from_afar(tmp_path, late, begin):
-    (tmp_path / "loop.yaml").write_text(LOOP)
-    loop = linear_model(tmp_path / "loop.yaml")
-    model = with_disturbance(loop.model, "pitch")
-    start = model.Params(**naming.asdict(loop.vehicle().params))
-    free = {"K": Free(200.0), "D": Free(1.0), "tau": Free(begin)}
-    found = fit(Problem(model, start, [in_loop(late, 1)], free, method="filter-error"))
-    assert found.status == "converged"
-    # The command is held a sample step of 1 ms by the loop that made it.
-    assert found.estimates["tau"].value == pytest.approx(late, abs=0.0005)
-    assert found.estimates["K"].value == pytest.approx(365.0, rel=0.1)

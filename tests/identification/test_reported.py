@@ -7,6 +7,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.identifiability.analysis import analyse
+from heli_jax.identification.identifiability.combinations import combinations
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
@@ -81,3 +82,15 @@ def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
         error = (hessian[i, j] - wanted) / (scale[i] * scale[j])
         assert abs(error) < 1e-3
     assert np.max(np.abs(hessian - J.T @ J) / np.outer(scale, scale)) > 0.05
+
+
+@pytest.mark.parametrize(("sd", "determined"), [(0.1, True), (1.2, False), (400.0, False)])
+def test_a_product_from_nothing_to_anything_is_not_determined(sd, determined):
+    # Both may grow by the same factor; from 1.18 on 1.96 sd are more than the logarithm of ten.
+    unknowns = tuple(Unknown(n, v, True, 1.0, 0.0) for n, v in (("Ixx", 0.05), ("a", 6.0)))
+    null = np.array([1.0, 1.0]) / np.sqrt(2.0)
+    across = np.array([1.0, -1.0])
+    found = combinations([null], np.outer(across, across) * sd**2 / 4.0, unknowns)
+    assert [c.name for c in found] == determined * ["a/Ixx"]
+    for c in found:
+        assert c.upper95 / c.value == pytest.approx(np.exp(Z95 * sd), rel=1e-5)

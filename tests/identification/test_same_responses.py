@@ -5,15 +5,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pytest
 
-from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.noise_covariance import OtherValues
 from heli_jax.identification.estimation.same_responses import same_responses
-from heli_jax.identification.fit import fit
 from heli_jax.identification.free import Free
-from heli_jax.identification.identifiability.as_likely import unless_as_likely
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -121,33 +117,7 @@ def test_two_modes_that_change_places_answer_alike(flight):
     assert back == pytest.approx(values, rel=1e-3)
 
 
-@pytest.mark.slow
 def test_none_answers_alike_outside_the_bounds_or_with_a_known_inflow(flight):
     assert asked(flight, {**FREE, "Zw": Free(-0.55, -3.0, -0.1)}) == []
     # The modes cannot change places without another share of the inflow.
     assert asked(flight, {n: FREE[n] for n in ("Zw", "tn")}) == []
-
-
-def test_values_that_are_as_likely_are_not_determined(flight):
-    other = OtherValues({"Zw": -9.1, "tn": 1.8}, {"Zw": -0.55, "tn": 0.11}, 0.4)
-    found = fit(Problem(MODEL, START, [flight], {n: FREE[n] for n in ("Zw", "Zc")}))
-    assert unless_as_likely(found.verdict, ()) is found.verdict
-    said = unless_as_likely(found.verdict, (other,))
-    assert not said.identifiable
-    assert said.undetermined == ("Zw",)
-    assert "Zw = -9.1 and tn = 1.8 answer the inputs as do Zw = -0.55 and tn = 0.11" in said.text
-
-
-@pytest.mark.slow
-def test_a_filter_begun_on_the_wrong_side_finds_the_right_one(flight):
-    model = with_disturbance(MODEL, "w")
-    start = model.Params(**START._asdict())
-    wrong = exchanged(**START._asdict())
-    free = {n: f._replace(start=wrong[n]) for n, f in FREE.items()}
-    found = fit(Problem(model, start, [flight], free, method="filter-error"))
-    assert found.status == "converged"
-    for name, true in START._asdict().items():
-        e = found.estimates[name]
-        assert e.sd is not None, name
-        assert abs(e.value - true) < 4.0 * e.sd, name
-    assert "search.same-responses" in {f.code for f in found.findings}

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
 from heli_jax.identification.estimation.drawn_starts import _draw_values
-from heli_jax.identification.unknowns.transforms import changes_sign
 from tests.identification.bench import steps
 
 
@@ -84,17 +83,13 @@ def problem(free, base=TRUTH, record=FLIGHT, **how):
     "starts",
     [
         {"Lp": -2.0, "Lr": -1.0, "Np": 1.0, "Nr": -1.0, "Ld": -5.0, "Nd": 5.0},
-        pytest.param(
-            {"Lp": 1.0, "Lr": -1.0, "Np": 1.0, "Nr": 1.0, "Ld": -5.0, "Nd": 1.0},
-            marks=pytest.mark.slow,
-        ),
         {"Lp": -1.0, "Lr": 0.0, "Np": 0.0, "Nr": -1.0, "Ld": 1.0, "Nd": 0.0},
     ],
-    ids=["wrong", "unstable", "zero"],
+    ids=["wrong", "zero"],
 )
 def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
     found = fit(problem({n: Free(v) for n, v in starts.items()}))
-    assert found.status == "converged", found.verdict.text
+    assert found.status == "converged"
     for name, true in TRUTH.items():
         one = found.estimates[name]
         assert abs(one.value - true) < 4 * one.sd
@@ -115,31 +110,15 @@ def test_a_signal_that_is_turned_is_a_doubt():
     assert wrong.estimates["Ld"].value == pytest.approx(-right.estimates["Ld"].value, rel=1e-4)
 
 
-@pytest.mark.parametrize("wrong", [0.5, 3.0])
 @pytest.mark.slow
-def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
-    # Over 20 s the simulation grows by e^10 and e^60.
-    found = fit(problem({"Lp": Free(wrong), "Ld": Free(-1.0)}))
+def test_a_damping_of_the_wrong_sign_is_found_through_windows():
+    # Over 20 s the simulation grows by e^60.
+    found = fit(problem({"Lp": Free(3.0), "Ld": Free(-1.0)}))
     assert found.status == "converged"
     for name in ("Lp", "Ld"):
         one = found.estimates[name]
         assert abs(one.value - TRUTH[name]) < 4 * one.sd
     assert "search.by-windows" in {f.code for f in found.findings}
-
-
-@pytest.mark.slow
-def test_the_sign_may_be_kept():
-    free = {"Ld": Free(10.0), "Nd": Free(1.0, sign="keep"), "Lr": Free(1.0, lower=0.0)}
-    one = problem(free)
-    assert [changes_sign(f) for f in one.free.values()] == [True, False, False]
-    found = fit(one)
-    assert found.status == "not-identifiable"
-    assert found.estimates["Nd"].value > 0
-    kept = fit(problem(free | {"Nd": Free(-1.0, sign="keep")}))
-    assert kept.status == "converged"
-    open_ = fit(problem(free | {"Nd": Free(1.0)}))
-    assert open_.estimates["Nd"].value == pytest.approx(kept.estimates["Nd"].value, rel=1e-4)
-    assert open_.log_likelihood == pytest.approx(kept.log_likelihood, abs=1e-3)
 
 
 def test_one_bound_beyond_zero_is_kept():
@@ -161,22 +140,6 @@ def test_a_parameter_that_is_zero_is_determined():
     assert one.sd < 0.2
 
 
-@pytest.mark.slow
-def test_what_says_nothing_is_not_determined():
-    # A record without motion but noise: every derivative is anybody's guess.
-    rng = np.random.default_rng(1)
-    still = Flight(
-        dt=DT,
-        inputs={"d": 1e-4 * FLIGHT.inputs["d"]},
-        outputs={n: NOISE * rng.standard_normal(N) for n in ("p", "r")},
-    )
-    verdict = check(problem({"Ld": Free(1.0), "Nd": Free(1.0)}, record=still)).verdict
-    assert not verdict.identifiable
-    assert set(verdict.undetermined) == {"Ld", "Nd"}
-    # The same with a start that asks for less: three times its size is told.
-    assert check(problem({"Ld": Free(1e3), "Nd": Free(1e3)}, record=still)).verdict.identifiable
-
-
 def test_many_starts_are_of_both_signs():
     rng = np.random.default_rng(0)
     values = _draw_values(Free(2.0, sign="any"), 200, rng)
@@ -184,10 +147,3 @@ def test_many_starts_are_of_both_signs():
     assert np.all(_draw_values(Free(2.0, sign="keep"), 50, rng) > 0)
     near = _draw_values(Free(2.0, prior=Prior(2.0, 0.1), sign="any"), 50, rng)
     assert np.all(np.abs(near - 2.0) < 1.0)
-
-
-def test_a_sign_is_one_of_two():
-    with pytest.raises(ValueError, match=r"free.Ld.sign: expected 'keep' or 'any', got 'plus'"):
-        problem({"Ld": Free(1.0, sign="plus")})  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="sign: any"):
-        problem({"Ld": Free(0.0, sign="keep")})

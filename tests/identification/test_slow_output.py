@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
@@ -13,7 +12,6 @@ from heli_jax.identification.equation_error.baseline import baseline
 from heli_jax.identification.equation_error.smoothing import segments
 from heli_jax.identification.validation.feedback import untested
 from heli_jax.identification.validation.metrics import whiteness
-from heli_jax.report.figures import residual_correlation, response
 
 from .bench import BENCH, amplitude_for, denominators, steps, vehicle
 
@@ -106,26 +104,3 @@ def test_recursive_least_squares_takes_what_is_whole(bench30):
     flight = record(0, slow=True)
     made = baseline(models.roll_on_stand, bench30, flight, order=2)
     assert made.output == "roll_rate"
-    assert any("which roll has too few of" in s for s in made.sentences)
-
-
-def test_figures_show_single_samples(fits):
-    signals = fits[True].signals[0]
-    top, below, *_ = response(signals, "roll", models.roll_on_stand)
-    for ax, line in ((top, top.lines[0]), (below, below.lines[0])):
-        assert line.get_marker() == "o"
-        assert line.get_xdata().size == 148
-        plt.close(ax.figure)
-    first, *_ = residual_correlation(signals, "roll")
-    # Lags in the sensor's own samples, a quarter of which there are.
-    assert first.get_xlim()[1] == pytest.approx(0.2 * 37.5)
-    plt.close(first.figure)
-
-
-def test_a_handful_of_samples_is_refused():
-    flight = record(0, slow=True)
-    few = np.where(np.arange(N) < 300, flight.outputs["roll"], np.nan)
-    few[np.flatnonzero(np.isfinite(few))[7:]] = np.nan
-    flight = dataclasses.replace(flight, outputs={**flight.outputs, "roll": few})
-    with pytest.raises(ValueError, match="expected at least 8 measured samples, got 7 of 1500"):
-        problem(flight)

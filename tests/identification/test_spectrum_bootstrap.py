@@ -1,28 +1,17 @@
 """The bootstrap of fits in frequency: what is drawn, and how estimates scatter."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
-from heli_jax import Free, Problem, fit, models, stages
+from heli_jax import fit, stages
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
 from heli_jax.identification.uncertainty.bootstrap import bootstrap
 from heli_jax.identification.uncertainty.spectrum_bootstrap import _records
-from tests.identification.bench import BENCH, record, vehicle
-
-FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
-
-
-def fitted(method, **more):
-    flight = record(BENCH, seed=3, n=3000)
-    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, method=method, **more))
-
-
-@pytest.fixture(scope="module")
-def found():
-    return fitted("frequency-error")
 
 
 @pytest.mark.parametrize("N", [7, 100, 101])
@@ -32,8 +21,8 @@ def test_lines_go_back_to_the_samples_they_came_of(N):
     np.testing.assert_allclose(lines_of(in_time_of(lines, N)), lines, atol=1e-12)
 
 
-def test_a_record_that_is_drawn_differs_in_its_noise_alone(found):
-    at = found.reached
+def test_a_record_that_is_drawn_differs_in_its_noise_alone(fitted_by_lines):
+    at = fitted_by_lines.reached
     [errors] = jax.device_get(errors_of_lines(at.layout, at.data, at.noise, at.z).errors)
     drawn, powers = _records(at, np.random.default_rng(1)), []
     for _ in range(40):
@@ -49,16 +38,16 @@ def test_a_record_that_is_drawn_differs_in_its_noise_alone(found):
         assert ratio == pytest.approx(1.0, rel=0.2)
 
 
-def test_estimates_scatter_as_their_intervals_say(found):
-    booted = bootstrap(found, 40, seed=2)
+def test_estimates_scatter_as_their_intervals_say(fitted_by_lines):
+    booted = bootstrap(fitted_by_lines, 40, seed=2)
     assert booted.failures == 0
-    for name, one in found.estimates.items():
+    for name, one in fitted_by_lines.estimates.items():
         values = booted.values[name]
         assert np.std(values, ddof=1) == pytest.approx(one.sd, rel=0.45)
         assert abs(np.mean(values) - one.value) < 0.6 * one.sd
 
 
-def test_the_stage_counts_records_and_no_steps_of_their_searches(found):
+def test_the_stage_counts_records_and_no_steps_of_their_searches(fitted_by_lines):
     class Heard:
         def __init__(self):
             self.ended = []
@@ -71,12 +60,13 @@ def test_the_stage_counts_records_and_no_steps_of_their_searches(found):
 
     heard = Heard()
     with stages.observed_by(heard), stages.stage("bootstrap", total=3):
-        bootstrap(found, 3, seed=2)
+        bootstrap(fitted_by_lines, 3, seed=2)
     assert ("bootstrap", 3) in heard.ended
 
 
-def test_responses_are_drawn_of_the_residual_at_all_lines():
-    responses = fitted("frequency-response", frequency=ResponseOptions(window=10.0))
+def test_responses_are_drawn_of_the_residual_at_all_lines(by_lines):
+    options = ResponseOptions(window=10.0)
+    responses = fit(replace(by_lines, method="frequency-response", frequency=options))
     booted = bootstrap(responses, 6, seed=2)
     assert booted.failures == 0
     for name, one in responses.estimates.items():

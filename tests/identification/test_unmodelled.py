@@ -3,45 +3,19 @@
 Records are made by SciPy: its integrators, and the exact response of linear systems.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Problem, fit
+from heli_jax import Flight, Free, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.validation.adequacy import by_responses
 from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
+from tests.identification.lag import LAG, Params, response
 
 N, DT = 1500, 0.02
-
-
-class Params(NamedTuple):
-    Lp: float
-    Ll: float
-
-
-class State(NamedTuple):
-    p: float
-
-
-class Inputs(NamedTuple):
-    lat: float
-
-
-class Outputs(NamedTuple):
-    p: float
-
-
-roll = Model(
-    "first order",
-    lambda q, x, u: State(p=q.Lp * x.p + q.Ll * u.lat),
-    lambda q, x, u: Outputs(p=x.p),
-    Params, State, Inputs, Outputs, linear=True,
-)  # fmt: skip
 
 
 def steps(rng):
@@ -55,17 +29,16 @@ def steps(rng):
     return u
 
 
-def linear(A, B, u):
-    """The first state of x' = A x + B u from rest, u held."""
-    system = scipy.signal.cont2discrete((A, B, np.eye(len(A)), np.zeros((len(A), 1))), DT)
-    return scipy.signal.dlsim((*system[:4], DT), u)[1][:, 0]
+def right(u):
+    return response(-4.0, 20.0, u, DT)
 
 
 def with_payload(u):
     """p with a payload that hangs at 6 rad/s, damping 0.03."""
     w, z, k = 6.0, 0.03, 12.0
     A = np.array([[-4.0, k, 0.0], [0.0, 0.0, 1.0], [4.0, -w * w - k, -2.0 * z * w]])
-    return linear(A, np.array([[20.0], [0.0], [-20.0]]), u)
+    system = (A, np.array([[20.0], [0.0], [-20.0]]), np.eye(3), np.zeros((3, 1)))
+    return scipy.signal.dlsim((*scipy.signal.cont2discrete(system, DT)[:4], DT), u)[1][:, 0]
 
 
 def saturated(u):
@@ -86,12 +59,12 @@ def through_play(u):
     for k, x in enumerate(u):
         at = min(max(at, x - 0.0125), x + 0.0125)
         v[k] = at
-    return linear(np.array([[-4.0]]), np.array([[20.0]]), v)
+    return right(v)
 
 
 def to_one_side(u):
     """p of a stick that does a tenth more to one side than to the other: even powers see it."""
-    return linear(np.array([[-4.0]]), np.array([[20.0]]), u + 0.05 * np.abs(u))
+    return right(u + 0.05 * np.abs(u))
 
 
 def with_dry_friction(u):
@@ -104,17 +77,19 @@ def with_dry_friction(u):
     return out
 
 
+def slowing_down(u):
+    """p of a rotor that loses a fifth of its moment steadily."""
+    return right(u * np.linspace(1.1, 0.9, N))
+
+
 def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0):
     rng = np.random.default_rng(seed)
     u = steps(rng)
     disturbed = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal(N)) * coloured
     p = made(u) + noise * rng.standard_normal(N) + disturbed
-    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p})
-    return fit(
-        Problem(
-            roll, Params(-3.0, 15.0), [flight], {"Lp": Free(-3.0), "Ll": Free(15.0)}, method=method
-        )
-    )
+    flight = Flight(dt=DT, inputs={"d": u}, outputs={"p": p})
+    free = {"Lp": Free(-3.0), "Ld": Free(15.0)}
+    return fit(Problem(LAG, Params(-3.0, 15.0), [flight], free, method=method))
 
 
 def misfit(found, code):
@@ -132,32 +107,30 @@ def misfit(found, code):
     return one
 
 
-METHODS = ("output-error", "frequency-error", "frequency-response")
-QUICK = [
-    pytest.param(m, marks=pytest.mark.slow if m == "frequency-response" else ()) for m in METHODS
-]
+FOLLOWS = "dynamics.residual-follows-input"
+AMPLITUDE = "dynamics.depends-on-amplitude"
+CHANGES = "dynamics.changes-over-record"
 
 
-@pytest.mark.parametrize("method", QUICK)
-def test_a_mode_that_is_left_out_takes_the_intervals_that_it_moves(method):
-    # Its residual is white, or nearly, and holds a few per cent of the output's power.
-    found = fitted(with_payload, method, noise=0.3)
+@pytest.mark.parametrize(
+    ("made", "method", "noise", "code", "untrusted"),
+    [
+        # Its residual is white, or nearly, and holds a few per cent of the output's power.
+        (with_payload, "output-error", 0.3, FOLLOWS, True),
+        (with_payload, "frequency-error", 0.3, FOLLOWS, True),
+        (saturated, "frequency-error", 0.02, AMPLITUDE, True),
+        # Powers of stick and response do not see play: the residual is whatever it came from.
+        (through_play, "output-error", 0.02, AMPLITUDE, None),
+        (to_one_side, "output-error", 0.02, AMPLITUDE, None),
+        (with_dry_friction, "output-error", 0.02, AMPLITUDE, None),
+        (slowing_down, "output-error", 0.02, CHANGES, True),
+    ],
+)
+def test_what_is_left_out_takes_the_intervals_that_it_moves(made, method, noise, code, untrusted):
+    found = fitted(made, method, noise=noise)
     assert found.status == "converged"
-    assert misfit(found, "dynamics.residual-follows-input").subjects == ("p", "lat")
-    assert found.exit_code == 3
-
-
-@pytest.mark.parametrize("method", QUICK)
-def test_a_saturation_that_is_left_out_is_named(method):
-    found = fitted(saturated, method, noise=0.02)
-    misfit(found, "dynamics.depends-on-amplitude")
-    assert found.exit_code == 3
-
-
-# Powers of stick and response do not see play: the residual is whatever the stick came from.
-@pytest.mark.parametrize("made", [through_play, to_one_side, with_dry_friction])
-def test_play_of_a_linkage_one_side_and_dry_friction_are_named(made):
-    misfit(fitted(made, "output-error", noise=0.02), "dynamics.depends-on-amplitude")
+    misfit(found, code)
+    assert untrusted is None or found.exit_code == 3
 
 
 @pytest.mark.slow
@@ -165,32 +138,21 @@ def test_a_flight_with_a_stick_of_another_scale_is_named():
     rng, flights = np.random.default_rng(5), []
     for name, scale in (("one", 1.0), ("two", 1.1), ("three", 1.0)):
         u = steps(rng)
-        p = linear(np.array([[-4.0]]), np.array([[20.0]]), u) + 0.02 * rng.standard_normal(N)
-        flights.append(Flight(dt=DT, inputs={"lat": scale * u}, outputs={"p": p}, name=name))
-    free = {"Lp": Free(-3.0), "Ll": Free(15.0)}
-    found = fit(Problem(roll, Params(-3.0, 15.0), flights, free))
+        p = right(u) + 0.02 * rng.standard_normal(N)
+        flights.append(Flight(dt=DT, inputs={"d": scale * u}, outputs={"p": p}, name=name))
+    free = {"Lp": Free(-3.0), "Ld": Free(15.0)}
+    found = fit(Problem(LAG, Params(-3.0, 15.0), flights, free))
     one = misfit(found, "dynamics.flights-differ")
     assert one.subjects == ("p", "two", "the others")
-    assert "Ll" in found.untrusted
+    assert "Ld" in found.untrusted
 
 
-@pytest.mark.parametrize("method", QUICK)
-def test_a_machine_that_changes_over_the_record_is_told(method):
-    def slows_down(u):
-        """p of a rotor that loses a fifth of its moment steadily."""
-        return linear(np.array([[-4.0]]), np.array([[20.0]]), u * np.linspace(1.1, 0.9, N))
-
-    found = fitted(slows_down, method, noise=0.02)
-    misfit(found, "dynamics.changes-over-record")
-    assert "Ll" in found.untrusted
-
-
-@pytest.mark.parametrize("coloured", [0.0, 0.02])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("method", "coloured"),
+    [("output-error", 0.0), ("frequency-error", 0.02), ("frequency-response", 0.02)],
+)
 def test_nothing_is_missed_of_a_right_model(method, coloured):
-    found = fitted(
-        lambda u: linear(np.array([[-4.0]]), np.array([[20.0]]), u), method, coloured=coloured
-    )
+    found = fitted(right, method, coloured=coloured)
     assert found.exit_code == 0
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
@@ -278,6 +240,12 @@ def test_where_samples_are_missing():
     own = own_samples(seen)
     assert own.every == 1
     assert own.holes == (300, 698)
+    # A slower clock, a random half, and none missing.
+    fourth = own_samples(np.arange(100) % 4 == 3)
+    assert fourth.every == 4
+    np.testing.assert_allclose(fourth.of_input(np.arange(100.0)), np.arange(3, 100, 4) - 1.5)
+    assert own_samples(np.random.default_rng(1).random(100) < 0.5) is None
+    assert own_samples(np.ones(9, bool)).every == 1
     # A sensor of 7 grid steps, whose clock drifts by one now and then, and one sample of it lost.
     slow = np.zeros(2000, bool)
     slow[np.cumsum([0, *([7] * 100), 8, *([7] * 50), 14, *([7] * 50)])] = True
@@ -294,6 +262,5 @@ def test_squared_errors_of_responses_above_their_interval_are_said():
     said = []
     for chi_squared in (1.0, 1.9, 2.1):
         found = by_responses(ResponseAgreement((), chi_squared, 0.75, 1.3, 100.0, 8.0, (), (), ()))
-        assert found is not None
         said.append([(f.severity, f.value, f.denies) for f in found.findings])
     assert said == [[], [("note", 1.9, False)], [("doubt", 2.1, True)]]

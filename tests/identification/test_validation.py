@@ -13,8 +13,6 @@ import scipy.integrate
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.validation.metrics import diverges
-from heli_jax.report.files import fit_json
-from heli_jax.report.tables import agreement
 
 
 class Pendulum(NamedTuple):
@@ -80,25 +78,6 @@ def test_the_initial_state_of_a_flight_held_out_is_found(flights):
     assert found.validation["x"].vaf > 0.999
     assert found.validation_free_run == {}
     assert not [f for f in found.findings if f.code.startswith("held-out.")]
-
-
-@pytest.mark.slow
-def test_windows_are_used_and_the_run_in_one_piece_stands_beside(flights):
-    found = fit(problem(flights, window=1.0))
-    assert found.validation["x"].vaf > 0.99
-    # In one piece a stiffness 5 % off is seen: the swing comes too soon.
-    assert found.validation_free_run["x"].vaf < found.validation["x"].vaf - 0.01
-    plain = fit(problem(flights, k=9.0, window=1.0, continuity=0.01))
-    assert plain.validation["x"].vaf > 0.999
-    assert plain.validation_free_run["x"].vaf > 0.95
-    rows = {row[1]: row for row in agreement(plain, None).rows}
-    assert "diverges" not in rows["held out, in one piece"]
-    far = plain.validation_free_run["x"]._replace(vaf=-645.0)
-    far = dataclasses.replace(plain, validation_free_run={"x": far})
-    assert (
-        "diverges" in {row[1]: row for row in agreement(far, None).rows}["held out, in one piece"]
-    )
-    assert fit_json(far, problem(flights), None)["validation_free_run"]["x"]["vaf"] == -645.0
 
 
 def test_what_cannot_be_simulated_is_said_and_not_raised(flights):

@@ -13,7 +13,7 @@ from heli_jax.analysis.linear import linearize, modes
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Free, Nuisance, Problem
 from heli_jax.identification.unknowns.transforms import plain_kind
-from heli_jax.linear_models.read import linear_model, shipped
+from heli_jax.linear_models.read import linear_model
 from heli_jax.simulation.simulate import simulate
 
 STATES = {
@@ -30,10 +30,6 @@ STATES = {
     "hybrid-flybarless": "u v p q phi theta a b w r r_fb",
     "r50-hover": "u v p q phi theta a b w r r_fb c d",
 }
-
-
-def test_every_shipped_model_is_here():
-    assert set(shipped()) == set(STATES)
 
 
 @pytest.mark.parametrize("name", STATES)
@@ -170,16 +166,9 @@ def test_a_fit_finds_the_derivatives_of_a_record_by_scipy():
     assert kinds == {"Lb": "linear", "tau_f": "log", "Bd": "linear", "Blat": "linear"}
 
 
-@pytest.mark.parametrize(
-    ("free", "words"),
-    [
-        (Free(-0.1), "free.tau_f.start: expected more than zero"),
-        (Free(0.1, lower=-1.0), "free.tau_f.lower: expected more than zero"),
-        (Free(0.1, sign="any"), "free.tau_f.sign: expected keep"),
-    ],
-)
-def test_what_is_positive_starts_and_stays_above_zero(free, words):
+@pytest.mark.parametrize("free", [Free(-0.1), Free(0.1, lower=-1.0), Free(0.1, sign="any")])
+def test_what_is_positive_starts_and_stays_above_zero(free):
     found = linear_model("roll")
     flight = Flight(dt=0.1, inputs={"lat": np.ones(9)}, outputs={"p": np.arange(9.0)})
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match="tau_f"):
         Problem(found.model, found.vehicle().params, [flight], {"tau_f": free})

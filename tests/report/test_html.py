@@ -10,7 +10,6 @@ import pytest
 
 from heli_jax import numbers
 from heli_jax.finding import note
-from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import files, statements, tables
 from heli_jax.report.drawings import Analysis
 from heli_jax.report.files import SensorAgreement, SupplementaryAnalyses
@@ -118,14 +117,6 @@ def test_combinations_stand_beside_the_baseline(not_identifiable, sound):
     e = fit.estimates["Ixx"]
     assert float(mean) == pytest.approx(5.1 / e.value, rel=1e-2)
     assert float(sd) / float(mean) == pytest.approx(e.sd / e.value, rel=0.1)
-
-
-def test_residuals_that_are_not_white_make_a_warning(sound):
-    name = next(iter(sound[0].whiteness))
-    fit = dataclasses.replace(sound[0], whiteness={name: Whiteness(False, 1e-9, 100, 0.4, 0.9)})
-    assert (fit.overconfident, statements.headline(fit).level) == (True, "good")
-    assert statements.whiteness_note(fit)
-    assert not statements.whiteness_note(sound[0])
 
 
 def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):

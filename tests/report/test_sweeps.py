@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from heli_jax.report import sweeps
-from heli_jax.sweeps import chunks as pieces
+from heli_jax.sweeps import datasets as pieces
 
 UNITS = {"Ixx": "kg*m^2", "If": "kg*m^2", "initial.phi": "rad", "misfit": "rad", "fit": "%"}
 

@@ -11,7 +11,6 @@ import pytest
 import scipy.integrate
 
 from heli_jax import Model, load_vehicle, models, naming, simulate, trim
-from heli_jax.dynamics import helicopter as whole
 from heli_jax.simulation.events import ground, rotor_speed, stopped
 from heli_jax.simulation.trajectory import STATUS
 from tests.dynamics import whole_helicopter as oracle
@@ -43,123 +42,44 @@ def sticks(found, n, *, roll=2e-4, pitch=-2e-4, yaw=0.05, throttle=0.01, seed=0)
     return type(found.inputs)(**{k: one(k, v) for k, v in inputs.items()})
 
 
-def bare(xcell):
-    """No lift, no drag."""
-    return naming.replace(xcell, **{n: jnp.zeros(()) for n in ("a", "Cd0", "Sx", "Sy", "Sz")})
+@pytest.fixture(scope="module")
+def fleet():
+    """Three machines in the same flight of 50 samples: one program for several tests."""
+    model = models.helicopter("consistent")
+
+    @jax.jit
+    def fleet(machines, state, inputs):
+        machines = jax.tree.map(lambda *v: jnp.stack(v), *machines)
+        one = lambda p: simulate(model, p, inputs, dt=DT, initial_state=state)  # noqa: E731
+        return jax.vmap(one)(machines)
+
+    return lambda machines, state, inputs: fleet(
+        machines, jax.tree.map(jnp.asarray, state), jax.tree.map(jnp.asarray, inputs)
+    )
 
 
-def test_free_fall_is_a_parabola(xcell):
+def test_free_fall_is_a_parabola(xcell, fleet):
     """Without a rotor that the air could turn, and without drag."""
-    model, p = models.helicopter("consistent"), bare(xcell)
+    model = models.helicopter("consistent")
+    p = naming.replace(xcell, **{n: jnp.zeros(()) for n in ("a", "Cd0", "Sx", "Sy", "Sz")})
     s = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, dy=-1.0, dz=5.0, phi=0.3, psi=1.0)
-    zero = jnp.zeros(60)
-    run = jax.jit(lambda s: simulate(model, p, model.Inputs(zero, zero, zero, zero), dt=DT,
-                                     initial_state=s))(s)  # fmt: skip
+    zero = jnp.zeros(50)
+    run = jax.tree.map(lambda v: v[0], fleet([p, p, p], s, model.Inputs(zero, zero, zero, zero)))
     t = np.asarray(run.times)
     np.testing.assert_allclose(run.states.x, 3.0 * t, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(run.states.y, -1.0 * t, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(run.states.z, 5.0 * t - 0.5 * 9.80665 * t**2, rtol=1e-9, atol=1e-12)
     assert STATUS[int(run.status)] == "outside the model's range"  # the rotor stands still
-    assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(60))
+    assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(50))
 
 
-@pytest.mark.slow
-def test_turning_the_problem_turns_the_trajectory(xcell, hover):
-    model, angle, n = models.helicopter("consistent"), 2.2, 150
-    u = sticks(hover, n)
-
-    @jax.jit
-    def flown(s):
-        return simulate(model, xcell, u, dt=DT, initial_state=s).states
-
-    start = naming.replace(hover.state, dx=2.0, dy=1.0, dphi=0.1)
-    c, d = np.cos(angle), np.sin(angle)
-    turned = naming.replace(start, dx=2.0 * c - 1.0 * d, dy=2.0 * d + 1.0 * c, psi=angle)
-    one, other = flown(start), flown(turned)
-    np.testing.assert_allclose(other.x, c * one.x - d * one.y, atol=1e-9)
-    np.testing.assert_allclose(other.y, d * one.x + c * one.y, atol=1e-9)
-    np.testing.assert_allclose(other.psi, one.psi + angle, atol=1e-9)
-    for name in ("z", "phi", "theta", "Omega", "beta_roll"):
-        np.testing.assert_allclose(getattr(other, name), getattr(one, name), atol=1e-9)
-
-
-def energetic(p):
-    """The consistent helicopter with the work done on it as one more state, and its energy."""
-    base = models.helicopter("consistent")
-    how = whole.Corrections(*[True] * 11)
-    State = naming.extended(base.State, "Working", {"work": (float, None)})
-
-    def inner(s):
-        return base.State(**{n: getattr(s, n) for n in naming.names(base.State)})
-
-    def field(p, s, u):
-        m = whole.motion(how, s, u)
-        air = whole.flow(how, p, s, u, m)
-        force = whole.main_rotor(how, p, s, u, air)
-        tail = whole.tail_rotor(how, p, u, m, s.Omega, whole.inflow_of(how))
-        rotors = whole.Rotors(force, tail)
-        a = whole.accelerations(how, p, m, force.T)
-        hub = whole.rigid_hub_moments(how, p, s, u, m, force)
-        M = whole.moments(how, p, hub, rotors, whole.drive(how, p, s, u, air, rotors))
-        power = p.m * (a[0] * s.dx + a[1] * s.dy + (a[2] + p.g) * s.dz)
-        power = power + M.roll * m.p + M.pitch * m.q + M.yaw * m.r
-        return State(**naming.asdict(base.vector_field(p, inner(s), u)), work=power)
-
-    def energy(s):
-        m = whole.motion(how, s, None)
-        spin = p.Ixx * m.p**2 + p.Iyy * m.q**2 + p.Izz * m.r**2
-        return 0.5 * p.m * (s.dx**2 + s.dy**2 + s.dz**2) + 0.5 * spin + p.m * p.g * s.z
-
-    model = Model("working", field, lambda p, s, u: base.output(p, inner(s), u), base.Params, State,
-                  base.Inputs, base.Outputs)  # fmt: skip
-    return model, energy
-
-
-@pytest.mark.slow
-def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
-    model, energy = energetic(xcell)
-    start = model.State(**naming.asdict(hover.state), work=jnp.zeros(()))
-    u = sticks(hover, 100, roll=2e-3, pitch=2e-3, yaw=0.2, throttle=0.05)
-    left = []
-    for substeps in (4, 8):
-        run = jax.jit(
-            lambda s, k=substeps: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=k)
-        )(start)
-        E = np.asarray(jax.vmap(energy)(run.states))
-        assert np.ptp(E) > 10.0  # something happens
-        left.append(np.max(np.abs(E - E[0] - np.asarray(run.states.work))) / np.ptp(E))
-    assert left[1] < 1e-6
-    assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
-def test_rk4_is_dopri8(variant, substeps, xcell):
-    model = models.helicopter(variant)
-    found = trim(model, xcell)
-    u = sticks(found, 250, roll=1e-6, pitch=1e-6, yaw=0.01, throttle=2e-3)
-    if variant == "consistent":
-        u = sticks(found, 250)
-    run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=substeps))(
-        found.state
-    )
-    exact = jax.jit(
-        lambda s: simulate(
-            model, xcell, u, dt=DT, initial_state=s,
-            controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
-        )
-    )(found.state)  # fmt: skip
-    assert int(run.status) == int(exact.status) == 0
-    for name in ("x", "y", "z", "phi", "theta", "psi", "Omega"):
-        np.testing.assert_allclose(
-            getattr(run.states, name), getattr(exact.states, name), atol=1e-6, err_msg=name
-        )
-
-
-def test_two_seconds_are_scipys(xcell, hover):
+def test_a_second_is_scipys_and_one_bad_element_leaves_the_others_alone(xcell, hover, fleet):
     """One flight against solve_ivp with the second program's derivatives."""
-    model, n = models.helicopter("consistent"), 50
+    n = 50
     u = sticks(hover, n)
+    run = fleet([xcell, naming.replace(xcell, Ixx=jnp.asarray(jnp.nan)), xcell], hover.state, u)
+    assert [STATUS[int(s)] for s in run.status] == ["ok", "not finite", "ok"]
+    np.testing.assert_array_equal(run.states.phi[0], run.states.phi[2])
     names = oracle.STATES["consistent"]
     v = {**oracle.XCELL}
     x = np.array([float(getattr(hover.state, k)) for k in names])
@@ -171,9 +91,8 @@ def test_two_seconds_are_scipys(xcell, hover):
             return [d[m] for m in names]
 
         x = scipy.integrate.solve_ivp(rates, (0, DT), x, rtol=1e-9, atol=1e-11).y[:, -1]
-    run = simulate(model, xcell, u, dt=DT, initial_state=hover.state)
     for k, name in enumerate(names):
-        assert float(getattr(run.states, name)[-1]) == pytest.approx(x[k], rel=1e-6, abs=1e-7)
+        assert float(getattr(run.states, name)[0, -1]) == pytest.approx(x[k], rel=1e-6, abs=1e-7)
 
 
 def pilot(hover, gain=1.0):
@@ -325,22 +244,3 @@ def test_the_rotor_s_limits_end_a_run(xcell, hover):
     assert int(run.event) == 1
     assert float(run.states.Omega[-1]) == pytest.approx(limit, abs=1e-6)
     assert STATUS[int(run.status)] == "ended by an event"
-
-
-def test_one_bad_element_leaves_the_others_alone(xcell, hover):
-    model, n = models.helicopter("consistent"), 50
-    u = sticks(hover, n)
-
-    @jax.jit
-    @jax.vmap
-    def fleet(Ixx):
-        run = simulate(model, naming.replace(xcell, Ixx=Ixx), u, dt=DT, initial_state=hover.state)
-        return run.states.phi, run.status
-
-    good = jnp.asarray([0.25, 0.3, 0.35])
-    bad = jnp.asarray([0.25, jnp.nan, 0.35])
-    (phi, status), (spoilt, told) = fleet(good), fleet(bad)
-    np.testing.assert_array_equal(status, [0, 0, 0])
-    assert [STATUS[int(s)] for s in told] == ["ok", "not finite", "ok"]
-    np.testing.assert_array_equal(spoilt[0], phi[0])
-    np.testing.assert_array_equal(spoilt[2], phi[2])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from heli_jax.simulation import inputs
 from heli_jax.simulation.inputs import chirp, multistep_3211, random_steps
 
 
@@ -42,9 +41,3 @@ def test_sweep_runs_from_low_to_high():
     assert 1.0 / (up[-1] - up[-2]) == pytest.approx(high, rel=0.03)
     # Integral of an exponential frequency: (high - low) T / ln(high / low) turns in all.
     assert len(up) == pytest.approx((high - low) * n * dt / np.log(high / low), abs=2)
-
-
-def test_a_chirp_s_old_name_tells_the_new_one():
-    with pytest.warns(DeprecationWarning, match="chirp"):
-        u = inputs.sweep(50, 0.02, 0.5, 5.0)
-    np.testing.assert_array_equal(u, chirp(50, 0.02, 0.5, 5.0))

@@ -9,7 +9,6 @@ import pytest
 from heli_jax import Model, simulate
 from heli_jax.naming import Scalar
 from heli_jax.simulation.stepping import check_countable
-from heli_jax.summaries import as_html, of_trajectory
 
 
 class Params(NamedTuple):
@@ -42,18 +41,6 @@ def test_every_step_of_a_long_run_has_its_own_sample():
     # A sample too late would be an error of two; a sixth in each stage is rounded.
     wanted = np.concatenate([[0.0], np.cumsum(u)[:-1]])
     np.testing.assert_allclose(found.states.x, wanted, atol=1e-3)
-
-
-def test_single_precision_is_said_in_text_and_table():
-    _, single = run(100, jnp.float32)
-    assert "computed in float32, 7 digits" in repr(single)
-    assert "jax_enable_x64" in as_html(of_trajectory(single, ("finished",)))
-    attributes = single.to_xarray().attrs
-    assert attributes["precision"] == "float32"
-    assert "5e-5" in attributes["precision_note"]
-    _, double = run(100, jnp.float64)
-    assert "float" not in repr(double)
-    assert double.to_xarray().attrs == {"precision": "float64"}
 
 
 def test_more_samples_than_float32_counts_are_refused():

@@ -146,16 +146,3 @@ def test_a_result_whose_worker_has_died_is_not_waited_for_without_end(monkeypatc
             pass
         with pytest.raises(InputError):
             list(cluster._as_they_end(client, cluster._gathered([future])))
-
-
-@pytest.mark.slow
-def test_killed_and_resumed(tmp_path, monkeypatch):
-    """The experiment that shows it at full size, in small."""
-    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
-    survives = __import__("sweep_survives")
-    config = survives.configuration(tmp_path, n=3072, chunk=128, duration=20.0)
-    first = survives.run_through(config, tmp_path / "whole")
-    found = survives.kills(config, tmp_path / "whole", tmp_path / "killed", 2, first, seed=1)
-    assert found.equal
-    assert found.hit >= 1
-    assert found.rewritten == 0

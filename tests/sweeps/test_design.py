@@ -9,11 +9,9 @@ import pytest
 import scipy.stats.qmc
 from hypothesis import given
 
-from heli_jax import sweeps
 from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
-from heli_jax.sweeps.axes import whole_seeds
+from heli_jax.sweeps.design import _sobol_points as scrambled_sobol
 from heli_jax.sweeps.design import log_axes
-from heli_jax.sweeps.sobol_points import scrambled_sobol
 
 AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
 
@@ -150,21 +148,6 @@ def test_descriptions_tell_designs_apart():
 def test_what_cannot_be_a_design_is_refused_in_words(make, words):
     with pytest.raises(ValueError, match=words):
         make()
-
-
-def test_messages_say_what_was_expected_and_what_was_got():
-    with pytest.raises(ValueError, match=r"axes.a.n: expected at least 2 points, got 1"):
-        grid({"a": Range(1.0, 2.0, n=1)})
-    with pytest.raises(ValueError, match=r"axes.a: expected finite lower < upper, got 2 and 1"):
-        lhs({"a": Range(2.0, 1.0)}, 3)
-    with pytest.raises(ValueError, match=r"axes.seed: expected whole numbers .* got 6.5"):
-        whole_seeds(np.array([1.0, 6.5]))
-
-
-@pytest.mark.parametrize(("old", "new"), [("Between", "Range"), ("listed", "paired")])
-def test_old_names_are_told_the_new_ones(old, new):
-    with pytest.warns(DeprecationWarning, match=new):
-        assert getattr(sweeps, old) is getattr(sweeps, new)
 
 
 def test_a_grid_that_is_even_in_the_logarithm_is_drawn_so():

@@ -3,12 +3,10 @@
 import dataclasses
 import re
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Flight, load_vehicle, models, naming, sweep
-from heli_jax.errors import InputError
+from heli_jax import Flight, models, naming, sweep
 from heli_jax.sweeps import Range, Reduce, paired, sobol
 
 STAND = models.roll_on_stand
@@ -43,8 +41,6 @@ def agree(rtol, model, vehicle, flight, design, reduce, **options):
     [
         ("exact", "linear"),
         ("rk4", "zero-order"),
-        pytest.param("exact", "zero-order", marks=pytest.mark.slow),
-        pytest.param("rk4", "linear", marks=pytest.mark.slow),
     ],
 )
 def test_the_stand(bench30, record, solver, hold):
@@ -81,14 +77,6 @@ def test_a_sweep_that_cannot_be_fused(bench30, record, tmp_path):
         sweep(STAND, bench30, record, design, reduce, backend="gpu")
 
 
-def test_a_store_keeps_its_backend(bench30, record, tmp_path):
-    design, reduce = paired({"Ixx": [0.03, 0.04]}), {"m": BOTH["rms"]}
-    out = tmp_path / "out"
-    sweep(STAND, bench30, record, design, reduce, out=out, backend="fused")
-    with pytest.raises(InputError, match="was begun with backend fused, expected the same or auto"):
-        sweep(STAND, bench30, record, design, reduce, out=out, resume=True, backend="xla")
-
-
 def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     import jax
 
@@ -107,22 +95,6 @@ def test_an_operation_without_a_translation_is_said(bench30, record, capsys):
     assert found.attrs["split"]["backend"] == "xla"
     said = next(s for s in said if "no translation" in s)
     assert re.search(r"of the operation erf_inv \(at test_fused.py:\d+\)", said)
-
-
-def test_a_long_table_of_a_model(bench30, record):
-    # A model's own constants, of one axis and of two, longer than what stays in registers.
-    points, rows = np.linspace(-1.0, 1.0, 201), np.sin(np.outer(np.arange(90), [1.0, 2.0]))
-
-    def vector_field(p, s, u):
-        d = STAND.vector_field(p, s, u)
-        k = jnp.clip((100 * s.dphi + 45).astype(int), 0, 89)
-        lag = jnp.interp(s.dphi, points, np.tanh(points)) + 0.1 * jnp.asarray(rows)[k, 1]
-        twice = jnp.tile(jnp.stack([s.phi, s.dphi]), 2)
-        return naming.replace(d, dphi=d.dphi - lag - 0.1 * twice[3])
-
-    model = dataclasses.replace(STAND, vector_field=vector_field, linear=False)
-    design = paired({"initial.dphi": np.linspace(-0.9, 0.9, 9)})
-    agree(1e-13, model, bench30, record, design, {"rms": Reduce("rms", "roll")})
 
 
 def test_a_model_that_leaves_single_precision(bench30, record):
@@ -160,21 +132,3 @@ def test_a_translation_that_fails_is_no_sweep_that_fails(bench30, record, monkey
     assert any("whose translation failed (RuntimeError: LLVM IR parsing error" in s for s in said)
     with pytest.raises(ValueError, match=r"backend: this sweep cannot be fused: .*LLVM IR"):
         run_sweep(wanted, None, Options(backend="fused", lanes=1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["helicopter", "helicopter-paper", "helicopter-consistent"])
-def test_whole_helicopters(name):
-    from heli_jax.sweeps.spec import Trimmed
-
-    model = models.by_name(name)
-    vehicle = load_vehicle("configs/vehicles/x-cell-60.yaml", model.Params)
-    rng = np.random.default_rng(0)
-    inputs = {n: 2e-4 * np.repeat(rng.uniform(-1, 1, 4), 10) for n in naming.names(model.Inputs)}
-    flight = Flight(dt=0.02, inputs=inputs, outputs={})
-    trimmed = Trimmed() if name == "helicopter" else None
-    design = sobol({"Ixx": Range(0.15, 0.25, "log"), "offset.x_yaw": Range(0.0, 1e-3)}, 8)
-    reduce = {n: Reduce("rms", n) for n in naming.names(model.Outputs)[:6]}
-    found = agree(1e-12, model, vehicle, flight, design, reduce, trimmed=trimmed)
-    if trimmed is not None:
-        assert (found["status"] == 0).any()

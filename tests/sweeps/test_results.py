@@ -23,7 +23,6 @@ from heli_jax.sweeps import (
     grid,
     paired,
     product,
-    reducers,
     sobol,
 )
 from heli_jax.sweeps.design_point import DIVERGED, OK, OUT_OF_RANGE
@@ -38,7 +37,7 @@ def flown(model, record, **options):
     return jax.jit(lambda params: simulate(model, params, record, **options))
 
 
-@pytest.mark.parametrize("solver", ["exact", "rk4", "Tsit5"])
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
 def test_every_reducer_is_what_numpy_makes_of_the_run(bench30, record, solver):
     reduce = {how: Reduce(how, "roll") for how in REDUCERS}
     found = sweep(ROLL, bench30, record, sobol(AXES, 5), reduce, solver=solver)
@@ -69,28 +68,27 @@ def test_every_reducer_is_what_numpy_makes_of_the_run(bench30, record, solver):
     assert not found["status"].any()
 
 
-def test_an_axis_that_changes_nothing_says_so(bench30, record):
-    design = grid({"Ixx": [0.02, 0.03], "Iyy": [0.1], "gain.x_roll": [1.0]})
-    found = sweep(ROLL, bench30, record, design, {"peak": Reduce("peak", "roll")})
-    [said] = found.attrs["notes"]
-    assert (said["code"], said["subjects"]) == ("sweep.axis-without-effect", ["Iyy"])
-
-
 def test_the_labels_say_what_stands_there(bench30, record):
     reduce = {"peak": Reduce("peak", "roll"), "fit": Reduce("fit", "roll")}
-    found = sweep(ROLL, bench30, record, grid({"Ixx": [0.02, 0.03]}), reduce)
+    axes = {"Ixx": Range(0.02, 0.05, "log", 4), "Iyy": [0.1], "gain.x_roll": [1.0]}
+    found = sweep(ROLL, bench30, [record, record], grid(axes), reduce)
+    assert found["flight"].values.tolist() == [f"{record.name} ({k})" for k in (1, 2)]
+    assert list(found) == ["peak", "fit"]
+    assert found["Ixx"].attrs["scale"] == "log"
+    assert "scale" not in found["Iyy"].attrs
+    # An axis that changes nothing says so.
+    [said] = found.attrs["notes"]
+    assert (said["code"], said["subjects"]) == ("sweep.axis-without-effect", ["Iyy"])
     assert found["peak"].attrs["units"] == "rad"
     assert found["fit"].attrs["units"] == "%"
     assert found["Ixx"].attrs["units"] == "kg m^2"
     assert found["Ixx"].dims == ("element",)
-    assert set(found.coords) == {"Ixx", "status"}
+    assert set(found.coords) == {*axes, "flight", "status"}
     assert found["status"].attrs["flag_meanings"].split()[:3] == ["ok", "diverged", "out_of_range"]
     assert found.attrs["versions"]["jax"] == jax.__version__
 
 
-@pytest.mark.parametrize(
-    ("samples", "block"), [(2, 4), (4, 4), (5, 4), (9, 4), (400, 4), (5, 1), (9, 8)]
-)
+@pytest.mark.parametrize(("samples", "block"), [(2, 4), (5, 4), (9, 8)])
 def test_blocks_of_samples_lose_none(bench30, record, samples, block):
     flight = Flight(
         dt=0.02, inputs={"x_roll": record.inputs["x_roll"][:samples] + 1e-6}, outputs={}
@@ -307,32 +305,6 @@ def test_a_model_that_runs_away_is_flagged(pushed):
     assert found["status"].values.tolist() == [OK, DIVERGED, OK, DIVERGED]
 
 
-def test_a_vehicle_that_cannot_be_is_out_of_range_however_it_flies(bench30, record):
-    found = sweep(
-        ROLL, bench30, record, paired({"Ixx": [0.03, -1e-6]}), {"rms": Reduce("rms", "roll")}
-    )
-    assert found["status"].values.tolist() == [OK, OUT_OF_RANGE]
-    assert np.isnan(found["rms"][1])
-
-
-def test_flights_of_one_name_are_told_apart(bench30, record):
-    reduce = {"rms": Reduce("rms", "roll")}
-    found = sweep(ROLL, bench30, [record, record], paired({"Ixx": [0.03]}), reduce)
-    assert found["flight"].values.tolist() == [f"{record.name} ({k})" for k in (1, 2)]
-
-
-def test_results_stand_as_they_were_asked_for(bench30, record):
-    reduce = {n: Reduce("rms", "roll") for n in ("z", "b", "a")}
-    assert list(sweep(ROLL, bench30, record, paired({"Ixx": [0.03]}), reduce)) == ["z", "b", "a"]
-
-
-def test_an_axis_in_the_logarithm_says_so(bench30, record):
-    axes = {"Ixx": Range(0.02, 0.05, "log"), "a": Range(4.0, 6.0)}
-    found = sweep(ROLL, bench30, record, sobol(axes, 4), {"rms": Reduce("rms", "roll")})
-    assert found["Ixx"].attrs["scale"] == "log"
-    assert "scale" not in found["a"].attrs
-
-
 @pytest.fixture(scope="module")
 def xcell(vehicles_folder):
     from heli_jax import load_vehicle
@@ -379,10 +351,3 @@ def test_the_pilot_holds_each_element_in_its_own_trim(xcell):
     assert not found["status"].any()
     for name in reduce:
         np.testing.assert_allclose(found[name], 0.0, atol=1e-9)
-
-
-def test_the_old_name_of_a_measured_signal_s_squares_warns():
-    signal = reducers.measured(np.array([1.0, 3.0, np.nan]), np.dtype(float))
-    assert signal.total_squares == 2.0
-    with pytest.warns(DeprecationWarning, match="total_squares"):
-        assert signal.spread == 2.0

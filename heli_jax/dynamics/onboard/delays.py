@@ -34,9 +34,7 @@ def with_delays(
     linear, so that matrices, modes, filters and windows have it too, and differentiable.
 
     Args:
-        model: any.
         inputs: those that act late: names, or by name the parameter (which several may share).
-        outputs: those that are logged late, likewise.
         order: states of each output's delay line, 1 to 8.
 
     Raises:
@@ -67,10 +65,6 @@ def _by_name(late: Late) -> dict[str, str]:
 
 def with_input_delays(model: Model, parameters: Mapping[str, str]) -> Model:
     """The model whose inputs are late by new parameters.
-
-    Args:
-        model: any.
-        parameters: by input the name of its delay.
 
     Raises:
         ValueError: an input is late already, or the model has a parameter of that name.
@@ -162,13 +156,7 @@ class _LateOutputs(Device):
         self.late, self.order = late, order
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the lines' states, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the lines' states, per second."""
         measured = self.measured(p, s, u)
         rates = {}
         for n, parameter in self.late.items():
@@ -179,14 +167,7 @@ class _LateOutputs(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are late read from their lines.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-            y: the outputs before the delay.
-        """
+        """The outputs, those that are late read from their lines."""
         return naming.replace(
             y,
             **{
@@ -212,11 +193,6 @@ class _LateOutputs(Device):
 def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
     """The model with the delay of one input as a delay line among its states: within a feedback
     loop the input is no record that could be read further back.
-
-    Args:
-        model: one of whose inputs is late.
-        name: that input.
-        order: states of the line.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
     # The delay of this input is no longer one of the record: left in both places it would act
@@ -245,25 +221,13 @@ class _LateInput(Device):
         self.name, self.parameter = name, parameter
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs, the late one read from its line.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The inputs, the late one read from its line."""
         past = [getattr(s, n) for n in self.parts.states]
         late = line_value(past, getattr(u, self.name), getattr(p, self.parameter))
         return naming.replace(u, **{self.name: late})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the line's states, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the line's states, per second."""
         past = [getattr(s, n) for n in self.parts.states]
         changes = line_rates(past, getattr(u, self.name), getattr(p, self.parameter))
         return dict(zip(self.parts.states, changes, strict=True))
@@ -279,7 +243,6 @@ def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
 
     Args:
         past: the states of the line, in the signal's unit.
-        value: the signal now.
         delay: [s].
     """
     return jnp.where(delay == 0, value, line_end(past))
@@ -311,7 +274,6 @@ def require_past(model: Model, params: Record) -> None:
     """Refuse a delay line that would look ahead.
 
     Args:
-        model: any.
         params: its Params, concrete.
 
     Raises:
@@ -335,7 +297,6 @@ def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
 
     Args:
         past: the states m, in the signal's unit.
-        value: the signal u now.
         delay: tau [s].
     """
     rates, delay = [], _possible(delay)

@@ -61,34 +61,15 @@ class Device(abc.ABC):
         self.Outputs = with_more(model.Outputs, parts.outputs)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that reach the model; those from outside unless the device drives it.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The inputs that reach the model; those from outside unless the device drives it."""
         return u
 
     @abc.abstractmethod
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the device's own states, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the device's own states, per second."""
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, from those of the model.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-            y: the outputs of the model itself.
-        """
+        """The outputs, from those of the model."""
         return y
 
     def first(self, p: Record) -> dict[str, Any]:
@@ -102,36 +83,18 @@ class Device(abc.ABC):
         return self.model.State(**{n: getattr(s, n) for n in naming.names(self.model.State)})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """Of the model behind its device.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """Of the model behind its device."""
         of_model = self.model.vector_field(p, self.inner(s), self.inputs(p, s, u))
         # The device's states stand behind the model's: matrices of the model keep their rows and
         # columns.
         return self.State(**naming.asdict(of_model), **self.rates(p, s, u))
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """What the log has.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """What the log has."""
         return self.shown(p, s, u, self.measured(p, s, u))
 
     def measured(self, p: Record, s: Record, u: Record) -> Record:
-        """The outputs of the model itself.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The outputs of the model itself."""
         return self.model.output(p, self.inner(s), self.inputs(p, s, u))
 
     def start(self, p: Record) -> Record:
@@ -148,13 +111,7 @@ class Device(abc.ABC):
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """Those of the model, with the inputs that reach it.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """Those of the model, with the inputs that reach it."""
         assert self.model.limits is not None
         return self.model.limits(p, self.inner(s), self.inputs(p, s, u))
 
@@ -162,9 +119,7 @@ class Device(abc.ABC):
         """The Model with its device.
 
         Args:
-            suffix: of its name.
             again: puts the same device around another model: that without the stand.
-            **changes: further fields of the Model.
         """
         model, states = self.model, tuple(self.parts.states)
         steady = model.steady_flight
@@ -227,12 +182,6 @@ def _check_new(model: Model, parts: Parts) -> None:
 def require(names: Iterable[str], record: type, kind: str, model: Model) -> None:
     """Refuse names that a model's record does not have, none at all, and one twice.
 
-    Args:
-        names: asked for.
-        record: Inputs, Outputs or State of the model.
-        kind: what they are, as 'input'.
-        model: named in the sentence.
-
     Raises:
         ValueError: naming the first that is wrong.
     """
@@ -253,7 +202,6 @@ def quotient(above: str | None, below: str | None) -> str | None:
 
     Args:
         above: unit of the first, as `rad/s`.
-        below: unit of the second.
     """
     if above is None or below is None:
         return None

@@ -75,11 +75,7 @@ class Filter(NamedTuple):
 
 
 def cutoff(filters: Sequence[Filter]) -> float:
-    """Where low-passes one behind the other are 3 dB down together [Hz].
-
-    Args:
-        filters: low-passes, at least one.
-    """
+    """Where low-passes one behind the other are 3 dB down together [Hz]."""
     # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
     # quality rises before it falls, so the last crossing counts.
     hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
@@ -91,7 +87,6 @@ def gain(filters: Sequence[Filter], hz: np.ndarray) -> np.ndarray:
     """What low-passes one behind the other leave of an amplitude (K,).
 
     Args:
-        filters: low-passes.
         hz: frequencies (K,) [Hz].
     """
     size = np.ones_like(hz)
@@ -146,8 +141,6 @@ def with_filters(
     a line of states as in `with_delays`. Both are linear, with constants that are fixed.
 
     Args:
-        model: any.
-        filters: by output, one after the other.
         delays: by output [s], at most `LONGEST_DELAY`; the delay stands behind the filters.
 
     Raises:
@@ -183,7 +176,6 @@ def check_delay(delay: float, where: str) -> None:
 
     Args:
         delay: [s].
-        where: what the sentence begins with.
 
     Raises:
         ValueError: it is negative, too long or no number.
@@ -283,13 +275,7 @@ class _Filtered(Device):
         super().__init__(model, Parts({}, states))
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of filters and lines, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of filters and lines, per second."""
         measured, rates = self.measured(p, s, u), {}
         for n, sections in self.sections.items():
             value = getattr(measured, n)
@@ -309,14 +295,7 @@ class _Filtered(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs as they are logged.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-            y: the outputs before the filters.
-        """
+        """The outputs as they are logged."""
         logged = {}
         for n, sections in self.sections.items():
             value = getattr(y, n)
@@ -328,15 +307,7 @@ class _Filtered(Device):
         return naming.replace(y, **logged)
 
     def _behind(self, s: Record, state: str, speed: str, section: _Section, value: Any) -> Any:
-        """The signal behind a section.
-
-        Args:
-            s: the State.
-            state: the section's own.
-            speed: that of its rate.
-            section: its constants.
-            value: the signal before it.
-        """
+        """The signal behind a section."""
         if section.left is None:
             return getattr(s, state)
         # The low-passed signal's rate over omega Q is the band that a notch takes away.
@@ -362,11 +333,7 @@ def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str
 
 
 def states_behind(model: Model) -> frozenset[str]:
-    """The states of a model that are filters and delay lines behind its outputs.
-
-    Args:
-        model: any.
-    """
+    """The states of a model that are filters and delay lines behind its outputs."""
     names = "|".join(map(re.escape, naming.names(model.Outputs)))
     pattern = re.compile(rf"({names})_(filter\d+(_rate)?|late\d+)")
     return frozenset(n for n in naming.names(model.State) if pattern.fullmatch(n))
@@ -395,7 +362,6 @@ def line_rate(order: int, delay: float) -> float:
     """The fastest rate of a delay line [rad/s].
 
     Args:
-        order: its states.
         delay: [s].
     """
     return float(np.max(np.abs(np.linalg.eigvals(_line(order)[0])))) / delay

@@ -60,8 +60,6 @@ def with_rate_loop(
         model: with servos already, where it has them (`with_servos`): they are in the loop.
         on: the sticks; by stick its rate where the model's axes do not say it: a state, or p, q or
             r of a model with `body_rates`; None for those of the model's roll and pitch axes.
-        integral: whether there is K_i.
-        feedforward: whether there is K_ff.
         lag: whether the unit's gyro is low-passed, tau dr_m/dt = r - r_m.
 
     Raises:
@@ -86,7 +84,6 @@ def with_gyro(
         model: with the tail's servo already, where it has one.
         on: the pedal, as the sticks of `with_rate_loop`; None for that of the yaw axis.
         heading_hold: whether the pedal commands a rate, with an integral of its error.
-        lag: whether the gyro is low-passed.
 
     Raises:
         ValueError: no such pedal, no rate known for it, one whose unit is not that of an angular
@@ -216,34 +213,17 @@ class _RateLoop(Device):
         self.loops, self.law = loops, law
 
     def rate(self, s: Record, name: str) -> Any:
-        """The rate itself.
-
-        Args:
-            s: the State, with the loop's own states.
-            name: of a state, or p, q or r.
-        """
+        """The rate itself."""
         if _is_of_body(self.model, name) and self.model.body_rates is not None:
             return self.model.body_rates(s)[name]
         return getattr(s, name)
 
     def seen(self, s: Record, stick: str, rate: str) -> Any:
-        """The rate as the loop has it.
-
-        Args:
-            s: the State, with the loop's own states.
-            stick: the input that the loop drives.
-            rate: its name.
-        """
+        """The rate as the loop has it."""
         return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """What the loops ask of the machine in place of their sticks; other inputs pass.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """What the loops ask of the machine in place of their sticks; other inputs pass."""
         driven = {}
         for stick, rate in self.loops:
             # From the state and not from an output: an output may be delayed or filtered by the
@@ -266,13 +246,7 @@ class _RateLoop(Device):
         return naming.replace(u, **driven)
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of integrals and lagged rates, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of integrals and lagged rates, per second."""
         rates = {}
         for stick, rate in self.loops:
             measured = self.seen(s, stick, rate)

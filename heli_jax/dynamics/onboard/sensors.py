@@ -1,16 +1,31 @@
-"""Sensors between motion and log: accelerometers, low-passes, delays."""
+r"""Sensors between motion and log: accelerometers, low-passes, delays.
+
+Sensors of the body's motion show specific force, angular acceleration and airspeed. At r from the
+centre of gravity $f = a - g + \dot\omega \times r + \omega \times (\omega \times r)$ and $V = v -
+v_{wind} + \omega \times r$, along the body forward, right and down. Three kinds of models know
+their velocities:
+
+- linear ones with speeds u, v, w of the body: about hover, $f_x = \dot u + g\theta$,
+  $f_y = \dot v - g\phi$, $f_z = \dot w$ (the steady -g of a level hover is left to the bias);
+- others with speeds u, v, w and rates p, q, r of the body among their states;
+- those with speeds dx, dy, dz over the ground (dz up) and the angles phi, theta, psi, and with
+  either the angles' derivatives dphi, dtheta, dpsi as states or the rates of the body as outputs:
+  the whole helicopter.
+"""
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, zeros
+from heli_jax.dynamics.model import Model, axes_of, zeros
 from heli_jax.dynamics.onboard.delays import ORDER, Late, with_delays
-from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, require
-from heli_jax.dynamics.onboard.motion_sensors import with_motion_sensors
+from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
 from heli_jax.naming import Record
 
 
@@ -28,14 +43,12 @@ def with_sensors(
 
     An accelerometer adds the outputs `ax`, `ay`, `az` [m/s^2] along the body (forward, right,
     down): the specific force at (`x_imu`, `y_imu`, `z_imu`) [m] from the centre of gravity, new
-    parameters (`heli_jax.dynamics.onboard.motion_sensors`). A low-pass is first order,
+    parameters (`heli_jax.dynamics.onboard.sensors`). A low-pass is first order,
     `tau_lowpass_OUTPUT` [s] with the state `OUTPUT_lowpass`. Delays are those of `with_delays`.
 
     Args:
-        model: any.
         lowpass: outputs that are low-passed, `ax` and its like among them.
         delay: outputs that are late, by names or by name the parameter.
-        imu: whether there is an accelerometer.
         angular_acceleration: whether `pdot`, `qdot`, `rdot` [rad/s^2] are outputs.
         airspeed: whether `airspeed` and `u_air`, `v_air`, `w_air` [m/s] are outputs, at (`x_air`,
             `y_air`, `z_air`) [m] from the centre of gravity.
@@ -80,13 +93,7 @@ class _LowPass(Device):
         self.on = on
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the low-passed outputs, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of the low-passed outputs, per second."""
         y = self.measured(p, s, u)
         return {
             f"{n}_lowpass": (getattr(y, n) - getattr(s, f"{n}_lowpass"))
@@ -95,14 +102,7 @@ class _LowPass(Device):
         }
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, those that are low-passed read from their states.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-            y: the outputs before the low-pass.
-        """
+        """The outputs, those that are low-passed read from their states."""
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
@@ -111,3 +111,388 @@ class _LowPass(Device):
         # Zero in its place would show as a start-up transient of the filter, which a logger that
         # runs before the record begins has long behind it.
         return {f"{n}_lowpass": getattr(y, n) for n in self.on}
+
+
+_AXES = {"x": "ahead of", "y": "to the right of", "z": "below"}
+_ALONG = {"x": "forward", "y": "to the right", "z": "down"}
+
+
+def with_motion_sensors(
+    model: Model, *, imu: bool = False, angular_acceleration: bool = False, airspeed: bool = False
+) -> Model:
+    """The model with outputs that its sensors make of the motion; each costs only if asked for.
+
+    Args:
+        imu: whether there is an accelerometer: outputs ax, ay, az [m/s^2], the specific force at
+            the new parameters x_imu, y_imu, z_imu [m].
+        angular_acceleration: whether pdot, qdot, rdot [rad/s^2] are shown, the derivatives of the
+            body's rates as far as the model has these.
+        airspeed: whether the speed through the air is shown, at the new parameters x_air, y_air,
+            z_air [m]: u_air, v_air, w_air along the body and their norm airspeed [m/s].
+
+    Raises:
+        ValueError: the model does not know what is asked for, or has the name already.
+    """
+    asked = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
+    return _with_sensors(model, tuple(name for name, on in asked.items() if on))
+
+
+# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+@functools.cache
+def _with_sensors(model: Model, shown: tuple[str, ...]) -> Model:
+    def again(other: Model) -> Model:
+        return _with_sensors(other, shown)
+
+    # What the sensors show is made of derivatives, so a push on these has to come before them:
+    # `with_disturbance` puts it on the model within.
+    return _MotionSensors(model, shown).made("+".join(shown), again, within=(model, again))
+
+
+class _MotionSensors(Device):
+    """Sensors somewhere in the body, without a dynamics of their own."""
+
+    def __init__(self, model: Model, shown: tuple[str, ...]) -> None:
+        self.asked = shown
+        self.motion = motion_of(model) if {"imu", "airspeed"} & set(shown) else None
+        rates = {letter: rate_of(model, letter) for letter in "pqr"}
+        self.body_rates = {letter: rate for letter, rate in rates.items() if rate is not None}
+        params: dict[str, Quantity] = {}
+        outputs: dict[str, Quantity] = {}
+        if "imu" in shown:
+            params |= _place("imu", "IMU")
+            outputs |= self._forces()
+        if "angular_acceleration" in shown:
+            outputs |= self._accelerations(model)
+        if "airspeed" in shown:
+            params |= _place("air", "airspeed probe")
+            outputs |= self._speeds(model)
+        super().__init__(model, Parts(params, {}, outputs))
+
+    def _forces(self) -> dict[str, Quantity]:
+        assert self.motion is not None
+        return {
+            n: Quantity("m/s^2", f"specific force {_ALONG[n[1]]} at the IMU")
+            for n in self.motion.outputs
+        }
+
+    def _accelerations(self, model: Model) -> dict[str, Quantity]:
+        if not self.body_rates:
+            raise ValueError(
+                f"model {model.name} has no rates of its body, expected states or outputs p, q, r "
+                "or axes named roll, pitch, yaw"
+            )
+        words = {"p": "roll", "q": "pitch", "r": "yaw"}
+        quantities = {}
+        for letter, (kind, name) in self.body_rates.items():
+            record = model.State if kind == "state" else model.Outputs
+            unit = quotient(naming.unit(record, name), "s")
+            meaning = f"angular acceleration of {words[letter]}"
+            quantities[f"{letter}dot"] = Quantity(unit, meaning)
+        return quantities
+
+    def _speeds(self, model: Model) -> dict[str, Quantity]:
+        assert self.motion is not None
+        windy = "wind_x" in naming.names(model.Inputs)
+        if self.motion.kind != "ground" and windy and "psi" not in naming.names(model.State):
+            raise ValueError(
+                f"model {model.name} has a wind over the ground and speeds along its body, "
+                "expected a state psi that tells where it heads"
+            )
+        speeds = {
+            f"{'uvw'['xyz'.index(axis)]}_air": Quantity("m/s", f"airspeed {_ALONG[axis]}")
+            for axis in self.motion.along
+        }
+        if self.motion.kind == "linear":
+            return speeds
+        return {"airspeed": Quantity("m/s", "airspeed at the probe"), **speeds}
+
+    def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """None: these sensors have no states."""
+        return {}
+
+    def output(self, p: Record, s: Record, u: Record) -> Record:
+        """The model's outputs and those of the sensors beside them."""
+        model, motion = self.model, self.motion
+        s = self.inner(s)
+        # Once for all sensors: it is the field that costs.
+        rates = model.vector_field(p, s, u)
+        y = naming.asdict(model.output(p, s, u))
+        if "imu" in self.asked and motion is not None:
+            y |= specific_force(model, motion, p, s, u, rates)
+        if "angular_acceleration" in self.asked:
+            y |= {
+                f"{letter}dot": angular_acceleration(model, rate, p, s, u, rates)
+                for letter, rate in self.body_rates.items()
+            }
+        if "airspeed" in self.asked and motion is not None:
+            y |= airspeed(model, motion, p, s, u, rates)
+        return self.Outputs(**y)
+
+
+def _place(suffix: str, what: str) -> dict[str, Quantity]:
+    # Zero as default, the centre of gravity, where the levers vanish: the one position that needs
+    # no measurement.
+    return {
+        f"{axis}_{suffix}": Quantity("m", f"{what} {where} the centre of gravity", 0.0)
+        for axis, where in _AXES.items()
+    }
+
+
+_G = 9.80665
+
+type Vector = tuple[Any, Any, Any]
+
+_ANGLE_RATES = ("dphi", "dtheta", "dpsi")
+_BODY_RATES = (("p", "q", "r"), ("roll_rate", "pitch_rate", "yaw_rate"))
+"""the names that outputs may have which are the rates of the body"""
+
+
+class MotionKind(NamedTuple):
+    """How a model knows its velocities."""
+
+    kind: str
+    """linear, body or ground"""
+    outputs: tuple[str, ...]
+    """those of ax, ay, az that it can show"""
+
+    @property
+    def along(self) -> str:
+        """The letters of the axes along which it knows its velocity."""
+        return "".join(name[1] for name in self.outputs)
+
+
+def motion_of(model: Model) -> MotionKind:
+    """How a model knows its velocities.
+
+    Raises:
+        ValueError: it knows none.
+    """
+    states = naming.names(model.State)
+    if model.linear:
+        seen = tuple(f"a{axis}" for axis, n in zip("xyz", "uvw", strict=True) if n in states)
+        if seen:
+            return MotionKind("linear", seen)
+    elif {"u", "v", "w", "p", "q", "r", "phi", "theta"} <= set(states):
+        return MotionKind("body", ("ax", "ay", "az"))
+    elif {"dx", "dy", "dz", "phi", "theta", "psi"} <= set(states) and (
+        set(_ANGLE_RATES) <= set(states) or _body_rates(model)
+    ):
+        return MotionKind("ground", ("ax", "ay", "az"))
+    raise ValueError(
+        f"model {model.name} does not know its velocities, expected states u, v, w (with p, q, r, "
+        "phi, theta), or dx, dy, dz, phi, theta, psi with states dphi, dtheta, dpsi or outputs p, "
+        "q, r"
+    )
+
+
+def _body_rates(model: Model) -> tuple[str, ...]:
+    """The outputs that are the rates of the body; () where there are none."""
+    outputs = naming.names(model.Outputs)
+    return next((names for names in _BODY_RATES if set(names) <= set(outputs)), ())
+
+
+def specific_force(
+    model: Model, motion: MotionKind, p: Record, s: Record, u: Record, rates: Record
+) -> dict[str, Any]:
+    """The specific force at the IMU [m/s^2], by output.
+
+    Args:
+        p: the model's Params with x_imu, y_imu, z_imu.
+    """
+    # From the model's own derivatives, so that thrust, drag and gusts are in it without being
+    # named: an accelerometer shows all forces but weight.
+    of_kind = {"linear": _linear, "body": _body, "ground": _ground}[motion.kind]
+    force = of_kind(model, p, s, u, rates)
+    return {n: force["xyz".index(n[1])] for n in motion.outputs}
+
+
+def airspeed(
+    model: Model, motion: MotionKind, p: Record, s: Record, u: Record, rates: Record
+) -> dict[str, Any]:
+    """The speed through the air at the probe, by output: u_air, v_air, w_air along the body
+    forward, right, down, and airspeed, their norm [m/s].
+
+    Args:
+        p: the model's Params with x_air, y_air, z_air.
+        u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.
+    """
+    at = (p.x_air, p.y_air, p.z_air)
+    if motion.kind == "linear":
+        omega = tuple(getattr(s, n, 0.0) for n in "pqr")
+        velocity = tuple(getattr(s, n, 0.0) for n in "uvw")
+    elif motion.kind == "body":
+        omega, velocity = (s.p, s.q, s.r), (s.u, s.v, s.w)
+        wind = _wind(u)
+        if wind is not None:
+            velocity = _less(velocity, _into_body(s, wind))
+    else:
+        omega, _ = _turning(model, p, s, u, rates)
+        wind = _wind(u)
+        over_ground = (s.dx, s.dy, -s.dz)
+        velocity = _into_body(s, over_ground if wind is None else _less(over_ground, wind))
+    velocity = _sum(velocity, _cross(omega, at))
+    shown = {f"{'uvw'['xyz'.index(n)]}_air": velocity["xyz".index(n)] for n in motion.along}
+    # About hover a norm has no linear part: a linear model shows components alone.
+    return shown if motion.kind == "linear" else {"airspeed": _norm(velocity), **shown}
+
+
+def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
+    """Where a model has the rate p, q or r of the body: ('state', name) or ('output', name); None
+    where it has none.
+    """
+    states, outputs = naming.names(model.State), naming.names(model.Outputs)
+    if letter in states:
+        return "state", letter
+    i = "pqr".index(letter)
+    for names in _BODY_RATES:
+        if names[i] in outputs:
+            return "output", names[i]
+    rates = {axis.name: axis.rate for axis in axes_of(model)}
+    rate = rates.get(("roll", "pitch", "yaw")[i])
+    return None if rate is None else ("state", rate)
+
+
+def angular_acceleration(
+    model: Model, rate: tuple[str, str], p: Record, s: Record, u: Record, rates: Record
+) -> Any:
+    """The derivative of one of the body's rates [rad/s^2]."""
+    kind, name = rate
+    if kind == "state":
+        return getattr(rates, name)
+    return _along_motion(lambda state: getattr(model.output(p, state, u), name), s, rates)[1]
+
+
+def _g(p: Record) -> Any:
+    # The model's own g where it has one: a fit in which weight and specific force had two values
+    # would find the difference as a force.
+    return getattr(p, "g", _G)
+
+
+def _at(p: Record) -> Vector:
+    return p.x_imu, p.y_imu, p.z_imu
+
+
+def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
+    """About hover, of first order in all states; a state that the model has not is zero."""
+
+    def of(record: Record, name: str) -> Any:
+        return getattr(record, name, 0.0)
+
+    # omega x v and omega x (omega x r) are products of two small numbers, of which a linear model
+    # knows nothing: kept here, they would make the output nonlinear.
+    turning = _cross((of(rates, "p"), of(rates, "q"), of(rates, "r")), _at(p))
+    return (
+        of(rates, "u") + _g(p) * of(s, "theta") + turning[0],
+        of(rates, "v") - _g(p) * of(s, "phi") + turning[1],
+        of(rates, "w") + turning[2],
+    )
+
+
+def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
+    omega, velocity = (s.p, s.q, s.r), (s.u, s.v, s.w)
+    # u, v and w are components along axes that turn: their derivatives lack omega x v, without
+    # which a steady turn would show no acceleration.
+    along = _sum((rates.u, rates.v, rates.w), _cross(omega, velocity))
+    cos_theta = jnp.cos(s.theta)
+    weight = (
+        -_g(p) * jnp.sin(s.theta),
+        _g(p) * cos_theta * jnp.sin(s.phi),
+        _g(p) * cos_theta * jnp.cos(s.phi),
+    )
+    at_centre = tuple(a - g for a, g in zip(along, weight, strict=True))
+    return _sum(at_centre, _lever(p, omega, (rates.p, rates.q, rates.r)))
+
+
+def _ground(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
+    # Acceleration less gravity while still along the ground, where gravity has one component.
+    force = _into_body(s, (rates.dx, rates.dy, -rates.dz - _g(p)))
+    return _sum(force, _lever(p, *_turning(model, p, s, u, rates)))
+
+
+def _into_body(s: Record, vector: Vector) -> Vector:
+    """A vector forward, right, down over the ground along the body: yaw, pitch, roll (Stevens and
+    Lewis, 2003, eq. 1.3-20)."""
+    x, y, z = vector
+    (cphi, sphi), (ctheta, stheta), (cpsi, spsi) = (
+        (jnp.cos(angle), jnp.sin(angle)) for angle in (s.phi, s.theta, s.psi)
+    )
+    ahead, right = cpsi * x + spsi * y, cpsi * y - spsi * x
+    return (
+        ctheta * ahead - stheta * z,
+        sphi * (stheta * ahead + ctheta * z) + cphi * right,
+        cphi * (stheta * ahead + ctheta * z) - sphi * right,
+    )
+
+
+def _turning(model: Model, p: Record, s: Record, u: Record, rates: Record) -> tuple[Vector, Vector]:
+    """The rates of the body and their derivatives, where the velocities are over the ground."""
+    # Of the angles' own derivatives where these are states. The paper's helicopter shows them as
+    # the rates of the body, which they are in level flight alone; its sensors are where its angles
+    # put them.
+    if set(_ANGLE_RATES) <= set(naming.names(model.State)):
+        return _along_motion(_from_angles, s, rates)
+
+    def shown(state: Record) -> Vector:
+        outputs = model.output(p, state, u)
+        roll, pitch, yaw = (getattr(outputs, n) for n in _body_rates(model))
+        return roll, pitch, yaw
+
+    return _along_motion(shown, s, rates)
+
+
+def _from_angles(s: Record) -> Vector:
+    cphi, sphi = jnp.cos(s.phi), jnp.sin(s.phi)
+    ctheta, stheta = jnp.cos(s.theta), jnp.sin(s.theta)
+    return (
+        s.dphi - s.dpsi * stheta,
+        s.dtheta * cphi + s.dpsi * ctheta * sphi,
+        s.dpsi * ctheta * cphi - s.dtheta * sphi,
+    )
+
+
+def _along_motion(function: Callable[[Record], Any], s: Record, rates: Record) -> tuple[Any, Any]:
+    """A function of the state, and its derivative in time."""
+    as_arrays = jax.tree.map(jnp.asarray, s)
+    tangent = jax.tree.map(lambda v, like: jnp.asarray(v, like.dtype), _as(s, rates), as_arrays)
+    return jax.jvp(function, (as_arrays,), (tangent,))
+
+
+def _as(state: Record, rates: Record) -> Record:
+    """The rates in the state's class, which a device around the model may have extended."""
+    return type(state)(**{n: getattr(rates, n) for n in naming.names(type(state))})
+
+
+def _wind(u: Record) -> Vector | None:
+    """The velocity of the air forward, right, down over the ground; None in still air."""
+    names = naming.names(type(u))
+    if not {"wind_x", "wind_y", "wind_z"} <= set(names):
+        return None
+    # The model's z is up, as that of the helicopter's position.
+    return u.wind_x, u.wind_y, -u.wind_z
+
+
+def _norm(v: Vector) -> Any:
+    # The root of zero has no derivative: at rest this one's is zero.
+    square = v[0] ** 2 + v[1] ** 2 + v[2] ** 2
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
+
+
+def _lever(p: Record, omega: Vector, alpha: Vector) -> Vector:
+    """What the IMU feels beside the centre of gravity."""
+    return _sum(_cross(alpha, _at(p)), _cross(omega, _cross(omega, _at(p))))
+
+
+def _cross(a: Any, b: Any) -> Vector:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+def _sum(a: Any, b: Any) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _less(a: Any, b: Any) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]

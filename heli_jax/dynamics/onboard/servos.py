@@ -35,8 +35,6 @@ def with_servos(
     [s]. New states: the servo's position and speed, `INPUT_NAME` and `INPUT_NAME_rate`.
 
     Args:
-        model: whose inputs are moved by servos.
-        on: those inputs.
         rate_limit: whether they are limited in rate; the model is then no longer linear.
         delay: whether they act late by a pure delay, exact (`Model.delays`).
         name: ends the names of parameters and states, for a second kind of servo.
@@ -90,25 +88,13 @@ class _Servos(Device):
         self.on, self.rate_limit, self.name = on, rate_limit, name
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that are moved by servos, where these stand; the others as they are.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The inputs that are moved by servos, where these stand; the others as they are."""
         # The position alone reaches the model: blades follow where the servo stands, not what it
         # was told.
         return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of positions and speeds, per second.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
+        """The derivatives of positions and speeds, per second."""
         omega, zeta = (getattr(p, f"{k}_{self.name}") for k in ("omega", "zeta"))
         rates = {}
         for n in self.on:

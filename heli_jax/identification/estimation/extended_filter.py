@@ -11,8 +11,7 @@ from heli_jax import naming
 from heli_jax.identification.estimation.filter_step import Drive, Estimate, Filter
 from heli_jax.identification.estimation.moments import moments_after
 from heli_jax.numerics.matrix_exponential import product, van_loan
-from heli_jax.simulation.delays import delays_of
-from heli_jax.simulation.hold import Segment, delayed, segments
+from heli_jax.simulation.hold import Segment, delayed, delays_of, segments
 
 # Inputs are a model's own class: they are annotated Any.
 

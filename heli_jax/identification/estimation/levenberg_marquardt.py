@@ -200,7 +200,6 @@ def _in_blocks(
     if not stages.watched():
         return _optimise_in_one_program(*problem, z0, standing, np.asarray(max_steps), trusted)
     done, over = 0, False
-    stages.at_most(max_steps)
     while True:
         began = time.perf_counter()
         until = min(done + steps, max_steps)
@@ -351,7 +350,6 @@ def _run(
     if nearing is not None:
         unchecked, damping = (np.asarray(v, z0.dtype) for v in nearing)
         constants = constants._replace(unchecked=unchecked, damping=damping)
-    stages.at_most(max_steps)
     if held is not None:
         # Initial states alone, from far off: steps that are shortened end in the next valley (a
         # pendulum near the top of its swing).

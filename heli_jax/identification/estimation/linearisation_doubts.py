@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.analysis.mean_flight import flown
-from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.linearised import linearised, point
+from heli_jax.analysis.operating_point import flown
+from heli_jax.dynamics.jacobians import jacobians, linearised, point
 from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations

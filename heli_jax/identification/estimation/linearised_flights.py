@@ -13,9 +13,9 @@ import optimistix as optx
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.analysis.mean_flight import mean_condition, mean_heading
+from heli_jax.analysis.operating_point import mean_condition, mean_heading
 from heli_jax.analysis.trim import Condition, equilibrium, is_full_nonlinear, trim
-from heli_jax.dynamics.linearised import about, linearised
+from heli_jax.dynamics.jacobians import about, linearised
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.simulated_flights import Drive

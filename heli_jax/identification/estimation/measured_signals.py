@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.dynamics.sensor_noise import sensor_noise
+from heli_jax.dynamics.disturbance import sensor_noise
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 _BEHIND = 0.02

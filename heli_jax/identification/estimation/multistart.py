@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax import stages
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
@@ -188,8 +187,6 @@ class Search:
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i in range(points.shape[0]):
-            if points.shape[0] > 1:
-                stages.part((i + 1, points.shape[0]))
             optimum = optimise(
                 layout,
                 self.data,
@@ -209,7 +206,6 @@ class Search:
             runs.append(run)
             if progress is not None and points.shape[0] > 1:
                 progress(f"{i + 1} of {points.shape[0]} starts done")
-        stages.part(None)
         return runs
 
     @property

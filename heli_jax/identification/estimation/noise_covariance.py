@@ -1,6 +1,6 @@
 """How large the measurement noise is: guessed first, then relaxed with the optimum."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -44,17 +44,6 @@ _WORTH_TELLING = 0.1
 """log-likelihood by which two optima differ"""
 
 
-class OtherValues(NamedTuple):
-    """Values of free parameters that explain a record as well as an optimum's."""
-
-    values: Mapping[str, float]
-    """those that differ, SI"""
-    instead_of: Mapping[str, float]
-    """the optimum's"""
-    less: float
-    """by how much their log-likelihood is below that of the optimum"""
-
-
 class RelaxedOptimum(NamedTuple):
     """An optimum together with the noise that it shows."""
 
@@ -68,8 +57,6 @@ class RelaxedOptimum(NamedTuple):
     """what a reader should know of how the optimum was reached"""
     absent: tuple[str, ...] = ()
     """the parameters of those of several disturbances that do not show"""
-    as_likely: tuple[OtherValues, ...] = ()
-    """other values of the free parameters that explain the record as well"""
 
     def after(self, earlier: "RelaxedOptimum", *notes: Finding) -> "RelaxedOptimum":
         """The same with the rounds and notes of an earlier one before its own."""

@@ -26,7 +26,6 @@ from heli_jax.identification.estimation.disturbance_search import (
 )
 from heli_jax.identification.estimation.multistart import Search, named_values
 from heli_jax.identification.estimation.noise_covariance import (
-    OtherValues,
     RelaxedOptimum,
     log_likelihood_of,
 )
@@ -59,9 +58,8 @@ _EVALUATIONS = 1000
 """of the responses in all: a second or two"""
 _MOST = 2
 """other values that a filter is begun from"""
-_BETTER, _AS_LIKELY = 0.1, 1.92
-"""log-likelihood by which an optimum is better than another; and up to which neither is surer than
-95 %"""
+_BETTER = 0.1
+"""log-likelihood by which an optimum is better than another"""
 
 
 def better_of_same_responses(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
@@ -101,8 +99,6 @@ def better_of_same_responses(search: Search, optimum: RelaxedOptimum) -> Relaxed
             )
             again, best = best, again.after(best, note("search.same-responses", said))
             other, likelihood = likelihood, other
-        if other > likelihood - _AS_LIKELY:
-            best = best._replace(as_likely=_other_values(search, again, best, likelihood - other))
     return best
 
 
@@ -245,14 +241,6 @@ def _changed(search: Search, one: RelaxedOptimum, other: RelaxedOptimum) -> dict
     """The free parameters in which an optimum differs from another, with its values."""
     here, there = (named_values(search.layout, search.data, o.best.z) for o in (one, other))
     return {n: v for n, v in here.items() if not abs(v - there[n]) <= _MOVED * abs(there[n])}
-
-
-def _other_values(
-    search: Search, other: RelaxedOptimum, best: RelaxedOptimum, less: float
-) -> tuple[OtherValues, ...]:
-    values = _changed(search, other, best)
-    here = named_values(search.layout, search.data, best.best.z)
-    return (OtherValues(values, {n: here[n] for n in values}, less),)
 
 
 def _log_posterior(search: Search, optimum: RelaxedOptimum) -> float:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
 from heli_jax.numerics.jitted import jitted
-from heli_jax.simulation.delays import Delays, at, delays_of
+from heli_jax.simulation.hold import Delays, at, delays_of
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 # Params, State and Inputs are a model's own classes: they are annotated Any.

@@ -160,20 +160,18 @@ class _Analysis(NamedTuple):
     resting: tuple[Inseparable, ...]
     """what priors determine, and the data alone do not"""
     exchange: Exchange
-    twins: tuple[tuple[str, str], ...]
     second: tuple[SecondSolution, ...]
     limits: Mapping[str, tuple[float, float]]
     """by name the ends of an interval that is not the slopes'"""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Also those that take a small part in a direction that is not determined, those whose
-        values may be exchanged, and those that have others as good."""
+        """Also those that take a small part in a direction that is not determined, and those that
+        have other values as good."""
         return tuple(
             u.name
             for i, u in enumerate(self.unknowns)
             if any(abs(v[i]) > TAKES_NO_PART for v in self.determined.null)
-            or any(u.name in pair for pair in self.twins)
             or any(u.name in other.changed for other in self.second)
         )
 
@@ -230,7 +228,6 @@ def analyse(
         groups,
         resting,
         exchange,
-        elsewhere.twins,
         elsewhere.second,
         elsewhere.limits,
     )
@@ -257,13 +254,12 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         dict(remedies),
         roughly,
         through_zero,
-        a.twins,
         a.second,
     )
     directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
         names=names,
-        identifiable=not (known.null or a.twins or a.second),
+        identifiable=not (known.null or a.second),
         rank=known.rank,
         rank_without_priors=a.data.rank,
         condition=a.condition,
@@ -287,7 +283,6 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
                 label for v in directions_not_determined for label in a.exchange.labels(v)
             )
         ),
-        twins=a.twins,
         second=a.second,
     )
 
@@ -417,7 +412,7 @@ def _pairs(
 def _weakest(a: _Analysis) -> Weakest | None:
     """The least determined direction, and what is determined far better; None where there is more
     to say than that."""
-    if a.determined.null or a.data.null or a.twins or a.second or not a.condition > ILL_CONDITIONED:
+    if a.determined.null or a.data.null or a.second or not a.condition > ILL_CONDITIONED:
         return None
     covariance = a.determined.covariance
     _, vectors = np.linalg.eigh(covariance)

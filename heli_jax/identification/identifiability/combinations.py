@@ -196,8 +196,6 @@ type Tied = Callable[[list[np.ndarray], np.ndarray, tuple[Unknown, ...]], tuple[
 class Elsewhere(NamedTuple):
     """What slopes at one point do not tell."""
 
-    twins: tuple[tuple[str, str], ...] = ()
-    """pairs of parameters whose values may be exchanged"""
     second: tuple[SecondSolution, ...] = ()
     """other values that fit as well"""
     tied: Tied = combinations

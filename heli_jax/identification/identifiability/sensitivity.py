@@ -240,8 +240,6 @@ class Around(NamedTuple):
 
     aliased: Collection[str] = ()
     """the parameters that move a mode which the samples do not tell from its aliases"""
-    twins: tuple[tuple[str, str], ...] = ()
-    """pairs of parameters whose values may be exchanged"""
     second: tuple[SecondSolution, ...] = ()
     """other values that fit as well"""
     valley: Valley | None = None
@@ -318,7 +316,5 @@ def verdict_of(
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
     remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
-    elsewhere = Elsewhere(
-        around.twins, around.second, around.tied, around.null, around.one_sided, around.limits
-    )
+    elsewhere = Elsewhere(around.second, around.tied, around.null, around.one_sided, around.limits)
     return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)

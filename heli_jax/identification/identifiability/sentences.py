@@ -68,8 +68,6 @@ class Facts(NamedTuple):
     whose interval reaches the end of its search"""
     through_zero: tuple[str, ...] = ()
     """parameters of either sign whose 95 % interval holds zero"""
-    twins: tuple[tuple[str, str], ...] = ()
-    """pairs whose values may be exchanged"""
     second: tuple[SecondSolution, ...] = ()
     """other values that fit as well"""
 
@@ -82,13 +80,11 @@ def sentences(facts: Facts) -> tuple[str, ...]:
         _at_bound(bound[name]) if name in bound else _without_effect(name)
         for name in facts.without_effect
     ]
-    lines += [_exchanged(pair, facts) for pair in facts.twins]
     lines += _also_fits(facts)
     lines += [_not_determined(group, facts) for group in facts.groups]
     # Each parameter is spoken of once, in the sentence that says most: what comes later leaves out
     # what an earlier one has named.
     in_groups = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
-    in_groups |= {n for pair in facts.twins for n in pair}
     in_groups |= {n for other in facts.second for n in other.changed}
     partners = [n for n in facts.undetermined if n not in in_groups]
     not_determined = in_groups | set(partners)
@@ -216,15 +212,6 @@ def _by_prior(names: list[str]) -> list[str]:
 def listed(words: list[str] | tuple[str, ...], last: str = "and") -> str:
     """`a, b and c`"""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
-
-
-def _exchanged(pair: tuple[str, str], facts: Facts) -> str:
-    values = [f"{u.value:.4g}" for n in pair for u in facts.unknowns if u.name == n]
-    return (
-        f"{listed(pair)} can be exchanged: the data tell the two values, {listed(values)}, and do "
-        f"not tell which is which: fix one of {', '.join(pair)}, give it a prior, or bound them "
-        "apart."
-    )
 
 
 def _also_fits(facts: Facts) -> list[str]:

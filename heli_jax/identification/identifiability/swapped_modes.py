@@ -20,13 +20,14 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.identifiability.twins import APART, responses_of
 from heli_jax.identification.identifiability.valley import SAME, Valley
 from heli_jax.identification.identifiability.verdict import SecondSolution
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
 
+_APART = 9.0
+"""squares that the slopes let expect of the other values: below, the two are the same"""
 _FREQUENCIES = 15
 """at which responses are compared, from the record's length to the samples'"""
 _ALIKE = 0.02
@@ -59,7 +60,6 @@ def second_solutions(
     e: Evaluation,
     *,
     optimum: bool = True,
-    reported: Sequence[tuple[str, str]] = (),
 ) -> tuple[SecondSolution, ...]:
     """Other admissible values of the free parameters that the data do not tell from those here.
 
@@ -68,7 +68,6 @@ def second_solutions(
         at: the point.
         e: what it tells.
         optimum: whether it is one, about which the other unknowns may follow.
-        reported: pairs of parameters whose values are said already to be exchangeable.
     """
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     names = [n for n in problem.free if n in values]
@@ -88,9 +87,24 @@ def second_solutions(
     valley, solutions = Valley(problem, at, e), []
     for z in others:
         one = _as_good(valley, family, z, optimum)
-        if one is not None and not any(set(one.changed) <= set(pair) for pair in reported):
+        if one is not None:
             solutions.append(one)
     return tuple(solutions)
+
+
+def _responses_of(
+    problem: Problem, params: Any, about: OperatingPoint, omega: np.ndarray
+) -> np.ndarray:
+    """(k, p, m) of the linearised model, with the delays of its inputs."""
+    matrices = linearize(problem.model, params, about.state, about.inputs).matrices
+    A, B, C, D = (np.asarray(M, np.float64) for M in matrices)
+    s = 1j * omega
+    with np.errstate(all="ignore"):
+        H = C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None] + 0j) + D
+    late = dict(problem.model.delays)
+    names = naming.names(problem.model.Inputs)
+    delays = [float(getattr(params, late[n])) if n in late else 0.0 for n in names]
+    return H * np.exp(-s[:, None] * np.array(delays))[:, None, :]
 
 
 class _Family:
@@ -169,7 +183,7 @@ class _Family:
 
     def responses(self, z: np.ndarray) -> np.ndarray:
         """(k, p, m) of the measured outputs."""
-        return responses_of(self.problem, self._at(z), self.about, self.omega)[:, self.rows]
+        return _responses_of(self.problem, self._at(z), self.about, self.omega)[:, self.rows]
 
 
 class _Record:
@@ -313,7 +327,7 @@ def _as_good(
         > _CHANGED * (max(abs(here[n]), abs(v)) + family.size[i] * ~family.log[i])
     )
     # Along a valley other values are as good anyhow, and it is said what goes together there.
-    if not changed or family.open_along(changed) or not _expected(valley, values) > APART:
+    if not changed or family.open_along(changed) or not _expected(valley, values) > _APART:
         return None
     return SecondSolution(values, changed)
 

@@ -122,8 +122,6 @@ class Verdict:
     """parameters that are determined, with an interval that holds zero: their sign is open"""
     exchangeable: tuple[str, ...] = ()
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
-    twins: tuple[tuple[str, str], ...] = ()
-    """pairs of parameters whose values may be exchanged: the data do not tell which is which"""
     second: tuple[SecondSolution, ...] = ()
     """other values that the data do not tell from these"""
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.sensor_noise import sensor_noise
+from heli_jax.dynamics.disturbance import sensor_noise
 from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.sensitivity import references_of, unknowns_of

@@ -71,7 +71,6 @@ def standard_errors(
     *,
     white: bool,
     aliased: Collection[str] = (),
-    twins: tuple[tuple[str, str], ...] = (),
     second: tuple[SecondSolution, ...] = (),
     optimum: bool = True,
 ) -> StandardErrors:
@@ -85,11 +84,10 @@ def standard_errors(
         white: whether the residuals are white and independent between outputs; of a method with
             process noise whether the innovations are.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
-        twins: the pairs of parameters whose values may be exchanged.
         second: other values that fit as well.
         optimum: whether the point is one, about which the likelihood may be asked.
     """
-    around = Around(frozenset(aliased), twins, second, Valley(problem, at, e))
+    around = Around(frozenset(aliased), second, Valley(problem, at, e))
     inputs = through_inputs(at, e) if optimum else None
     if inputs is not None:
         return _with_process_noise(problem, at, e, inputs, around, white=white)

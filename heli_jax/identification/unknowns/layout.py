@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise, with_sensor_noise
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.sensor_noise import sensor_noise, with_sensor_noise
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem

@@ -74,7 +74,7 @@ class Ranking:
     """flights and outputs whose noise was guessed, and is that of `noise`"""
     noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """sd by `flight/output`, SI"""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     """on how the windows were compared"""
     record: tuple[Finding, ...] = ()
     """what speaks against the whole record, as `check` says it: rates, and what inputs excite"""
@@ -250,9 +250,10 @@ def _simulated(
     return s, _rows_of_spans(layout, data, cuts, samples, cell), notes
 
 
-_DIVERGES = (
+_DIVERGES = note(
+    "windows.own-beginnings",
     "At the start values the simulation of the whole record leaves what was measured, so each "
-    "window begins where its own samples say, and check may expect more or less of the record."
+    "window begins where its own samples say, and check may expect more or less of the record.",
 )
 
 

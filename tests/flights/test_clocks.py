@@ -1,0 +1,252 @@
+"""Clocks of logs: their units, which column is one, rates that contradict them, faults in them."""
+
+import numpy as np
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights.convert import Selection, convert_log
+from heli_jax.flights.resample import new_clock, step_notes
+from heli_jax.flights.time_units import likely_unit, split_unit, time_unit
+
+N, DT = 300, 0.01
+T = DT * np.arange(N)
+U, P = np.sin(7.0 * T), np.cos(5.0 * T)
+ROWS = [f"{t:.2f},{u:.6f},{p:.6f}" for t, u, p in zip(T, U, P, strict=True)]
+CELLS = [row.partition(",")[2] for row in ROWS]
+
+
+def written(tmp_path, rows, names="t,u,p"):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([names, *rows]) + "\n")
+    return path
+
+
+def stamped(tmp_path, stamps, names="t,u,p"):
+    rows = [f"{s},{c}" for s, c in zip(stamps, CELLS, strict=False)]
+    return written(tmp_path, rows, names)
+
+
+def read(path, time: str | Signal | None = "t", u="u", p="p", **options):
+    inputs, outputs = {"u": Signal(u, "1", "1")}, {"p": Signal(p, "1", "1")}
+    return read_flight(path, time=time, inputs=inputs, outputs=outputs, **options)
+
+
+def clock(path):
+    info = describe_log(path)
+    assert info.time is not None
+    return info.time
+
+
+# Units.
+
+
+@pytest.mark.parametrize(
+    ("step", "rows", "unit"),
+    [
+        *((0.01, 6000, "s"), (1.0, 6000, "s"), (0.1, 100_000, "s")),
+        *((10, 6000, "ms"), (200, 3000, "ms"), (1, 60_000, "ms"), (2, 9000, "ms")),
+        *((2500, 9000, "us"), (500, 40_000, "us"), (125, 200_000, "us")),
+        # A sample a second in microseconds is no instant.
+        *((1e6, 27, "us"), (1e6, 5000, "ns"), (2e3, 5000, "us"), (10_000_000, 900, "ns")),
+    ],
+)
+def test_ticks_without_a_unit_are_of_the_one_that_makes_a_flight(step, rows, unit):
+    assert likely_unit(step * np.arange(rows) + 12345.0) == unit
+
+
+@pytest.mark.parametrize("first", [45352.5, 60371.5, 739312.5, 2460372.5])
+def test_days_as_spreadsheets_and_matlab_count_them_are_guessed_by_their_size(tmp_path, first):
+    assert likely_unit(first + 0.01 * np.arange(6000) / 86400) == "day"
+    # Seconds of a day, and of an hour, in the same range.
+    assert likely_unit(first + 0.001 * np.arange(6000)) == "s"
+    assert likely_unit(1e3 + 0.01 * np.arange(6000) / 86400) == "s"
+    # Twice a second: the digits of Julian days end at 40 us.
+    path = stamped(tmp_path, [f"{first + 0.5 * k / 86400:.12f}" for k in range(60)], "datenum,u,p")
+    time = clock(path)
+    assert (time.unit, time.guessed, time.rate) == ("day", True, pytest.approx(2.0))
+    assert read(path, Signal("datenum", "day", "s")).dt == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("days since 2024-03-01", "day"),
+        ("Hours since 2024-03-01 00:00:00", "h"),
+        ("milliseconds  Since 1970-01-01T00:00:00Z", "ms"),
+        ("d", "day"),
+        ("since 1970", None),
+        ("dayssince 1970", None),
+    ],
+)
+def test_the_unit_of_a_clock_with_its_epoch(text, unit):
+    assert time_unit(text) == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("Time [h]", ("Time", "h")),
+        ("t (d)", ("t", "day")),
+        ("elapsed_hours", ("elapsed", "h")),
+        ("time days", ("time", "day")),
+        # A position down, and the span of a tail.
+        ("pos_d", ("pos_d", "")),
+        ("t_h", ("t_h", "")),
+    ],
+)
+def test_the_unit_of_a_clock_behind_its_name(name, parts):
+    assert split_unit(name) == parts
+
+
+def test_a_unit_in_the_file_counts_and_one_in_a_name_is_a_hint(tmp_path):
+    path = written(tmp_path, ["[ms],[-],[deg/s]", *ROWS])
+    flight = read(path)
+    assert flight.dt == pytest.approx(DT * 1e-3)
+    contradicted = [n.subjects for n in flight.source.notes if n.code == "units.contradicted"]
+    assert contradicted == [(), ("p",)]
+    path = written(tmp_path, ROWS, "time_ms,u,p")
+    assert "units.contradicted" in {n.code for n in read(path, "time_ms").source.notes}
+    # Steps of 10 s are no flight's: those that the name says are meant.
+    path = stamped(tmp_path, [f"{1e3 * t:.1f}" for t in T], "time_ms,u,p")
+    with pytest.raises(InputError):
+        read(path, "time_ms")
+
+
+@pytest.mark.parametrize(("step", "rows"), [(10.0, 2000), (5.0, 300), (1.0, 20000)])
+def test_times_in_ms_are_not_taken_in_seconds(tmp_path, step, rows):
+    t = step * np.arange(rows)
+    np.savez(tmp_path / "a.npz", t=t, u=np.sin(t), p=np.cos(t))
+    with pytest.raises(InputError):
+        read(tmp_path / "a.npz")
+    for unit, scale, count in (("ms", 1e-3, 0), ("s", 1.0, 1)):
+        f = read(tmp_path / "a.npz", Signal("t", unit, "s"))
+        assert f.dt == pytest.approx(scale * step)
+        assert [c.code for c in f.source.cautions] == count * ["units.unlikely"]
+
+
+@pytest.mark.parametrize(
+    ("names", "stated", "count"),
+    [
+        # A quarter off; as stated; every eighth sample logged.
+        (("t", "u", "p"), {"fs": 100.0}, 1),
+        (("t", "u", "p"), {"dt": 0.0125}, 0),
+        (("t", "u", "p"), {"fs": 640.0}, 0),
+        # Of two clocks the one that is stated.
+        (("imu.t", "rc.u", "imu.p", "rc.t"), {"imu.fs": 100.0, "rc.fs": 200.0}, 1),
+    ],
+)
+def test_a_rate_beside_times_of_another_is_a_caution(tmp_path, names, stated, count):
+    slow, fast = 0.0125 * np.arange(2000), 0.005 * np.arange(4500)
+    clock, u, p, *other = names
+    arrays = {clock: slow, u: np.sin(fast if other else slow), p: np.cos(slow)}
+    np.savez(tmp_path / "a.npz", **arrays, **stated, **dict.fromkeys(other, fast))
+    flight = read(tmp_path / "a.npz", None if other else clock, u, p, rate=80.0)
+    assert [c.code for c in flight.source.cautions] == count * ["clock.rate-contradicted"]
+
+
+# Which column is the clock.
+
+
+@pytest.mark.parametrize(
+    ("names", "column"),
+    [
+        ("Packet number,Gyroscope X (deg/s)", None),
+        ("Millis,Gyroscope X (deg/s)", "Millis"),
+        ("Freq (Hz),Gain", None),
+    ],
+)
+def test_what_increases_along_a_table_and_is_no_time(tmp_path, names, column):
+    # Packets of several sensors are counted together, so that those of one are not one by one.
+    numbers = np.cumsum(np.tile([2, 1, 2, 1, 1], 40))
+    path = written(tmp_path, [f"{n},{np.sin(n / 9):.5f}" for n in numbers], names)
+    time = describe_log(path).time
+    assert (None if time is None else time.column) == column
+
+
+def test_the_stamp_of_a_sample_goes_before_that_of_its_arrival(tmp_path):
+    stamps = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(40)
+    late = stamps + np.random.default_rng(0).integers(1_000_000, 9_000_000, 40).cumsum()
+    rows = [f"{a},{s},0,{k % 7}" for k, (a, s) in enumerate(zip(late, stamps, strict=True))]
+    time = clock(written(tmp_path, rows, "%time,field.header.stamp,field.header.seq,p"))
+    assert (time.column, time.unit, time.uniform) == ("field.header.stamp", "ns", True)
+    # One that was never set is none.
+    rows = [f"{a},0,{a % 7}" for a in late]
+    assert clock(written(tmp_path, rows, "%time,header.stamp,p")).column == "%time"
+
+
+TWO = ("timestamp", "timestamp_sample")
+
+
+@pytest.mark.parametrize(
+    ("file", "names", "column"),
+    [
+        ("log_actuator_controls_0_0.csv", (*TWO, "x"), TWO[0]),
+        ("vehicle_thrust_setpoint_virtual_mc_0.csv", (*TWO, "x"), TWO[0]),
+        ("log_vehicle_angular_velocity_0.csv", (*TWO, "xyz[0]"), TWO[1]),
+        ("b.csv", ("time", "vehicle_imu.timestamp_sample", "x"), "time"),
+    ],
+)
+def test_a_command_acts_from_when_it_was_published_in_a_table_too(tmp_path, file, names, column):
+    stamps = 20_000_000 + 4000 * np.arange(100)
+    columns = {"timestamp": stamps + 1500 + np.arange(100) % 7, "timestamp_sample": stamps}
+    columns |= {"time": (stamps - stamps[0]) * 1e-6}
+    rows = np.column_stack([columns.get(n.split(".")[-1], 1e-3 * stamps) for n in names])
+    np.savetxt(tmp_path / file, rows, "%.9g", ",", header=",".join(names), comments="")
+    assert clock(tmp_path / file).column == column
+
+
+# Faults.
+
+
+def test_a_counter_of_32_bits_goes_on_and_other_faults_are_refused_with_their_line(tmp_path):
+    ticks = (np.round(1e6 * T).astype(np.int64) + 2**32 - 1_000_000) % 2**32
+    path = stamped(tmp_path, ticks)
+    assert read(path, Signal("t", "us", "s")).dt == pytest.approx(DT)
+    made = convert_log(path, Selection(time_unit="us")).columns["time"]
+    np.testing.assert_allclose(made, T, atol=1e-9)
+    twice, spike = T.copy(), T.copy()
+    twice[100], spike[100] = twice[99], 1e6
+    for stamps, line in (
+        (twice, 102),
+        (spike, 103),
+        (T[::-1], 3),
+        (T - (T >= 1.5), 152),
+        (T % 1.5, 152),
+        (np.round(T, 1), 3),
+    ):
+        with pytest.raises(InputError, match=f"line {line}, column 't'"):
+            read(stamped(tmp_path, [f"{s:.3f}" for s in stamps]))
+
+
+def test_rows_of_one_time_are_counted(tmp_path):
+    path = written(tmp_path, [row for row in ROWS for _ in range(2)])
+    with pytest.raises(InputError, match="300 of 600"):
+        read(path)
+    assert "300 of 600" in clock(path).problem
+
+
+def test_a_step_of_the_clock_is_told_with_its_time():
+    t = 0.01 * np.arange(6000)
+    t[3000:] += 0.1
+    (note,) = step_notes(t, 100.0, 0.25)
+    assert (note.code, note.value) == ("clock.long-steps", pytest.approx(0.11))
+    assert note in new_clock(t, 100.0).notes
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.01, 0.02), (0.02, 0.01)])
+def test_a_second_rate(first, second):
+    rng = np.random.default_rng(0)
+    steps = np.r_[np.full(3000, first), np.full(2000, second)]
+    t = np.cumsum(steps * (1 + 0.1 * rng.uniform(-1, 1, steps.size)))
+    (note,) = step_notes(t, 100.0, 0.25)
+    assert (note.code, note.value) == ("clock.other-rate", pytest.approx(t[2999], abs=0.03))
+
+
+def test_nothing_is_said_of_an_ordinary_clock():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        t = 0.01 * np.arange(4000) + 0.002 * rng.uniform(-1, 1, 4000)
+        assert step_notes(t, 50.0, 0.25) == ()
+        # Many samples lost here and there: the shares of missing samples say so.
+        assert step_notes(t[rng.uniform(size=t.size) > 0.4], 50.0, 0.25) == ()
