@@ -86,18 +86,21 @@ class ComparedRuns(NamedTuple):
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
             # Where an optimiser stopped on its way there is nothing to compare.
-            there = [
-                e if _arrived(run) else None for e, run in zip(estimates, self.runs, strict=True)
-            ]
-            apart = [_difference(there[0], other) for other in there[1:]]
+            pairs = zip(estimates, self.runs, strict=True)
+            first_one, *others = (e if _arrived(run) else None for e, run in pairs)
+            apart = [_difference(first_one, other) for other in others]
             rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
         """Each run's estimates, the combinations that one of the runs determines, then what all its
         flights share beside them: gains, a time shift, the disturbance."""
-        pairs = zip(self.runs, _combinations(self.runs), strict=True)
-        return [{**run.estimates, **of_run, **_shared(run)} for run, of_run in pairs]
+        by_run = []
+        for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
+            # What belongs to a flight has FLIGHT/ before its name.
+            shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
+            by_run.append({**run.estimates, **combined, **shared})
+        return by_run
 
     @property
     def agreement(self) -> Table:
@@ -328,24 +331,17 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     return text(getattr(m, key, None))
 
 
-def _shared(run: SavedFit) -> dict[str, Estimate]:
-    """The nuisance parameters that belong to no flight: those have FLIGHT/ before their name."""
-    return {n: e for n, e in run.nuisance.items() if "/" not in n}
-
-
 def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
     """Whether both were fitted to the same samples of a log, or some of them."""
+    ours, others = (
+        [f for f in run.content["data"] if f.get("sha256") and not f.get("hold_out")]
+        for run in (first, second)
+    )
     return any(
         a["sha256"] == b["sha256"] and _overlap(a.get("window"), b.get("window"))
-        for a in _logged(first)
-        for b in _logged(second)
+        for a in ours
+        for b in others
     )
-
-
-def _logged(run: SavedFit) -> list[dict[str, Any]]:
-    """The flights that were fitted and are from a log."""
-    fitted = [flight for flight in run.content["data"] if not flight.get("hold_out")]
-    return [flight for flight in fitted if flight.get("sha256")]
 
 
 def _overlap(a: list[float] | None, b: list[float] | None) -> bool:

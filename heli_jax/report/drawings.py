@@ -236,31 +236,12 @@ def caption(picture: Picture, *, rls: bool) -> str:
 def alt_text(picture: Picture, analysis: Analysis) -> str:
     """What a figure of the report shows, for who does not see it."""
     fit, intervals = analysis.fit, analysis.supplementary.intervals
+    # Costs, intervals and chains are numbers of the tables beside.
     if picture.name == "correlation":
         return f"{picture.title}. {_correlations(fit)}."
-    if picture.name == "starts":
-        costs = [row.cost for row in fit.starts if row.converged]
-        low, high = (number(f(costs, default=0.0), 4) for f in (min, max))
-        best = f"; costs {low if low == high else f'{low} to {high}'}" if costs else ""
-        failed = len(fit.starts) - len(costs)
-        return f"{picture.title}. Of {len(fit.starts)} starts {failed} failed{best}."
-    if picture.name == "intervals" and intervals is not None:
-        words = [
-            f"{name} by {method} {number(low)} to {number(high)}"
-            for name, methods in intervals.by_parameter.items()
-            for method, (low, high) in methods.items()
-        ]
-        return f"{picture.title}. 95 % intervals: {'; '.join(words)}."
-    if intervals is not None and (posterior := intervals.posterior) is not None:
-        if picture.name == "trace":
-            chains, draws = next(iter(posterior.draws.values())).shape
-            words = f"{chains} chains of {draws} draws, {posterior.divergent} divergent"
-            return (
-                f"{picture.title}. {words}; mean and sd of all: {_scatter(posterior.draws, fit)}."
-            )
-        if picture.name == "pairs_posterior":
-            return f"{picture.title}. {_pairs(posterior.draws, fit)}."
-    if picture.name == "pairs_bootstrap" and intervals is not None and intervals.bootstrap:
+    if picture.name == "pairs_posterior" and intervals and intervals.posterior:
+        return f"{picture.title}. {_pairs(intervals.posterior.draws, fit)}."
+    if picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
         return f"{picture.title}. {_pairs(intervals.bootstrap.values, fit)}."
     for output, m in fit.metrics.items():
         if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
@@ -270,7 +251,10 @@ def alt_text(picture: Picture, analysis: Analysis) -> str:
 
 def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
     """What samples show, pair by pair."""
-    names = list(samples)[:MOST]
+    names, each = list(samples)[:MOST], []
+    for name in names:
+        mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
+        each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
     pairs = [(names[j], names[i]) for i in range(len(names)) for j in range(i)]
     shares = [(p, s) for p in pairs if (s := share_within(fit, samples, *p)) is not None]
     # What is furthest from the 95 % that the curve stands for is told first.
@@ -278,15 +262,7 @@ def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
     inside = ", ".join(f"{x} and {y} {percent(share, 0)}" for (x, y), share in worst)
     count = next(iter(samples.values())).size
     within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
-    return f"{count} samples, mean and sd: {_scatter(samples, fit)}{within}"
-
-
-def _scatter(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
-    words = []
-    for name, values in list(samples.items())[:MOST]:
-        mean, sd = measured(float(np.std(values)), float(np.mean(values)))
-        words.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
-    return "; ".join(words)
+    return f"{count} samples, mean and sd: {'; '.join(each)}{within}"
 
 
 def _correlations(fit: Fit) -> str:

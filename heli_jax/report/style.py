@@ -187,15 +187,8 @@ def line(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
 
 
 def samples(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw what was measured: a line, or where few samples have neighbours a dot for each, of which
-    a line would show nothing.
-
-    Args:
-        ax: where.
-        x: (N,), ascending.
-        y: (N,), NaN where one is missing.
-        **line_style: as of matplotlib's `plot`; of dots all but the width.
-    """
+    """Draw what was measured, NaN where it is missing: a line, or where few samples have neighbours
+    a dot for each, of which a line would show nothing."""
     x, y = np.asarray(x), np.asarray(y)
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
@@ -214,16 +207,7 @@ def bars(
     color: str,
     label: str | None = None,
 ) -> None:
-    """Draw dots with error bars.
-
-    Args:
-        ax: where.
-        x: (N,)
-        y: (N,)
-        reach: of the bars down and up, (2, N), or the same for both, (N,).
-        color: of both.
-        label: of the dots.
-    """
+    """Draw dots with error bars; `reach`: of the bars down and up, (2, N), or of both, (N,)."""
     ax.plot(x, y, "o", ms=2.2, mew=0.0, color=color, label=label)
     down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
     # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.

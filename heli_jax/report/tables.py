@@ -1,7 +1,7 @@
 """Tables of the page and of the terminal: rows of text under heads."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
-from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.identification.validation.metrics import diverges
 from heli_jax.numbers import (
     NOTHING,
     explained_text,
@@ -243,41 +243,36 @@ def agreement(
     """The same metrics for fit, held-out flights and RLS, output by output."""
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
     rows, units = [], logged or {}
-    # An output may have been measured in the flights held out alone.
-    for output in dict.fromkeys([*fit.metrics, *fit.validation]):
-        for of, m in _metrics(fit, baseline, output):
-            row = (output, of, *_agreed(m))
-            if of == _IN_ONE_PIECE and diverges(m):
-                # Its numbers grow with the length of the record: they would say nothing of the
-                # model.
-                rows.append((*row[:2], "diverges", *[NOTHING] * 3, *([NOTHING] if units else ())))
-                continue
-            unit, factor = units.get(output, ("", math.nan))
-            rows.append((*row, *([f"{number(m.rmse * factor)} {unit}".strip()] if units else ())))
-    return Table((*head, "RMSE as logged") if units else head, rows)
-
-
-_IN_ONE_PIECE = "held out, in one piece"
-
-
-def _metrics(fit: Fit, baseline: Baseline | None, output: str) -> Iterator[tuple[str, Metrics]]:
-    """The metrics of an output that there are, in words of what."""
     sources = (
         ("fit, simulated", fit.metrics),
         ("fit, one step ahead", fit.one_step),
         ("held out, simulated", fit.validation),
         (_IN_ONE_PIECE, fit.validation_free_run),
         ("held out, one step ahead", fit.one_step_validation),
-    )
-    yield from ((of, metrics[output]) for of, metrics in sources if output in metrics)
-    if baseline is not None and baseline.output == output:
         # With its flight, since it saw that one alone and the fit all.
-        yield f"RLS ({baseline.flight})", baseline.metrics
+        *([(f"RLS ({b.flight})", {b.output: b.metrics})] if (b := baseline) else ()),
+    )
+    # An output may have been measured in the flights held out alone.
+    for output in dict.fromkeys([*fit.metrics, *fit.validation]):
+        for of, metrics in sources:
+            if (m := metrics.get(output)) is None:
+                continue
+            unit, factor = units.get(output, ("", math.nan))
+            cells = (
+                *(vaf_percent(share) for share in (m.vaf, m.nrmse_fit_percent / 100)),
+                number(m.rmse),
+                number(m.tic, 3),
+                *([f"{number(m.rmse * factor)} {unit}".strip()] if units else ()),
+            )
+            if of == _IN_ONE_PIECE and diverges(m):
+                # Its numbers grow with the length of the record: they would say nothing of the
+                # model.
+                cells = ("diverges", *[NOTHING] * (len(cells) - 1))
+            rows.append((output, of, *cells))
+    return Table((*head, "RMSE as logged") if units else head, rows)
 
 
-def _agreed(m: Metrics) -> tuple[str, ...]:
-    fit_percent = vaf_percent(m.nrmse_fit_percent / 100)
-    return (vaf_percent(m.vaf), fit_percent, number(m.rmse), number(m.tic, 3))
+_IN_ONE_PIECE = "held out, in one piece"
 
 
 def responses(agreement: ResponseAgreement | None) -> Table | None:

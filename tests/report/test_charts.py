@@ -10,7 +10,6 @@ from heli_jax import models
 from heli_jax.identification.result import Signals
 from heli_jax.report import figures, origin, style
 from heli_jax.report.charts import Numbers, chart_of, described
-from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.page import picture
 from heli_jax.report.style import panels
 from tests.report.test_view import decoded
@@ -100,19 +99,6 @@ def test_numbers_come_back_to_a_hundredth_of_a_percent_of_their_range():
     assert np.nanmax(np.abs(back - values)) < 1e-5 * np.ptp(values[np.isfinite(values)])
     np.testing.assert_allclose(decoded(content, times), 3.0 + 0.02 * np.arange(400), atol=1e-12)
     np.testing.assert_array_equal(decoded(content, constant), 2.5)
-
-
-def test_a_line_has_the_same_name_in_each_panel(sound):
-    fit, problem, _ = sound
-    flight = FittedFlight(problem.model, fit.params, fit, fit.signals[0])
-    above, below, *_ = chart_of(figures.bode(flight, None)[0].figure).panels
-    names = [s.label for s in above.series]
-    assert "record" in names
-    assert [s.label for s in below.series] == names
-    residual = chart_of(figures.residual_correlation(fit.signals[0], "roll")[0].figure)
-    alt = described(residual)
-    assert "within the 99 % band −" in alt
-    assert "autocorrelation: autocorrelation" not in alt
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,11 @@ import scipy.signal
 from heli_jax import Flight, models, naming
 from heli_jax.analysis.operating_point import EVERYWHERE
 from heli_jax.analysis.spectral import partial_coherence
-from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.result import Signals
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report import card
 from heli_jax.report.frequency import _spectra, coherences, linear_matrices
-from tests.identification.bench import BENCH, record, vehicle
+from tests.identification.bench import BENCH, vehicle
 
 
 def by_scipy(inputs, y, j, length, dt):
@@ -69,16 +68,6 @@ def gates(flown, **changed):
     return {g.of.removesuffix(", flight 1"): g for g in card._of_excitation(problem, fit)}
 
 
-def test_a_coherence_has_no_size():
-    rng = np.random.default_rng(3)
-    u, y = rng.standard_normal((2, 5, 12)) + 1j * rng.standard_normal((2, 5, 12))
-    others = rng.standard_normal((5, 12, 1)) + 0j
-    plain = partial_coherence(others, u, y)
-    # The squares of such numbers overflow, as those of a simulation that diverged.
-    np.testing.assert_allclose(partial_coherence(others, u, 1e200 * y), plain, rtol=1e-12)
-    np.testing.assert_allclose(partial_coherence(others, 1e-200 * u, y), plain, rtol=1e-12)
-
-
 def test_a_noise_free_flight_of_the_exact_model_fails_no_gate(flown):
     found = gates(flown)
     assert len(found) == 9
@@ -102,28 +91,6 @@ def test_what_should_respond_and_does_not_fails(flown):
     shown = {n: np.roll(y, y.size // 2) for n, y in signals.simulated.items()}
     found = gates(flown, inputs=other, simulated=shown)
     assert found["lon to q"].passed is False
-
-
-def test_one_input_alone_is_weighted_by_the_expected_response():
-    dt, n = 0.05, 4000
-    flight = record(BENCH, seed=4, n=n, dt=dt, noise=0.05)
-    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
-    s = Signals("f", False, flight.times, {"x_roll": u}, {"roll": y}, {"roll": y})
-    model, params = models.roll_on_stand, vehicle(BENCH)
-    at = SimpleNamespace(state=None, inputs=None)
-    [found] = coherences(model, params, at, s, SimpleNamespace(nuisance={})).values()
-    length = 256  # eight and more in 4000 samples, in powers of two
-    how = {"fs": 1 / dt, "window": np.hanning(length), "noverlap": length // 2}
-    f, g2 = scipy.signal.coherence(u, y, nperseg=length, detrend="linear", **how)
-    _, power = scipy.signal.welch(u, nperseg=length, detrend="linear", **how)
-    tf = roll_transfer_function(params, stand=True)
-    num, den, _ = scipy.signal.cont2discrete(
-        ([float(v) for v in tf.num], [float(v) for v in tf.den]), dt
-    )
-    _, H = scipy.signal.freqz(np.ravel(num), den, 2 * np.pi * f * dt)
-    weights = (np.abs(H) ** 2 * power)[1:-1]
-    assert found.value == pytest.approx(np.average(g2[1:-1], weights=weights), rel=1e-4)
-    assert found.others == 0
 
 
 @pytest.mark.parametrize(

@@ -34,14 +34,3 @@ def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     measured = type("Measured", (), {**pair._asdict(), "picture": np.full(OMEGA.size, np.nan)})
     axes = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
     assert axes[0].get_xlim()[1] < 6.0
-
-
-def test_bins_of_a_response_in_gusts_are_within_the_axes() -> None:
-    """Their coherence is 0.45 from 2 to 4 Hz, where the gain has fallen by 9 dB more."""
-    pair = _pair()
-    hz = OMEGA / (2.0 * np.pi)
-    H = pair.H / (1.0 + (hz / 2.0) ** 4)
-    coherence = np.where(hz > 2.0, np.where(hz > 4.0, pair.coherence, 0.45), 0.9)
-    axes = match(pair._replace(H=H, coherence=coherence), "dB re rad/s", "")
-    lowest = 20.0 * np.log10(np.min(np.abs(H[hz < 4.0])))
-    assert axes[0].get_ylim()[0] < lowest

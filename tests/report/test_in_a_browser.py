@@ -55,20 +55,6 @@ def over_time(window):
     return group
 
 
-def test_a_figure_has_its_own_limits_while_all_of_it_is_seen_and_others_when_zoomed(window, report):
-    window.size(1200)
-    window.open(report)
-    content = json.loads(window.value("document.getElementById('numbers').textContent"))
-    over = [c for c in content["charts"] if c["x_label"] == "time in the log [s]"]
-    limits = [p["limits"] for c in over for p in c["panels"]]
-    group = json.dumps(over_time(window))
-    y = f"heliCharts.groups.get({group}).map(u => [u.scales.y.min, u.scales.y.max])"
-    np.testing.assert_allclose(window.value(y), limits)
-    # A stretch in which the response does not go through all of its range.
-    window.value(f"heliCharts.groups.get({group})[0].setScale('x', {{min: 5.0, max: 5.2}})")
-    assert np.ptp(window.value(y)[0]) < 0.9 * np.ptp(limits[0])
-
-
 def scales(window, group, k=0):
     return window.value(
         f"(({{min, max}}) => [min, max])(heliCharts.groups.get({json.dumps(group)})[{k}].scales.x)"

@@ -2,7 +2,6 @@
 
 import csv
 import math
-import types
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from heli_jax.flights.flight import Signal
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.numbers import percent
-from heli_jax.report import compared_page, drawings, figures, tables
-from heli_jax.report.charts import Logged, Numbers, chart_of
+from heli_jax.report import compared_page, drawings, figures
+from heli_jax.report.charts import chart_of
 from heli_jax.report.files import write_signals
 from heli_jax.report.saved_fit import load_fit
 from tests.report.test_compared_runs import METRICS, write_run
@@ -76,14 +75,6 @@ def test_card_and_figure_give_one_number_where_samples_are_missing():
     assert outside / (inside + outside) == pytest.approx(test.outside)
 
 
-def test_an_interval_without_ends_is_not_determined():
-    unknown = types.SimpleNamespace(
-        value=8.9e-4, sd=math.inf, lower95=-math.inf, upper95=math.inf, unit="rad"
-    )
-    table = tables.nuisances(types.SimpleNamespace(nuisance={"bias roll": unknown}))
-    assert table.shown.rows == [("bias roll", "not determined", "–", "–", "rad")]
-
-
 def test_a_pulse_width_is_shown_as_logged_beside_si():
     pwm = Signal("aileron_pwm", "m", "m", offset=1496.0, scale=6e-9, invert=True)
     as_logged = drawings.as_logged(pwm)
@@ -94,12 +85,6 @@ def test_a_pulse_width_is_shown_as_logged_beside_si():
     assert drawings.as_logged(Signal("roll", "rad", "rad")) is None
     degrees = drawings.as_logged(Signal("roll", "deg", "rad"))
     assert degrees == ("deg", pytest.approx(180.0 / math.pi), 0.0)
-    # On the page: SI, the log's name, factor and offset.
-    numbers = Numbers()
-    chart = chart_of(figures.response(part("one", 0.0), "roll", models.roll_on_stand)[0].figure)
-    numbers.add_chart(chart, {"x_roll": Logged("aileron_pwm", -1.0 / 6e-9, 1496.0)})
-    panels = numbers.content()["charts"][0]["panels"]
-    assert panels[-1]["logged"] == ["m", "aileron_pwm", -1.0 / 6e-9, 1496.0]
 
 
 @pytest.mark.parametrize(("window", "drawn"), [([18.0, 32.0], True), ([18.0, 30.0], False)])

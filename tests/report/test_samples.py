@@ -138,7 +138,6 @@ def test_the_page_shows_chains_pairs_and_their_diagnostics(white, sampled, tmp_p
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'href="posterior.nc"' in page
     assert 'href="bootstrap.nc"' in page
-    assert "4 chains of 300 draws, 1 divergent" in page
     assert "Within the Gaussian 95 % curve: Ixx and If 9" in page
     assert len(page) < 700_000
     table = tables.sampling(sampled.posterior)

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from heli_jax.analysis.handling_qualities import Number
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
-from heli_jax.report.responses import fit_row, fit_sentences
-from heli_jax.report.tables import _shown
+from heli_jax.report.responses import fit_sentences
 
 WINDOW = 20.0
 
@@ -42,13 +40,3 @@ def test_poles_that_zeros_all_but_cancel_are_named() -> None:
     assert not fit_sentences(
         _fit(11.0, 24.0)._replace(numerator=(numerator[0], undetermined)), WINDOW
     )
-
-
-def test_numbers_have_the_digits_that_their_deviation_leaves() -> None:
-    """As all tables of the package have them."""
-    delay = Coefficient(0.0341197, 0.00109, 0.0319, 0.0363)
-    row = fit_row(_fit(2.0)._replace(delay=delay))
-    assert row[0] == "(10.00 ± 0.10)"
-    assert row[3] == "34.1 ± 1.1"
-    phase_delay = Number(0.065356, 0.0009, 0.06360, 0.06712)
-    assert _shown(phase_delay, 1e3) == "65.36 (63.60 to 67.12)"

@@ -45,25 +45,6 @@
     return splits.map(v => v == null ? null : String(+v.toFixed(8)).replace("-", "−"));
   }
 
-  // Where a panel has its numbers, as in the figures' files: angles in parts of a right angle, and two at least.
-  function levels(low, high, most, degrees) {
-    if (!(high > low)) return [];
-    const least = (high - low) / most, tens = v => 10 ** Math.floor(Math.log10(v));
-    const round = v => [0.5, 1, 2, 5, 10, 20].map(f => f * tens(v));
-    const steps = degrees && least > 0.2 ? [1, 2, 5, 15, 30, 45, 90, 180, ...round(least / 360).filter(n => n >= 1).map(n => 360 * n)] : round(least);
-    let before = [];
-    for (const step of steps) {
-      const first = Math.ceil(low / step - 1e-9), last = Math.floor(high / step + 1e-9);
-      if (last - first < most) {
-        const found = Array.from({ length: last - first + 1 }, (_, k) => (first + k) * step);
-        // One number tells no size.
-        return found.length > 1 ? found : [...new Set([...before, ...found])].sort((a, b) => a - b);
-      }
-      before = [first * step, last * step];
-    }
-    return before;
-  }
-
   // As many digits as the range leaves sense to: five.
   function text(value, span) {
     if (value == null || !Number.isFinite(value)) return "–";
@@ -196,7 +177,7 @@
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
       scales: { x: { time: false, distr: chart.logarithmic ? 3 : 1, range: xRange }, y: { range } },
       axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.x_label : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.logarithmic ? decades : undefined, filter: chart.logarithmic ? (u, s) => s : undefined,
-        values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 16, splits: (u, i, low, high) => levels(low, high, Math.max(3, Math.floor(u.bbox.height / uPlot.pxRatio / 20)), panel.label.endsWith("[deg]")), values: (u, splits) => ticks(splits) }],
+        values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 20, values: (u, splits) => ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {

@@ -425,7 +425,8 @@ def bode_overlay(
         if response is not None:
             _curve(axes, response.omega, response.H, phase(response.H), label=label, **look)
     axes[0].set_ylabel("magnitude [dB]")
-    limits = [w * _TURN for w in axes[0].get_xlim()]
+    omega = np.concatenate([r.omega for _, r in simulated if r is not None])
+    limits = omega.min(), omega.max()
     _finish(axes, limits, f"{input} to {output}, {style.short(flight)}", "")
     return axes
 
