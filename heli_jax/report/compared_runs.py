@@ -212,7 +212,7 @@ class ComparedRuns(NamedTuple):
     def _summary(self) -> Summary:
         head, rows = self.estimates
         title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
-        return Summary(title, head, rows, tuple(sentences(self.notes)))
+        return Summary(title, head, tuple(rows), tuple(sentences(self.notes)))
 
     def __repr__(self) -> str:
         return as_text(self._summary())

@@ -592,13 +592,15 @@ def written(kind: Any, value: Any) -> Any:
         kind: of the table; a section, or a mapping or list of such.
         value: what has its keys as attributes, or in a mapping as they stand in the file.
     """
-    for option in () if value is None else _options(kind):
+    if value is None:
+        return None
+    for option in _options(kind):
         if _is_section(option):
             fields = _fields(option)
             if isinstance(value, Mapping):
                 return {n: written(fields[n][0], v) for n, v in value.items()}
-            found = {n: (kind, source(value)) for n, (kind, source) in fields.items()}
-            return {n: written(kind, v) for n, (kind, v) in found.items() if v is not ABSENT}
+            found = {n: source(value) for n, (_, source) in fields.items()}
+            return {n: written(fields[n][0], v) for n, v in found.items() if v is not ABSENT}
         if typing.get_origin(option) in _MAPPINGS and isinstance(value, Mapping):
             return {str(n): written(typing.get_args(option)[1], v) for n, v in value.items()}
         if (inner := _item(option)) is not None and not isinstance(value, str | float):

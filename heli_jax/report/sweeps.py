@@ -22,6 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
 from scipy.stats import binned_statistic_2d
 
 from heli_jax.numbers import number
@@ -111,10 +112,10 @@ class Column:
         return (np.geomspace if self.log else np.linspace)(*self.view, count + 1)
 
     def scale(
-        self, ax: Axes, which: Which, ends: Sequence[float], ticks: int, letters: int = _LETTERS
+        self, ax: Axes, which: Which, ends: ArrayLike, ticks: int, letters: int = _LETTERS
     ) -> None:
         """Give an axis of a panel its scale, limits, ticks and label."""
-        low, high = float(ends[0]), float(ends[-1])
+        low, *_, high = map(float, np.asarray(ends))
         axis = ax.xaxis if which == "x" else ax.yaxis
         if self.log:
             # Matplotlib's log scale has no negative numbers; the linear part of this one is unseen.
@@ -360,7 +361,7 @@ def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray
     if not use.any():
         return np.full([e.size - 1 for e in grid], np.nan)
     points = x.values[use], y.values[use], z.values[use]
-    return binned_statistic_2d(*points, "median", bins=list(grid)).statistic
+    return binned_statistic_2d(*points, "median", bins=grid).statistic  # pyright: ignore
 
 
 def corner(table: Table) -> Figure | None:

@@ -113,7 +113,7 @@ def _cells(e: Estimate | Combination) -> tuple[str, str, str, str]:
     # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
     # Nor is there one beside an interval without an end, which says that nothing is known.
     if e.sd is None or not math.isfinite(e.sd):
-        return (NOT_DETERMINED, *[NOTHING] * 3)
+        return NOT_DETERMINED, NOTHING, NOTHING, NOTHING
     value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
     interval = "not trusted" if e.lower95 is None else f"{low} to {high}"
     return value, sd, relative(e.sd, e.value), interval

@@ -296,11 +296,11 @@ def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Panels:
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
         # A zero at either end makes an edge of a stretch that begins or ends with the record.
         edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2):
+        for begin, end in edges.reshape(-1, 2).tolist():
             # Up to the next sample, so that a single one outside can be seen.
             for ax in axes:
-                last = t[min(end, t.size - 1)]
-                ax.axvspan(t[begin], last, color=style.ORANGE, alpha=0.22, lw=0, zorder=0)
+                last = float(t[min(end, t.size - 1)])
+                ax.axvspan(float(t[begin]), last, color=style.ORANGE, alpha=0.22, lw=0, zorder=0)
     return axes
 
 
