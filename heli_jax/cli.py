@@ -691,7 +691,7 @@ def _new(options: argparse.Namespace) -> int:
 
 def _keys(options: argparse.Namespace) -> int:
     from heli_jax.config import keys
-    from heli_jax.report import fit_keys
+    from heli_jax.report import document
 
     if options.schema is not None:
         place = Path(options.schema)
@@ -700,14 +700,14 @@ def _keys(options: argparse.Namespace) -> int:
             temporary.write_text(f"{text}\n", encoding="utf-8")
         options.say(f"wrote {place}")
         return DONE
-    matching = fit_keys.matching if options.fit else keys.matching
+    matching = document.matching if options.fit else keys.matching
     found = matching(options.pattern or "")
     if options.json:
         print(json.dumps([key._asdict() for key in found], indent=1))
         return DONE
     if not found:
         hint = ""
-        if not options.fit and fit_keys.matching(options.pattern):
+        if not options.fit and document.matching(options.pattern):
             hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(options.pattern)}"
         raise InputError(
             f"keys: expected a text that some key or its meaning holds, got {options.pattern}{hint}"

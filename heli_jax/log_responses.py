@@ -160,7 +160,7 @@ def run_responses(
     transfer functions, those of fits.
     """
     from heli_jax.report.responses import transfer_status, write_responses
-    from heli_jax.report.tables.handling import handling_lines, handling_sentences
+    from heli_jax.report.tables import handling_lines, handling_sentences
 
     responses = responses_of_log(experiment, log, say)
     # Of axes that did not move nobody asked by name, and nothing is to be said.
