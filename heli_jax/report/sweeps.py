@@ -255,7 +255,7 @@ def slices(table: Table, result: str) -> Figure | None:
         failed = table.failed(x)
         foot = np.full(failed.size, 0.03)
         _crosses(ax, x.values[failed], foot, transform=ax.get_xaxis_transform(), marker="|")
-        x.scale(ax, "x", x.edges(1), 5)
+        x.scale(ax, "x", x.edges(1), 6)
         if y.empty:
             ax.set_yticks([])
             ax.text(0.5, 0.5, table.nothing, transform=ax.transAxes, ha="center", color=style.GREY)
