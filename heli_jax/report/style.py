@@ -361,6 +361,10 @@ def save(draw: Callable[[], "Figure | None"], path: Path) -> tuple[str, bytes] |
         drawn = draw()
         if drawn is None:
             return None
+        if drawn.get_layout_engine() is not None:
+            # Once, and not for each of the files.
+            drawn.draw_without_rendering()
+            drawn.set_layout_engine("none")
         data = as_svg(drawn)
         path.with_suffix(".svg").write_bytes(data)
         path.with_suffix(".png").write_bytes(as_png(drawn))
