@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import import_path, interrupts, run_directory, terminal
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.interrupts import resumable
 from heli_jax.numbers import ADEQUATE
 from heli_jax.regular_file import read_regular
@@ -565,9 +565,8 @@ def _convert(options: argparse.Namespace) -> int:
     for found in converted.notes:
         options.say(Note(found.of(options.log).sentence))
     columns = converted.columns
-    count = len(columns) - 1
-    of = "1 signal" if count == 1 else f"{count} signals"
-    options.say(f"wrote {columns[convert.TIME].size} samples of {of} to {out}")
+    size = columns[convert.TIME].size
+    options.say(f"wrote {size} samples of {len(columns) - 1} signals to {out}")
     return DONE
 
 
@@ -580,10 +579,8 @@ def _selection(options: argparse.Namespace) -> "Selection":
         raise InputError(f"--preset: names the columns, expected it without {other}")
     by_preset = None
     if options.preset is not None:
-        try:
+        with located("--preset"):
             by_preset = named.by_preset(options.preset)
-        except ValueError as e:
-            raise InputError(f"--preset: {e}") from e
     return convert.Selection(
         options.signals,
         options.rate,
@@ -694,7 +691,7 @@ def _new(options: argparse.Namespace) -> int:
 
 def _keys(options: argparse.Namespace) -> int:
     from heli_jax.config import keys
-    from heli_jax.report import fit_keys
+    from heli_jax.report import document
 
     if options.schema is not None:
         place = Path(options.schema)
@@ -703,14 +700,14 @@ def _keys(options: argparse.Namespace) -> int:
             temporary.write_text(f"{text}\n", encoding="utf-8")
         options.say(f"wrote {place}")
         return DONE
-    matching = fit_keys.matching if options.fit else keys.matching
+    matching = document.matching if options.fit else keys.matching
     found = matching(options.pattern or "")
     if options.json:
         print(json.dumps([key._asdict() for key in found], indent=1))
         return DONE
     if not found:
         hint = ""
-        if not options.fit and fit_keys.matching(options.pattern):
+        if not options.fit and document.matching(options.pattern):
             hint = f"; fit.json has it: heli-jax keys --fit {shlex.quote(options.pattern)}"
         raise InputError(
             f"keys: expected a text that some key or its meaning holds, got {options.pattern}{hint}"

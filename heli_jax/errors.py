@@ -1,7 +1,8 @@
 """The one error that a user's files and configurations can raise."""
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 _END = 1000
@@ -25,6 +26,17 @@ class InputError(ValueError):
     def __init__(self, text: str, within: str = "") -> None:
         super().__init__(shortened(text))
         self.within = shortened(within or text)
+
+
+@contextlib.contextmanager
+def located(where: str) -> Iterator[None]:
+    """Make an `InputError` that begins with a place of a ValueError that knows none."""
+    try:
+        yield
+    except InputError:
+        raise  # it names its file already
+    except ValueError as e:
+        raise InputError(f"{where}: {e}") from e
 
 
 class VehicleError(ValueError):
@@ -62,6 +74,25 @@ def nearest(name: str, known: Iterable[str], otherwise: str | None = None) -> st
     # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""
+
+
+def require_known(names: Iterable[Any], known: Iterable[str], where: str, what: str) -> None:
+    """Refuse names of a file that are none of those known: `fit.yaml: fit.free: model roll has no
+    parameter 'Ixy'; did you mean 'Ixx'?`.
+
+    Args:
+        names: as the file has them.
+        known: those that there are.
+        where: the file and the place.
+        what: the words before the name.
+
+    Raises:
+        InputError: one of them is.
+    """
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise InputError(f"{where}: {what} {name!r:.60}{nearest(str(name), known)}")
 
 
 def require_kind(argument: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> None:

@@ -22,7 +22,7 @@ from heli_jax.config import (
 )
 from heli_jax.dynamics.check_model import cannot_start
 from heli_jax.dynamics.model import Model, require_constants, require_linear, zeros
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import decide
@@ -64,12 +64,8 @@ def _stick_inputs(
         settings: the configuration's `simulate`.
     """
     record = experiment.model.Inputs
-    for name in settings.inputs:
-        if name not in naming.names(record):
-            raise InputError(
-                f"{where}.inputs: model {experiment.model.name} has no input {name!r}"
-                f"{nearest(name, naming.names(record))}"
-            )
+    words = f"model {experiment.model.name} has no input"
+    require_known(settings.inputs, naming.names(record), f"{where}.inputs", words)
     out = {}
     # In the model's order, not the configuration's: the draws must not depend on how it is written.
     for name in naming.names(record):
@@ -102,10 +98,8 @@ def _factor_to_si(unit: str, si: str, where: str) -> float:
     Args:
         si: the SI unit of what it is for.
     """
-    try:
+    with located(where):
         return units.factor(unit, si)
-    except ValueError as e:
-        raise InputError(f"{where}: {e}") from e
 
 
 def generate(experiment: Experiment) -> Simulated:
@@ -134,12 +128,11 @@ def generate(experiment: Experiment) -> Simulated:
         needed = " and ".join(drawn.parameters)
         raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
     # What can be refused is refused before the run, which takes longest.
-    for name in settings.noise:
-        if name not in (known := naming.names(experiment.model.Outputs)):
-            raise InputError(
-                f"{where}.noise: model {experiment.model.name} has no output {name!r}"
-                f"{nearest(name, known)}"
-            )
+    known, words = (
+        naming.names(experiment.model.Outputs),
+        f"model {experiment.model.name} has no output",
+    )
+    require_known(settings.noise, known, f"{where}.noise", words)
     driven = _stick_inputs(experiment, settings, n, rng, where)
     _check_full_nonlinear(experiment, settings, where)
     flown = in_wind(experiment) if settings.wind is not None else experiment
@@ -217,11 +210,9 @@ def _run(
     """The run as NumPy arrays, without measurement noise; and its inputs as they were commanded, in
     arrays of as many samples."""
     # Said by name: what is missing is NaN, and the run would only be called not finite.
-    try:
+    with experiment.located(""):
         require_constants(experiment.model, experiment.vehicle.params)
         require_linear(experiment.model, experiment.vehicle.params)
-    except ValueError as e:
-        raise experiment.wrong("", e) from e
     model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
     if is_full_nonlinear(experiment.model):
@@ -287,17 +278,13 @@ def _begin(experiment: Experiment, settings: SimulateConfig, where: str) -> Trim
     """The trimmed flight that a run begins in."""
     condition = Condition(**settings.start.model_dump()) if settings.start else Condition()
     wind = settings.wind or (0.0, 0.0, 0.0)
-    try:
+    with located(f"{where}.start"):
         return trim(experiment.model, experiment.vehicle.params, condition, wind=wind)
-    except ValueError as e:
-        raise InputError(f"{where}.start: {e}") from e
 
 
 def _pilot(experiment: Experiment, begin: Trim, where: str) -> Pilot:
-    try:
+    with located(f"{where}.hold_attitude"):
         return attitude_hold(experiment.model, experiment.vehicle.params, begin)
-    except ValueError as e:
-        raise InputError(f"{where}.hold_attitude: {e}") from e
 
 
 def _extended(model: Model, state: Record) -> Record:

@@ -1,6 +1,6 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights, with_log
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
@@ -35,7 +35,7 @@ _HOLDS = {
 def responses_of_log(
     experiment: Experiment,
     log: str | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> FlightResponses:
     """Frequency responses of all flights of a configuration together.
 
@@ -55,13 +55,10 @@ def responses_of_log(
     asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
     for found in (n for f in flights for n in (f.source.notes if f.source else ())):
-        if progress is not None:
-            progress(Note(found.sentence))
+        progress(Note(found.sentence))
     _require_samples(flights, experiment.path)
-    try:
+    with located(f"{experiment.path}: frequency"):
         estimate = flight_responses(flights, settings)
-    except ValueError as e:
-        raise InputError(f"{experiment.path}: frequency: {e}") from e
     pairs = [pair for output in estimate.outputs.values() for pair in output.pairs.values()]
     if not any(np.isfinite(pair.coherence).any() for pair in pairs):
         longest = max(f.duration for f in flights)
@@ -119,36 +116,18 @@ def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[
         )
         for (first, other), names in mixed.items()
     ]
-    steps = [flights[0].logged_step(name, "input") for name in guessed]
-    return [*notes, *_straight_lines(guessed, 500.0 * max(steps, default=0.0))]
-
-
-def _straight_lines(guessed: Mapping[str, str], half: float) -> list[Finding]:
-    """In one sentence that inputs were taken to move in straight lines, which is a guess.
-
-    Args:
-        half: of the longest step between samples [ms].
-    """
-    if not guessed:
-        return []
-    names, reasons = list(guessed), set(guessed.values())
-    several = len(names) > 1
-    reason = reasons.pop() if len(reasons) == 1 else ""
-    # Reasons are of one input each: `moves at 100 % of the samples`.
-    why = (
-        f"as {'each' if several else 'it'} {reason}"
-        if reason
-        else "as " + "; ".join(f"{n} {r}" for n, r in guessed.items())
-    )
-    whose = "NAME" if several else names[0]
-    words = (
-        f"{', '.join(names)}: {_HOLDS['linear']} between samples, {why}, which is a guess; if "
-        f"{'one' if several else 'it'} is a command that is held from sample to sample, "
-        f"{'its ' if several else ''}delays and phase delays are half a sample, "
-        f"{'up to ' if several else ''}{half:.3g} ms, "
-        f"shorter and bandwidths higher: state signals.inputs.{whose}.hold"
-    )
-    return [note("hold.guessed", words, *names, value=1e-3 * half)]
+    if guessed:
+        # Half of the longest step between samples [ms].
+        half = 500.0 * max(flights[0].logged_step(name, "input") for name in guessed)
+        reasons = "; ".join(dict.fromkeys(guessed.values()))
+        words = (
+            f"{', '.join(guessed)}: {_HOLDS['linear']} between samples (it {reasons}), which is a "
+            "guess; of a command that is held from sample to sample delays and phase delays are up "
+            f"to half a sample, {half:.3g} ms, shorter and bandwidths higher: state "
+            "signals.inputs.NAME.hold"
+        )
+        notes.append(note("hold.guessed", words, *guessed, value=1e-3 * half))
+    return notes
 
 
 def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple[Finding, ...]:
@@ -181,7 +160,7 @@ def run_responses(
     transfer functions, those of fits.
     """
     from heli_jax.report.responses import transfer_status, write_responses
-    from heli_jax.report.tables.handling import handling_lines, handling_sentences
+    from heli_jax.report.tables import handling_lines, handling_sentences
 
     responses = responses_of_log(experiment, log, say)
     # Of axes that did not move nobody asked by name, and nothing is to be said.

@@ -8,9 +8,9 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax.config import Experiment
-from heli_jax.config.logs import with_log
+from heli_jax.config.logs import require_flights, with_log
 from heli_jax.config.schema import FlightConfig
-from heli_jax.errors import InputError
+from heli_jax.errors import located
 from heli_jax.finding import note
 from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
@@ -31,7 +31,7 @@ def rank_log(
     experiment: Experiment,
     log: str | None = None,
     length: float | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Ranking:
     """What each window of a configuration's logs says of its free parameters.
 
@@ -44,8 +44,7 @@ def rank_log(
         InputError: the log or something of the configuration is wrong, or no window may be used.
     """
     config, path = experiment.config, experiment.path
-    if not config.flights:
-        raise InputError(f"{path}: flights: expected at least one log, got none")
+    require_flights(experiment)
     if log is not None:
         flights = list(with_log(experiment, log).config.flights)
     else:
@@ -60,19 +59,15 @@ def rank_log(
     problem = configuration.problem(experiment)
     for flight in problem.flights:
         for found in flight.source.notes if flight.source else ():
-            if progress is not None:
-                progress(Note(found.sentence))
-    try:
+            progress(Note(found.sentence))
+    with located(f"{path}"):
         # Before the work, and not after it: with many windows that takes a while.
         seconds = window_samples(problem, length) * problem.training[0].dt
-        if progress is not None:
-            progress(f"comparing windows of {seconds:.3g} s, half overlapping")
+        progress(f"comparing windows of {seconds:.3g} s, half overlapping")
         ranking = _ranked(problem, stated, length)
-    except ValueError as e:
-        raise InputError(f"{path}: {e}") from e
     ranked = {window.flight for window in ranking.windows}
     for i, flight in enumerate(problem.training):
-        if i not in ranked and progress is not None:
+        if i not in ranked:
             words = f"is shorter than a window of {ranking.length:.3g} s, and left out"
             progress(Note(f"{flight.name}: {flight.duration:.4g} s {words}"))
     return ranking
@@ -142,8 +137,7 @@ def print_ranking(ranking: Ranking) -> None:
     print_table(head, rows, keys=head.index("to [s]") + 1)
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
-        words = "window that says less is" if unshown == 1 else "windows that say less are"
-        tell(f"{unshown} further {words} not shown.")
+        tell(f"windows that say less, not shown: {unshown}")
     for w in ranking.windows:
         if w.excluded:
             tell(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")

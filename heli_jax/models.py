@@ -14,7 +14,7 @@ from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
 from heli_jax.dynamics.onboard.sensors import with_sensors
 from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.dynamics.roll import on_stand, pitch, roll
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, located, nearest, require_known
 from heli_jax.import_path import by_path, is_path
 from heli_jax.linear_models import read as linear_models
 
@@ -75,12 +75,8 @@ def by_name(
             sentence.
     """
     if name in _HELICOPTERS:
-        for correction in corrections or {}:
-            if correction not in Corrections._fields:
-                raise InputError(
-                    f"{where}: the helicopter has no correction {correction!r}"
-                    f"{nearest(correction, Corrections._fields)}"
-                )
+        known = Corrections._fields
+        require_known(corrections or {}, known, where, "the helicopter has no correction")
         # Always called in this way: the cache then gives the same model for the same switches.
         switches = dict(sorted((corrections or {}).items()))
         return helicopter(_HELICOPTERS[name], wind=wind, **switches)
@@ -110,8 +106,6 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
         kind = "nothing" if model is None else what_instead(model)
         raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
     # Here and not at the first run: the message can name the configuration's key.
-    try:
+    with located(where):
         check_model(model)
-    except ValueError as e:
-        raise InputError(f"{where}: {e}") from e
     return model

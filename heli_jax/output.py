@@ -30,7 +30,7 @@ from heli_jax.numbers import (
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.fitted_responses import NO_RESPONSES
-from heli_jax.report.tables.handling import handling_lines
+from heli_jax.report.tables import handling_lines
 from heli_jax.summaries import of_estimates
 from heli_jax.terminal import print_table, tell
 from heli_jax.workflow import FitRun

@@ -66,10 +66,6 @@ def write_view(
         write(temporary, simulated.runs, simulated.model, params, title, notes, made)
 
 
-def _counted(elements: int) -> str:
-    return "1 element" if elements == 1 else f"{elements} elements"
-
-
 def print_sweep(out: Path) -> None:
     """The summary of a sweep on standard output."""
     # From the file, not from memory: a resumed sweep prints what all its runs have computed.
@@ -78,7 +74,7 @@ def print_sweep(out: Path) -> None:
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
     # A store of an earlier version does not say: there was no other.
     backend = totals["split"].get("backend", "xla")
-    tell(f"{_counted(totals['elements'])} of {totals['model']}: {words}; backend {backend}")
+    tell(f"{totals['elements']} elements of {totals['model']}: {words}; backend {backend}")
     rows = []
     for name, result in totals["results"].items():
         numbers = [
@@ -114,7 +110,7 @@ def print_sweep(out: Path) -> None:
     # A sweep that was resumed when all was there has computed nothing, and has no rate.
     if timing["computed_elements"]:
         tell(
-            f"{_counted(timing['computed_elements'])} in {terse(timing['seconds'], 3)} s "
+            f"{timing['computed_elements']} elements in {terse(timing['seconds'], 3)} s "
             f"({terse(timing['elements_per_s'], 3)} a second, with compilation)"
         )
     tell(f"store: {out / 'sweep.zarr'}")
@@ -153,10 +149,9 @@ def print_study(result: "xr.Dataset") -> None:
     flat = result.drop_dims(empty).stack(fit=axes, create_index=False)
     status = [str(s) for s in flat["status"].to_numpy()]
     counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
-    fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
     adequate = Counter(str(a) for a in flat["adequate"].to_numpy() if a)
     judged = ", ".join(f"{count} {words}" for words, count in adequate.items())
-    tell(f"{fits}: {counts}" + (f"; adequate: {judged}" if judged else ""))
+    tell(f"{len(status)} fits: {counts}" + (f"; adequate: {judged}" if judged else ""))
     outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
     rows = []
     for i in range(min(len(status), _MOST_ROWS)):

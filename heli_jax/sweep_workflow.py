@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.config import Experiment
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.finding import note
 from heli_jax.yaml_file import as_yaml
 
@@ -65,7 +65,7 @@ def run_sweep(
             **options,
         }
     )
-    try:
+    with located(f"{config.path}: sweep"):
         dataset = run_job(
             job,
             out,
@@ -75,10 +75,6 @@ def run_sweep(
             attributes={"configuration": resolved, "seed": design.seed or 0},
             notes=notes,
         )
-    except InputError:
-        raise
-    except ValueError as e:
-        raise InputError(f"{config.path}: sweep: {e}") from e
     if figures and out is not None:
         carrying.say("drawing figures")
         _draw_sweep(out, dataset, job, carrying.say)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, require_known
 from heli_jax.naming import Record, Scalar
 from heli_jax.yaml_file import EDIT, read_mapping
 
@@ -222,9 +222,8 @@ def vehicle_from_mapping(
     """
     known = naming.names(params)
     constants = {}
+    require_known(content, known, where, "unknown constant")
     for name, entry in content.items():
-        if name not in known:
-            raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
         constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]
     missing = [n for n in lacking if n not in may_lack]

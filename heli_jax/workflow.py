@@ -18,7 +18,7 @@ from heli_jax.config import Experiment
 from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
-from heli_jax.errors import InputError, require_kind
+from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
@@ -175,7 +175,8 @@ def _fit_run(
         progress(Note(said.sentence))
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
-    try:
+    # `fit` knows no file, and its sentence needs one
+    with located(f"{config.path}: fit"):
         # Refused as by `check`: its estimates would look like any others.
         for finding in rates(problem):
             if finding.severity == "refuse":
@@ -189,8 +190,6 @@ def _fit_run(
             problem, fitted = with_likelier_hold(
                 problem, fitted, lambda held: _fitted(held, options, progress)
             )
-    except ValueError as e:  # `fit` knows no file, and its sentence needs one
-        raise InputError(f"{config.path}: fit: {e}") from e
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
     kept = None
@@ -265,11 +264,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     notes = reading_notes(problem)
     for said in notes:
         progress(Note(said.sentence))
-    try:
-        with stage("what the log can determine"):
-            return replace(check(problem), log_notes=tuple(notes))
-    except ValueError as e:
-        raise InputError(f"{config.path}: fit: {e}") from e
+    with located(f"{config.path}: fit"), stage("what the log can determine"):
+        return replace(check(problem), log_notes=tuple(notes))
 
 
 def reading_notes(problem: Problem) -> list[Finding]:
@@ -329,7 +325,7 @@ def _supplementary(
     asked = options.intervals
     further: Intervals | None = None
     choice = methods = None
-    try:
+    with located(f"{config.path}: fit"):
         if asked.profile or asked.bootstrap or asked.nuts:
             further = intervals(
                 fitted,
@@ -339,8 +335,6 @@ def _supplementary(
                 seed=options.seed,
                 progress=progress,
             )
-    except ValueError as e:
-        raise InputError(f"{config.path}: fit: {e}") from e
     # Each its own stage, as profiles, bootstrap and NUTS are: any of them may be what takes long.
     if options.compare:
         with stage("other models"):
@@ -385,10 +379,8 @@ def compare_models(
     config = config if isinstance(config, Experiment) else load_config(config)
     # All share the fitted problem's flights: likelihoods of different data do not compare.
     candidates = configuration.candidate_models(config, problem or configuration.problem(config))
-    try:
+    with located(f"{config.path}: fit"):
         return choose(candidates.problems, candidates.nested, progress=progress)
-    except ValueError as e:
-        raise InputError(f"{config.path}: fit: {e}") from e
 
 
 def write_report(run: FitRun, out: str | Path) -> FitRun:

@@ -63,23 +63,6 @@ gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 
 
-@pytest.fixture(autouse=True, scope="session")
-def _fit_json_is_described():
-    """Every fit.json that a test makes has the keys of its reference, and no others."""
-    from heli_jax.report import files, fit_keys
-
-    made = files.fit_json
-
-    def described(*args, **kwargs):
-        content = made(*args, **kwargs)
-        assert not (lacking := fit_keys.undescribed(content)), f"fit.json: {lacking}"
-        return content
-
-    files.fit_json = described
-    yield
-    files.fit_json = made
-
-
 @pytest.fixture(autouse=True)
 def _programs_are_let_go():
     began = time.monotonic()

@@ -192,9 +192,9 @@ def test_no_modules_import_each_other_in_a_circle():
             {
                 "sweeps",
                 "studies",
+                "report/sweeps.py",
+                "report/responses.py",
                 "simulation_output.py",
-                "report/sweeps",
-                "report/responses_netcdf.py",
                 "flights/array_table.py",
                 "flights/convert.py",
                 "exports.py",

@@ -12,8 +12,7 @@ import yaml
 from heli_jax import cli, yaml_file
 from heli_jax.config.keys import json_schema, keys
 from heli_jax.config.schema import Config
-from heli_jax.report import fit_keys
-from heli_jax.report.fit_format import FitFile
+from heli_jax.report import document
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = sorted([*(ROOT / "configs").glob("*.yaml"), *(ROOT / "configs/logs").glob("*.yaml")])
@@ -88,19 +87,9 @@ def test_keys_in_the_terminal(capsys: pytest.CaptureFixture[str], tmp_path: Path
 
 
 def test_the_keys_of_fit_json(capsys: pytest.CaptureFixture[str]) -> None:
-    paths = [key.path for key in fit_keys.fit_keys()]
+    paths = [key.path for key in document.fit_keys()]
     assert len(set(paths)) == len(paths)
     assert cli.main(["keys", "--fit", "no such key"]) == 2
     capsys.readouterr()
     assert cli.main(["keys", "--fit", "--json", "status"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["path"] == "status"
-
-
-def test_a_key_that_is_not_described_is_found() -> None:
-    names = dict.fromkeys(FitFile.__annotations__)
-    assert fit_keys.undescribed(names) == []
-    assert fit_keys.undescribed({**names, "other": 1}) == [".other"]
-    wrong = {**names, "metrics": {"p": {"vaf": 1.0, "of": 2}}, "record": [{"tpoic": ""}]}
-    assert fit_keys.undescribed(wrong) == [".metrics.p.of", ".record[].tpoic"]
-    del names["seed"]
-    assert fit_keys.undescribed(names) == ["no seed"]

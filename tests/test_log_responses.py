@@ -17,7 +17,7 @@ from heli_jax.cli import main
 from heli_jax.dynamics.model import Axis
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
-from heli_jax.report.figures.responses import branch_of, seen_of
+from heli_jax.report.figures.bode import branch_of, seen_of
 from heli_jax.report.responses import _content
 
 DT = 0.02

@@ -156,7 +156,7 @@ def _keys() -> str:
 
 
 def _fit_keys() -> str:
-    from heli_jax.report.fit_keys import Key, fit_keys
+    from heli_jax.report.document import Key, fit_keys
 
     def entry(key: Key) -> str:
         words = f"<br>{_cell(key.meaning)}" if key.meaning else ""

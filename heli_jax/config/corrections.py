@@ -1,7 +1,7 @@
 """Errors of sensors, found by `heli-jax compatibility`, taken off the signals of a flight."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -12,7 +12,7 @@ from pydantic import Field
 from heli_jax import naming, units
 from heli_jax.config.section import Section
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.yaml_file import read_mapping
@@ -139,6 +139,12 @@ def with_corrections(model: Model, flight: Flight, corrections: Corrections, whe
         words = f"not corrected, since undetermined: {', '.join(corrections.not_determined)}"
         notes.append(note("corrections.left-out", words, *corrections.not_determined))
     flight = dataclasses.replace(flight, **samples, known={**flight.known, **known})
+    return with_notes(flight, notes)
+
+
+def with_notes(flight: Flight, notes: Iterable[Finding]) -> Flight:
+    """The flight with further notes of its reader."""
+    # A flight that a script made has no source, and nobody who would read a note on it.
     if flight.source is None:
         return flight
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
@@ -149,10 +155,8 @@ def _factor(each: Logged, correction: SignalCorrection, where: str) -> float:
     """From the stated unit to SI."""
     signal = each.signal
     place = f"{where}.corrections: {signal.name}"
-    try:
+    with located(place):
         stated, of_correction = (units.factor(u, signal.si) for u in (signal.unit, correction.unit))
-    except ValueError as e:
-        raise InputError(f"{place}: {e}") from e
     # Read as degrees there and as radians here, one of the two fits was of other numbers.
     if not np.isclose(stated, of_correction, rtol=1e-9):
         raise InputError(

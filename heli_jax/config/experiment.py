@@ -1,5 +1,6 @@
 """An experiment: a configuration read and validated, with what it names at hand."""
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.check_model import starting_at
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError, VehicleError, nearest, require_kind
+from heli_jax.errors import InputError, VehicleError, located, nearest, require_kind, require_known
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, constant, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import EDIT, parse_value, read_mapping
@@ -36,11 +37,16 @@ class Experiment(NamedTuple):
     logs: OpenedLogs
     """those that were opened for the model's sake, until the flights are read"""
 
-    def wrong(self, section: str, error: ValueError) -> InputError:
-        """The error with its place before it: the section, or where the vehicle's constants are."""
-        if isinstance(error, VehicleError):
-            return InputError(f"{self.vehicle.path}: {error.problem}")
-        return InputError(f"{self.path}: {f'{section}: ' if section else ''}{error}")
+    @contextlib.contextmanager
+    def located(self, section: str) -> Iterator[None]:
+        """Put the place before an error: the section, or where the vehicle's constants are."""
+        try:
+            with located(f"{self.path}: {section}" if section else str(self.path)):
+                yield
+        except InputError as e:
+            if isinstance(e.__cause__, VehicleError):
+                raise InputError(f"{self.vehicle.path}: {e.__cause__.problem}") from e
+            raise
 
 
 def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
@@ -394,9 +400,7 @@ def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) ->
         vehicle, where = {}, own.path
     else:
         known = naming.names(built.Params)
-        for name in vehicle:
-            if name not in known:
-                raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
+        require_known(vehicle, known, where, "unknown constant")
         own = read.vehicle(
             {n: v for n, v in vehicle.items() if n in naming.names(read.model.Params)}, where
         )
@@ -457,10 +461,8 @@ def _in_si(config: Config, model: Model, path: Path) -> Config:
     disturbance = config.disturbance
     if disturbance is not None and disturbance.has_units:
         where = f"{path}: disturbance"
-        try:
+        with located(where):
             params = with_disturbance(model, disturbance.names, disturbance.poles).Params
-        except ValueError as e:
-            raise InputError(f"{where}: {e}") from e
         converted = {}
         for key in ("sigma_w", "tau_w"):
             # The units are those that the disturbed model gives to its parameters.
@@ -473,11 +475,7 @@ def _in_si(config: Config, model: Model, path: Path) -> Config:
 def _initial_state(config: Config, model: Model, path: Path) -> dict[str, float]:
     """The configuration's initial state [SI]."""
     where, states = f"{path}: initial_state", naming.names(model.State)
-    for name in config.initial_state:
-        if name not in states:
-            raise InputError(
-                f"{where}: model {model.name} has no state {name!r}{nearest(name, states)}"
-            )
+    require_known(config.initial_state, states, where, f"model {model.name} has no state")
     return {
         name: constant(entry, name, _si(name, model.State), where).value
         for name, entry in config.initial_state.items()

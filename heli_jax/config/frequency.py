@@ -6,7 +6,7 @@ from heli_jax import naming, units
 from heli_jax.analysis.attitude_responses import HandlingPair, handling_gaps, handling_pairs
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.frequency_section import FrequencyConfig, HandlingConfig, TransferConfig
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, require_known
 from heli_jax.finding import Finding, note
 
 
@@ -72,11 +72,8 @@ def check_pairs(
             ("output", experiment.model.Outputs),
         ):
             name, known = getattr(pair, role), naming.names(record)
-            if name not in known:
-                raise InputError(
-                    f"{experiment.path}: frequency.{section}[{i}].{role}: model "
-                    f"{experiment.model.name} has no {role} {name!r}{nearest(name, known)}"
-                )
+            where = f"{experiment.path}: frequency.{section}[{i}].{role}"
+            require_known([name], known, where, f"model {experiment.model.name} has no {role}")
 
 
 def units_of(experiment: Experiment) -> dict[str, str]:

@@ -20,7 +20,7 @@ from heli_jax.dynamics.kinematics import (
     kinematics,
 )
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.identification.free import Free, Prior
 from heli_jax.naming import Record
@@ -75,10 +75,8 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
     if content.get("model") != NAME:
         return content
     inputs, outputs = (_names(content, role) for role in ("inputs", "outputs"))
-    try:
+    with located(f"{where}: flights"):
         model = kinematics(inputs, outputs)
-    except ValueError as e:
-        raise InputError(f"{where}: flights: {e}") from e
     fit = content.get("fit") or {}
     if not isinstance(fit, dict) or not isinstance(fit.get("nuisance", {}), dict):
         return content  # the validation says what is wrong with it

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.config.corrections import read_corrections, with_corrections
+from heli_jax.config.corrections import read_corrections, with_corrections, with_notes
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.feedthrough import follows
 from heli_jax.config.kinematics import between_samples, prepared
@@ -28,7 +28,7 @@ from heli_jax.config.schema import (
 )
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.convert import Selection
@@ -46,6 +46,16 @@ _PULSE = (800.0, 2200.0)
 _OFFSET_AND_SCALE = "such as offset: 1500, scale: 0.002"
 
 
+def require_flights(experiment: Experiment) -> None:
+    """Refuse a configuration without flights.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not experiment.config.flights:
+        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
+
+
 def with_log(experiment: Experiment, log: str) -> Experiment:
     """The configuration with a log in place of its own, read as its first flight's is.
 
@@ -53,8 +63,7 @@ def with_log(experiment: Experiment, log: str) -> Experiment:
         InputError: the configuration has no flight.
     """
     config = experiment.config
-    if not config.flights:
-        raise InputError(f"{experiment.path}: flights: expected at least one log, got none")
+    require_flights(experiment)
     whole = {"log": str(Path(log).absolute()), "window": None, "hold_out": False}
     flights = [config.flights[0].model_copy(update=whole)]
     return experiment._replace(config=config.model_copy(update={"flights": flights}))
@@ -71,9 +80,8 @@ def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight,
     Raises:
         InputError: no flights, or one that cannot be read.
     """
-    config, path = experiment.config, experiment.path
-    if not config.flights:
-        raise InputError(f"{path}: flights: expected at least one log, got none")
+    config = experiment.config
+    require_flights(experiment)
     flights = tuple(
         flight
         for i, f in enumerate(config.flights)
@@ -102,7 +110,8 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
     instruments = _instrument_signals(model, f.signals, f"{where}.signals")
-    try:
+    # of `Flight`, which knows no file
+    with located(where):
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         runs = (time.runs if time is not None else None) or ""
         flights = (read_parts if f.gaps == "split" or runs else read_flight)(
@@ -121,10 +130,6 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
             follows=follows(experiment, f.rate, inputs),
             runs=runs,
         )
-    except InputError:
-        raise  # it names the log and the line already
-    except ValueError as e:  # of `Flight`, which knows no file
-        raise InputError(f"{where}: {e}") from e
     flights = (flights,) if isinstance(flights, Flight) else flights
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
     flights = tuple(_with_instruments(flight, instruments) for flight in flights)
@@ -149,14 +154,10 @@ def _noise_given(experiment: Experiment) -> bool:
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:
     """What can be refused before the log is read."""
-    for name in f.known:
-        # A constant of one flight alone is part of the machine, so only a parameter can be one: a
-        # misspelt name would leave the vehicle's value in its place without a word.
-        if name not in naming.names(model.Params):
-            raise InputError(
-                f"{where}.known: model {model.name} has no parameter {name!r}"
-                f"{nearest(name, naming.names(model.Params))}"
-            )
+    # A constant of one flight alone is part of the machine, so only a parameter can be one: a
+    # misspelt name would leave the vehicle's value in its place without a word.
+    known = naming.names(model.Params)
+    require_known(f.known, known, f"{where}.known", f"model {model.name} has no parameter")
     if f.window == "auto" and f.hold_out:
         raise InputError(
             f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
@@ -234,9 +235,8 @@ def as_configured(experiment: Experiment, selection: Selection) -> Selection:
     Raises:
         InputError: the configuration has no flight.
     """
-    config, path = experiment.config, experiment.path
-    if not config.flights:
-        raise InputError(f"{path}: flights: expected at least one log, got none")
+    config = experiment.config
+    require_flights(experiment)
     first = config.flights[0]
     time, ccpm = first.signals.time, first.signals.ccpm
     return dataclasses.replace(
@@ -361,12 +361,10 @@ def _unstated_units(
 def _with_notes(
     flight: Flight, notes: tuple[Finding, ...], cautions: tuple[Finding, ...]
 ) -> Flight:
-    # A flight that a script made has no source, and nobody who would read a note on it.
-    if not (notes or cautions) or flight.source is None:
+    flight = with_notes(flight, notes)
+    if not cautions or flight.source is None:
         return flight
-    notes = (*flight.source.notes, *notes)
-    source = dataclasses.replace(flight.source, notes=notes, cautions=cautions)
-    return dataclasses.replace(flight, source=source)
+    return dataclasses.replace(flight, source=dataclasses.replace(flight.source, cautions=cautions))
 
 
 def signals(
@@ -391,12 +389,7 @@ def signals(
     """
     record = model.Inputs if role == "inputs" else model.Outputs
     known = naming.names(record)
-    for name in stated:
-        if name not in known:
-            raise InputError(
-                f"{where}.{role}: model {model.name} has no {role[:-1]} {name!r}"
-                f"{nearest(name, known)}"
-            )
+    require_known(stated, known, f"{where}.{role}", f"model {model.name} has no {role[:-1]}")
     missing = [n for n in known if n not in stated]
     # Every input acts on the machine, so none can be left out; of the outputs one is enough.
     if role == "inputs" and missing:
@@ -493,18 +486,13 @@ def _instrument_signals(model: Model, config: SignalsConfig, where: str) -> dict
     for name, stated in config.instruments.items():
         place = f"{where}.instruments.{name}"
         known = naming.names(model.Inputs)
-        if name not in known:
-            raise InputError(
-                f"{place}: model {model.name} has no input {name!r}{nearest(name, known)}"
-            )
+        require_known([name], known, place, f"model {model.name} has no input")
         if stated.signal is None:
             raise InputError(f"{place}: expected a signal of the log, got a constant")
         unit = stated.unit or "1"
-        try:
+        with located(f"{place}.unit"):
             # Its size does not matter: a response by instrument is a quotient of two.
             si = units.si_of(unit)
-        except ValueError as e:
-            raise InputError(f"{place}.unit: {e}") from e
         signals[_PREFIX + name] = Signal(
             stated.signal, unit, si, hold=stated.hold, **stated.conversion
         )

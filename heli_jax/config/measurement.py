@@ -14,7 +14,7 @@ from heli_jax.config.onboard import FROM_LOG
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, cutoff, gain, with_filters
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, located, nearest
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.log import ChannelLog
@@ -110,14 +110,12 @@ def with_measurement(
                     f"({_words(channel)}) differ from those of flights[{at}] ({_words(first)}), "
                     "expected the same in all flights; fit them one by one"
                 )
-    try:
+    with located(f"{path}: flights.signals.outputs"):
         return with_filters(
             model,
             {n: filters for n, ((filters, _), _) in channels.items()},
             {n: delay for n, ((_, delay), _) in channels.items()},
         )
-    except ValueError as e:
-        raise InputError(f"{path}: flights.signals.outputs: {e}") from e
 
 
 def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: OpenedLogs) -> _Channel:

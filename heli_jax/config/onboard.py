@@ -13,7 +13,7 @@ from heli_jax.dynamics.onboard.filters import Filter, check_delay
 from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
 from heli_jax.dynamics.onboard.sensors import with_sensors
 from heli_jax.dynamics.onboard.servos import with_servos
-from heli_jax.errors import InputError
+from heli_jax.errors import located
 
 
 def _one_or_several(value: object) -> object:
@@ -207,9 +207,7 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
         ),
     ]
     for key, function, section in steps:
-        try:
+        with located(f"{path}: onboard.{key}"):
             # By name: a key that the function lacks, or the reverse, is an error here.
             model = function(model, **dict(section))
-        except ValueError as e:
-            raise InputError(f"{path}: onboard.{key}: {e}") from e
     return model

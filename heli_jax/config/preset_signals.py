@@ -8,7 +8,7 @@ from heli_jax.config.onboard import OnboardConfig
 from heli_jax.config.schema import InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, require_known
 from heli_jax.finding import Finding, note
 from heli_jax.flights.derived import CCPM
 from heli_jax.flights.log import ChannelLog
@@ -110,12 +110,8 @@ def _pilot(onboard: OnboardConfig | None) -> set[str]:
 
 def _wanted(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
     known = naming.names(model.Outputs)
-    for name in stated.preset_outputs or ():
-        if name not in known:
-            raise InputError(
-                f"{where}.preset_outputs: model {model.name} has no output {name!r:.60}"
-                f"{nearest(name, known)}"
-            )
+    place, words = f"{where}.preset_outputs", f"model {model.name} has no output"
+    require_known(stated.preset_outputs or (), known, place, words)
     return known if stated.preset_outputs is None else tuple(stated.preset_outputs)
 
 

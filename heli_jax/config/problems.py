@@ -18,7 +18,7 @@ from heli_jax.config.schema import FitConfig, LinearConfig
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError, located, nearest, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.read import require_moving_outputs, require_some_time
 from heli_jax.identification.methods import METHODS, estimator_of
@@ -62,7 +62,7 @@ def problem(experiment: Experiment) -> Problem:
     model = of_method["model"]
     # One number for all flights, since they share one compiled program: the slowest log's.
     substeps = max(substeps_for(f.dt, model.fastest) for f in flights)
-    try:
+    with experiment.located("fit"):
         whole = Problem(
             **of_method,
             # Not before the noise of the inputs is known, which it makes larger.
@@ -74,8 +74,6 @@ def problem(experiment: Experiment) -> Problem:
             frequency=_responses(experiment),
         )
         whole = with_chosen_windows(whole)
-    except ValueError as e:
-        raise experiment.wrong("fit", e) from e
     # Of the flights that are fitted: by now their windows are chosen.
     return _started_in_frequency(experiment, whole)
 
@@ -240,10 +238,8 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
     )
     if len(asked) > 1:
-        try:
+        with located(f"{experiment.path}: disturbance"):
             return disturbed_sets(fitted, model, asked, stated)
-        except ValueError as e:
-            raise InputError(f"{experiment.path}: disturbance: {e}") from e
     axis = next(iter(asked))
     # Whether there is a stand is in question only where its stiffness is.
     bare = model.without_stand if "kappa" in fitted.free else None
@@ -261,10 +257,8 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
     disturbance = experiment.config.disturbance
     if disturbance is None:
         return model, params
-    try:
+    with located(f"{experiment.path}: disturbance"):
         model = with_disturbance(model, disturbance.names, disturbance.poles)
-    except ValueError as e:
-        raise InputError(f"{experiment.path}: disturbance: {e}") from e
     # Left out, sigma_w stays 0 and tau_w 1 s: filter error then makes an initial guess of its own.
     extra = {n: jnp.asarray(v) for n, v in disturbance.parameters.items() if v is not None}
     return model, model.Params(**{**naming.asdict(params), **extra})
@@ -293,12 +287,10 @@ def _first_guesses(
     assert config is not None
     # Before its start is asked for: of what the model does not have there is none.
     known = naming.names(experiment.model.Params)
-    for name, f in free.items():
-        if name not in known and (config.start.method == "equation-error" or math.isnan(f.start)):
-            raise InputError(
-                f"{path}: fit.free: model {experiment.model.name} has no parameter {name!r}"
-                f"{nearest(name, known)}"
-            )
+    found = config.start.method == "equation-error"
+    asked = [n for n, f in free.items() if found or math.isnan(f.start)]
+    words = f"model {experiment.model.name} has no parameter"
+    require_known(asked, known, f"{path}: fit.free", words)
     # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
     # In frequency a fit begins where it is told to; what it finds takes the place of that later.
     if config.start.method != "equation-error":
@@ -317,12 +309,10 @@ def _first_guesses(
     # Without stepwise selection every term stays in: to leave one out is a change of the model,
     # which has to be asked for.
     limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
-    try:
+    with experiment.located("fit"):
         guess = equation_error_start(
             experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
         )
-    except ValueError as e:
-        raise experiment.wrong("fit", e) from e
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
@@ -379,9 +369,7 @@ def _started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
         "instrument": config.by_instrument,
     }
     whole = {"fixed_noise": (), "window": None, "continuity": None}
-    try:
+    with experiment.located("fit.start"):
         base = dataclasses.replace(problem, **bare, **whole)
         guess = frequency_error_start(base, max_steps=config.max_steps)
-    except ValueError as e:
-        raise experiment.wrong("fit.start", e) from e
     return started(problem, guess)

@@ -81,7 +81,7 @@ def sweep_job(
             f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
             "expected a configuration without it"
         )
-    try:
+    with experiment.located("sweep"):
         return job(
             model,
             params,
@@ -97,10 +97,6 @@ def sweep_job(
                 pilot,
             ),
         )
-    except InputError:  # a ValueError too, which names its file already
-        raise
-    except ValueError as e:
-        raise experiment.wrong("sweep", e) from e
 
 
 def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:

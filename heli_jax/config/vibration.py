@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from heli_jax import naming, units
+from heli_jax.config.corrections import with_notes
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.onboard import VibrationConfig
 from heli_jax.config.schema import FlightConfig
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, located
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.onto_grid import FEWEST
@@ -67,14 +68,10 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
     )
     slow = _too_slow(flight, frequencies)
     lost = _lost(flight, outputs, settling(frequencies, _Q), where)
-    source = flight.source
-    if source is not None:
-        listed = ", ".join(f"{hz:g}" for hz in frequencies)
-        done = note("notches.taken-out", f"inputs and outputs notched at {listed} Hz (Q {_Q:g})")
-        source = dataclasses.replace(source, notes=(*source.notes, done, *slow, *lost))
-    return dataclasses.replace(
-        flight, inputs=inputs, outputs=outputs, instruments=instruments, source=source
-    )
+    listed = ", ".join(f"{hz:g}" for hz in frequencies)
+    done = note("notches.taken-out", f"inputs and outputs notched at {listed} Hz (Q {_Q:g})")
+    flight = dataclasses.replace(flight, inputs=inputs, outputs=outputs, instruments=instruments)
+    return with_notes(flight, (done, *slow, *lost))
 
 
 def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ...]:
@@ -142,10 +139,8 @@ def _rotor_hz(
     """Turns per second, as stated, recorded, or known of the vehicle."""
     if config.vibration is not None:
         unit = config.vibration.unit
-        try:
+        with located(f"{where}.vibration.unit"):
             speed = config.vibration.rotor * units.factor(unit, "rad/s")
-        except ValueError as e:
-            raise InputError(f"{where}.vibration.unit: {e}") from e
         return speed / (2.0 * math.pi)
     if "Omega" in flight.inputs:
         speed = float(np.mean(flight.inputs["Omega"]))

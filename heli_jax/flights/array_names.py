@@ -5,6 +5,7 @@ Simulink's structures with time are arrays of structures with `values` and `labe
 ground stations `ATT` beside `ATT_label`, pandas `block0_values` beside `block0_items`.
 """
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 
@@ -104,8 +105,8 @@ def _chosen(path: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequen
 
 def _alike(one: str, other: str) -> int:
     """Letters with which two names begin alike."""
-    pairs = enumerate(zip(one, other, strict=False))
-    return next((i for i, (a, b) in pairs if a != b), min(len(one), len(other)))
+    pairs = zip(one, other, strict=False)
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _leaf(path: str) -> str:

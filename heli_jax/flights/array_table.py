@@ -125,7 +125,13 @@ def open_mat(path: Path) -> ArrayTable:
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
     if read.objects:
-        _require_arrays(path, read.arrays, read.objects)
+        if not any(x.size > 1 for x in read.arrays.values()):
+            name, kind = next(iter(read.objects.items()))
+            problem = (
+                f"holds {shown(name)}, a {kind} of MATLAB, which is no array; save its numbers"
+            )
+            way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
+            raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
         each = listed(f"{shown(n)} ({kind})" for n, kind in read.objects.items())
         sets.note(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *read.objects))
     for name, array in read.arrays.items():
@@ -134,27 +140,6 @@ def open_mat(path: Path) -> ArrayTable:
     for name, texts in as_lists(read.texts).items():
         sets.add_texts(name, texts)
     return sets.table(str(path), "mat", data)
-
-
-_WAYS = {
-    "timetable": "writetimetable({0}, 'flight.csv') writes what is read",
-    "table": "writetable({0}, 'flight.csv') writes what is read",
-    "timeseries": "save its numbers: t = {0}.Time; y = {0}.Data; save('flight.mat', 't', 'y')",
-    "iddata": "save its numbers: y = {0}.OutputData; u = {0}.InputData; Ts = {0}.Ts; "
-    "save('flight.mat', 'y', 'u', 'Ts')",
-}
-"""by class of MATLAB what makes a log of an object"""
-
-
-def _require_arrays(
-    path: Path, arrays: Mapping[str, np.ndarray], objects: Mapping[str, str]
-) -> None:
-    """Refuse a file whose numbers are all in objects."""
-    if any(x.size > 1 for x in arrays.values()):
-        return
-    name, kind = next(iter(objects.items()))
-    way = _WAYS.get(kind, "save its numbers as arrays, save('flight.mat', 't', 'y')").format(name)
-    raise wrong(str(path), f"holds {shown(name)}, a {kind} of MATLAB, which is no array; {way}")
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
@@ -278,7 +263,6 @@ class DataSets:
         self.labels: dict[str, str] = {}
         """texts by path"""
         self._stored: dict[str, np.ndarray] = {}
-        self._complex: list[str] = []
         self._units: dict[str, str] = {}
         self._texts: dict[str, list[str]] = {}
         self._missing: dict[str, int] = {}
@@ -298,8 +282,8 @@ class DataSets:
         """One data set, unpacked; `attributes` are all that it has, or those that count."""
         self.budget.take_numbers(stored.size, stored.nbytes)
         if stored.dtype.kind == "c":
-            self._complex.append(name)
-            stored = np.real(stored)
+            self._left_out[name] = "which is complex"
+            return
         packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
         try:
             values, missing = packed.unpack(stored, packing)
@@ -336,10 +320,6 @@ class DataSets:
         if self._left_out:
             words = listed(f"{shown(n)}, {why}" for n, why in self._left_out.items())
             notes.append(note(LEFT_OUT, f"left out: {words}", *self._left_out))
-        if self._complex:
-            words = "complex numbers, of which the real part is read: "
-            words += listed(map(shown, self._complex))
-            notes.append(note("channels.complex", words, *self._complex))
         whole, units_beside = labelled(self._stored, self.labels)
         stated = self._units | units_beside
         flat, of_stacks = unstacked(whole)

@@ -25,7 +25,7 @@ from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.request import Request
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
 from heli_jax.flights.slower import Timed
-from heli_jax.flights.strays import Strays, stray_words, strays
+from heli_jax.flights.strays import stray_words, strays
 from heli_jax.flights.table import column, shown, wrong
 
 _JUMP = (0.75, 1.001)
@@ -60,6 +60,7 @@ class AsLogged:
         return replace(source, facts=facts)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # differences of huge values
 def as_logged(
     request: Request,
     signals: Mapping[Key, Timed],
@@ -75,26 +76,17 @@ def as_logged(
     Raises:
         InputError: an input has marks; it acts all the time, so that none of it may be missing.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # differences of huge values
-        return _as_logged(request, signals, of_sources)
-
-
-def _as_logged(
-    request: Request,
-    signals: Mapping[Key, Timed],
-    of_sources: Mapping[Key, Mapping[str, Marked]],
-) -> AsLogged:
     made, marks, odd, notes = {}, {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
-        numbers = _in_log(signal, timed.values)
+        numbers = signal.from_si(timed.values)
         stated = _at_stated(signal, numbers)
         if stated.any():
             values, words = _without(timed.values, stated, key[1])
             count = int(np.count_nonzero(stated))
             notes.append(note("samples.missing-as-stated", f"{name} {words}", key[0], value=count))
             timed = timed._replace(values=values)
-            numbers = _in_log(signal, values)
+            numbers = signal.from_si(values)
         at = at_marks(numbers)
         sources = of_sources.get(key, {})
         marks[key] = (Marked(timed.seconds[at], numbers[at]), *sources.values())
@@ -114,12 +106,15 @@ def _as_logged(
             values, unwrapping = unwrapped(values, turn, name)
             notes.append(unwrapping)
         # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
-        odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
+        odd[key] = strays(timed.seconds, signal.from_si(values), key[1])
         for s in odd[key]:
             words = f"{name} has {stray_words(s)}: kept as measured"
             notes.append(note("samples.stray-kept", words, key[0], value=s.values.size))
         made[key] = Timed(timed.seconds, values)
-    return AsLogged(made, _facts(made, marks, odd), tuple(notes))
+    outputs = frozenset(key for key in made if key[1] == "output")
+    facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
+    facts = {key: replace(f, marked=marks[key], strays=odd[key]) for key, f in facts.items()}
+    return AsLogged(made, facts, tuple(notes))
 
 
 def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
@@ -143,16 +138,6 @@ def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray,
     # An input acts all the time: a stick stays where it was.
     last = known[np.maximum(np.searchsorted(known, np.arange(at.size), side="right") - 1, 0)]
     return values[last], f"{words}: taken as it was before"
-
-
-def _facts(
-    made: Mapping[Key, Timed],
-    marks: Mapping[Key, tuple[Marked, ...]],
-    odd: Mapping[Key, tuple[Strays, ...]],
-) -> dict[Key, SignalFacts]:
-    outputs = frozenset(key for key in made if key[1] == "output")
-    facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
-    return {key: replace(f, marked=marks[key], strays=odd[key]) for key, f in facts.items()}
 
 
 def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
@@ -179,7 +164,7 @@ def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
     """Values (N,) in SI of a signal, NaN where one stands for no value."""
-    numbers = _in_log(signal, values)
+    numbers = signal.from_si(values)
     none = np.isnan(without_marks(numbers)) | _at_stated(signal, numbers)
     return np.where(none, np.nan, values)
 
@@ -203,11 +188,6 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
             if steps.max() < (1 - _JUMP[0]) * turn and steps.sum() > _NEARLY * turn:
                 return after, [*notes, unwrapping]
     return numbers, notes
-
-
-def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:
-    """What stands in the log for values (N,) in SI."""
-    return signal.from_si(values)
 
 
 def is_wrapped(values: np.ndarray, turn: float) -> bool:

@@ -106,27 +106,17 @@ def is_called_time(name: str) -> bool:
 
 
 def _says_when_sampled(table: Table, name: str) -> bool:
-    """Whether a column is a clock before all others, since it is that of the samples themselves."""
-    if not _is_of_sample(name):
-        return False
-    if not name.casefold().endswith(_SAMPLED):
-        return True
-    # `convert` has put the clock of the topic beside what it copied. And a command acts from when
-    # it was published, 0.4 to 3 ms behind the gyro's sample: as in a ULog itself.
-    return "time" not in table.names and not _are_commands(table, name)
-
-
-def _are_commands(table: Table, stamps: str) -> bool:
-    """True where a column of times is that of commands of PX4, by the topic before it
-    (`/actuator_motors/timestamp`) or by the name of the file, as ulog2csv gives it."""
-    topic = re.split(r"[./]", stamps)[:-1]
-    return holds_commands(topic[-1] if any(topic) else PurePath(table.path).name)
-
-
-def _is_of_sample(name: str) -> bool:
-    """Whether a path ends in the stamp of a sample: field.header.stamp, timestamp_sample."""
+    """True for a clock that goes before all others, since it is that of the samples themselves:
+    field.header.stamp, timestamp_sample."""
     *_, last = path = tuple(re.split(r"[./]", name.casefold()))
-    return path[-2:] == _STAMP or last == _SAMPLED
+    if last != _SAMPLED:
+        return path[-2:] == _STAMP
+    # `convert` has put the clock of the topic beside what it copied. And a command acts from when
+    # it was published, 0.4 to 3 ms behind the gyro's sample: by the topic before the column
+    # (`/actuator_motors/timestamp_sample`) or by the name of the file, as ulog2csv gives it.
+    topic = re.split(r"[./]", name)[-2:-1]
+    commands = holds_commands(topic[0] if any(topic) else PurePath(table.path).name)
+    return "time" not in table.names and not commands
 
 
 def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:

@@ -21,6 +21,7 @@ from heli_jax.flights.named import NamedBy
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
+from heli_jax.flights.request import require_rate_and_window
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
 from heli_jax.flights.table import listed, require_few_columns, shown, wrong
 from heli_jax.flights.table_topics import (
@@ -91,7 +92,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
             clocks and no rate is given, or rate and window make no sense.
     """
     # Before the log is opened, which may take minutes.
-    _check(str(path), selection)
+    require_rate_and_window(str(path), selection.rate, selection.window)
     log = with_derived(open_log(path, selection.flight), selection.swashplate)
     # Asked before a table has lost the form of one, by which a preset may know it.
     named = None if selection.named is None else selection.named(log)
@@ -140,14 +141,6 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         columns = {TIME: columns[TIME], **{n: s.to_si(columns[s.name]) for n, s in taken.items()}}
     notes += _missing(columns)
     return Converted(columns, {TIME: "s"} | units, tuple(notes))
-
-
-def _check(path: str, selection: Selection) -> None:
-    rate, window = selection.rate, selection.window
-    if rate is not None and not 0 < rate < np.inf:
-        raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
-    if window is not None and not (np.all(np.isfinite(window)) and window[0] < window[1]):
-        raise wrong(path, f"window is {list(window)}, expected two increasing numbers of seconds")
 
 
 def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:

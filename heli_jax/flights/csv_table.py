@@ -740,7 +740,7 @@ def _floats(numbers: "pa.ChunkedArray") -> np.ndarray:
 
     values, at = np.empty(len(numbers), np.float64), 0
     # As buffers, since to_numpy imports pandas, which takes a second.
-    for chunk in filter(len, numbers.chunks):
+    for chunk in (c for c in numbers.chunks if len(c)):
         piece = values[at : at + len(chunk)]
         piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
         if chunk.null_count:

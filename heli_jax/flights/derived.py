@@ -5,6 +5,7 @@ written here.
 """
 
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -65,7 +66,12 @@ def derivation(
     if name in known or len(name) > _LONGEST_NAME:
         return None
     if name in CCPM:
-        return _of_servos(name, swashplate)
+        if swashplate is None:
+            raise ValueError(
+                f"{name} needs the swashplate's geometry, expected signals.ccpm with it"
+            )
+        unmixed = functools.partial(unmix, swashplate)
+        return Derivation((swashplate.servos,), _row(unmixed, CCPM.index(name)), "1")
     match = _CALL.fullmatch(name)
     if not match:
         return None
@@ -73,13 +79,16 @@ def derivation(
     arguments = [argument.strip() for argument in match[2].split(",")]
     expected = f"expected {', '.join(FORMS)}, got {shown(name)}"
     if function == "euler" and len(arguments) in (1, 4) and part in EULER:
-        return Derivation((_quaternion(arguments, known),), _euler(EULER.index(part)), "rad")
+        return Derivation(
+            (_quaternion(arguments, known),), _row(euler_angles, EULER.index(part)), "rad"
+        )
     if function == "body_velocity" and len(arguments) in (4, 7) and part in BODY:
         *q, north, east, down = arguments
         groups = (_quaternion(q, known), (north, east, down))
-        return Derivation(groups, _body_velocity(BODY.index(part)))
+        return Derivation(groups, _row(body_velocity, BODY.index(part)))
     if function == "unwrap" and len(arguments) == 2 and not part:
-        return Derivation(((arguments[0],),), _unwrap(_period(arguments[1], expected)))
+        period = _period(arguments[1], expected)
+        return Derivation(((arguments[0],),), lambda values: _unwrapped(values[0], period))
     if function not in ("euler", "body_velocity", "unwrap"):
         hint = nearest(function, ("euler", "body_velocity", "unwrap"))
         raise ValueError(f"no derived channel {shown(function)}{hint}")
@@ -115,11 +124,8 @@ def _period(text: str, expected: str) -> float:
     return period
 
 
-def _of_servos(name: str, swashplate: Swashplate | None) -> Derivation:
-    if swashplate is None:
-        raise ValueError(f"{name} needs the swashplate's geometry, expected signals.ccpm with it")
-    row = CCPM.index(name)
-    return Derivation((swashplate.servos,), lambda servos: unmix(swashplate, servos)[row], "1")
+def _row(of: Callable[..., np.ndarray], row: int) -> Callable[..., np.ndarray]:
+    return lambda *samples: of(*samples)[row]
 
 
 def euler_angles(q: np.ndarray) -> np.ndarray:
@@ -157,18 +163,6 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     out = np.array(values, np.float64)
     out[good] = np.unwrap(out[good], period=period)
     return out
-
-
-def _euler(row: int) -> Callable[..., np.ndarray]:
-    return lambda q: euler_angles(q)[row]
-
-
-def _body_velocity(row: int) -> Callable[..., np.ndarray]:
-    return lambda q, velocity: body_velocity(q, velocity)[row]
-
-
-def _unwrap(period: float) -> Callable[..., np.ndarray]:
-    return lambda values: _unwrapped(values[0], period)
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,20 +157,7 @@ def describe_log(
     unit: str | None = None,
     rate: float | None = None,
 ) -> LogInfo:
-    """Signals, rates, duration and gaps of a log, of its first flight where it holds several.
-
-    Args:
-        path: the log, in a format that `read_flight` reads.
-        time: the column of time stamps, in seconds where only its name is given; by default a
-            column with a usual name (its unit from an ending such as `_ms`, or guessed from the
-            steps), or the first that increases from row to row.
-        unit: of the time stamps, whichever column they are in.
-        rate: samples a second [Hz] of a table without times: of its rows, or of a column that
-            counts them.
-
-    Raises:
-        InputError: the log cannot be read, has no such column, or needs no column of times.
-    """
+    """As `describe_flights`, of the first flight of a log alone."""
     return next(describe_flights(path, time, unit, rate=rate))
 
 
@@ -181,17 +168,20 @@ def describe_flights(
     number: int | None = None,
     rate: float | None = None,
 ) -> Iterator[LogInfo]:
-    """As `describe_log`, of all flights of a log, one by one.
+    """Signals, rates, duration and gaps of the flights of a log, one by one.
 
     Args:
-        path: the log.
-        time: the column of time stamps.
-        unit: of the time stamps.
+        path: the log, in a format that `read_flight` reads.
+        time: the column of time stamps, in seconds where only its name is given; by default a
+            column with a usual name (its unit from an ending such as `_ms`, or guessed from the
+            steps), or the first that increases from row to row.
+        unit: of the time stamps, whichever column they are in.
         number: of the one flight to describe, from 1.
-        rate: samples a second [Hz] of a table without times.
+        rate: samples a second [Hz] of a table without times: of its rows, or of a column that
+            counts them.
 
     Raises:
-        InputError: as `describe_log`.
+        InputError: the log cannot be read, has no such column, or needs no column of times.
     """
     # All flights of a file are read by one pass of its reader, so `number` chooses among them and
     # spares no time.
@@ -243,7 +233,7 @@ def _describe_topic(topic: Topic) -> TopicInfo:
 def describe_table(
     table: Table, time: str | Signal | None, unit: str | None, rate: float | None = None
 ) -> LogInfo:
-    """As `describe_log`, of a table that is open.
+    """As `describe_flights`, of a table that is open.
 
     Args:
         table: of rows.
@@ -259,7 +249,11 @@ def describe_table(
     signal, guessed, said = table_clock(table, surveys, time, unit, rate)
     starts = np.zeros(0, int)
     if signal is not None and signal.name != ROWS:
-        table, surveys, starts = _with_runs(table, surveys, signal)
+        stamps = _values(surveys, signal.name)
+        if (starts := restarts(stamps)).size:
+            scale = clock_scale(table, signal)
+            table = with_runs(table, signal.name, {signal.name: stamps}, scale)
+            surveys = table.survey()
     # A stamp is never taken as missing: a wrong one is refused with its row.
     measured = [s for s in surveys if signal is None or s.name != signal.name]
     marks = mark_notes((s.name, s.values) for s in measured if s.values is not None)
@@ -330,22 +324,10 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers, unit, rows=rows)
 
 
-def _with_runs(
-    table: Table, surveys: list[Survey], signal: Signal
-) -> tuple[Table, list[Survey], np.ndarray]:
-    """The table with its runs one after another, its columns, and the rows in which the runs begin,
-    but for the first."""
-    stamps = _values(surveys, signal.name)
-    assert stamps is not None  # only a column of numbers is taken for a clock
-    starts = restarts(stamps)
-    if not starts.size:
-        return table, surveys, starts
-    parted = with_runs(table, signal.name, {signal.name: stamps}, clock_scale(table, signal))
-    return parted, parted.survey(), starts
-
-
-def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
-    return next(survey.values for survey in surveys if survey.name == name)
+def _values(surveys: list[Survey], name: str) -> np.ndarray:
+    values = next(survey.values for survey in surveys if survey.name == name)
+    assert values is not None  # only a column of numbers is guessed or taken for a clock
+    return values
 
 
 def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed: bool) -> TimeInfo:
@@ -353,7 +335,6 @@ def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed:
         stamps = np.arange(_n_rows(surveys), dtype=np.float64)
     else:
         stamps = _values(surveys, signal.name)
-    assert stamps is not None  # only a column of numbers is guessed or taken for a clock
     if signal.name == ROWS or signal.scale != 1.0:
         clock = _describe_stamps(signal.name, "s", stamps, signal.scale)
         return replace(clock, guessed=guessed, counted=round(1.0 / signal.scale, 9))

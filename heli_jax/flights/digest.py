@@ -1,24 +1,32 @@
 """The fingerprint of a file, computed beside other work."""
 
+import functools
 import hashlib
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 
 class Digest:
-    """SHA-256 of a file in a thread of its own: of a large one it takes as long as reading it.
+    """SHA-256 of a file, all bytes of it or where it is, in a thread of its own: of a large one it
+    takes as long as reading it.
 
     It begins when it is told to, or asked for: pyarrow reads with all cores there are.
     """
 
     def __init__(self, source: bytes | Path) -> None:
-        """Note what to read: all bytes of the file, or where it is."""
         self._source = source
-        self._made: Future[str] | None = None
+
+    @functools.cached_property
+    def _made(self) -> Future[str]:
+        pool = ThreadPoolExecutor(1)
+        try:
+            return pool.submit(_sha256, self._source)
+        finally:
+            pool.shutdown(wait=False)
 
     def begin(self) -> None:
         """Begin, if it has not."""
-        self._begun()
+        _ = self._made
 
     def hex(self) -> str:
         """The fingerprint, once it is there.
@@ -26,14 +34,7 @@ class Digest:
         Raises:
             OSError: the file could not be read to its end.
         """
-        return self._begun().result()
-
-    def _begun(self) -> Future[str]:
-        if self._made is None:
-            pool = ThreadPoolExecutor(1)
-            self._made = pool.submit(_sha256, self._source)
-            pool.shutdown(wait=False)
-        return self._made
+        return self._made.result()
 
 
 def _sha256(source: bytes | Path) -> str:

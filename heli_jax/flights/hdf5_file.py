@@ -93,8 +93,6 @@ def _read(path: Path, kind: str, budget: Budget) -> DataSets:
         # Of others nothing is read: they may be of types that h5py does not know.
         counting = (*packed.ATTRIBUTES, *packed.UNIT_ATTRIBUTES)
         attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
-        for beside, texts in of_attributes(item).items():
-            read.add_texts(f"{dotted}_{beside}", texts)
         for field, values, own in _fields(dotted, content(item), attributes):
             stored.append((field, values, own))
 
@@ -132,8 +130,6 @@ def _fields(
 
 _MOST_TEXTS, _LONGEST = 100, 1000
 """of a list, and bytes of each: others are data"""
-_ATTRIBUTES = ("columns", "names", "labels", "channels", "column_names", "channel_names")
-"""of a matrix, that may list its columns"""
 
 
 # Any: h5py's classes cannot be named where it is not installed.
@@ -177,18 +173,6 @@ def is_text(item: Any) -> bool:
 def _class_of(item: Any) -> str:
     stated = item.attrs.get("MATLAB_class", b"")
     return stated.decode("ascii", "replace") if isinstance(stated, bytes) else ""
-
-
-def of_attributes(item: Any) -> dict[str, Sequence[Any]]:
-    """Lists of texts among a data set's attributes that may name its columns, by attribute."""
-    attributes = {}
-    for name in _ATTRIBUTES:
-        if name not in item.attrs:
-            continue
-        texts = np.ravel(item.attrs[name])
-        if 1 < texts.size <= _MOST_TEXTS and texts.dtype.kind in "SUO":
-            attributes[name] = list(texts)
-    return attributes
 
 
 def numbers_of(file: Any) -> dict[str, float]:

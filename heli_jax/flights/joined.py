@@ -105,11 +105,15 @@ def joined_log(
     seconds = stamps * scale
     if not is_joined(seconds, signals, inputs):
         return None
-    topics = topics_of(seconds, signals, table.units, request.time.name)
-    notes = (*table.notes, joined_note(topics))
-    start = float(seconds[0])
+    topics, said = topics_of(seconds, signals, table.units, request.time.name)
     return ChannelLog(
-        table.path, table.format, table.size, table.sha256, topics, notes=notes, start=start
+        table.path,
+        table.format,
+        table.size,
+        table.sha256,
+        topics,
+        notes=(*table.notes, said),
+        start=float(seconds[0]),
     )
 
 
@@ -118,8 +122,8 @@ def topics_of(
     columns: Mapping[str, np.ndarray],
     units: Mapping[str, str],
     clock: str,
-) -> tuple[Topic, ...]:
-    """The topics of a joined table, each at its own rows.
+) -> tuple[tuple[Topic, ...], Finding]:
+    """The topics of a joined table, each at its own rows, and a note on them.
 
     Args:
         seconds: of the rows (N,) [s].
@@ -132,18 +136,13 @@ def topics_of(
         own = {name: columns[name][group.rows] for name in group.names}
         stated = {name: units[name] for name in own if units.get(name)}
         topics.append(Topic(_called(group.names), seconds[group.rows], own, stated, clock))
-    return tuple(topics)
-
-
-def joined_note(topics: Sequence[Topic]) -> Finding:
-    """A note on the topics that the rows were divided into."""
     known = (t for t in topics if t.times.size > 1)
     rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
     words = (
         f"its rows hold one topic each and leave other cells empty: each column is taken at the "
         f"rows that hold it ({rates})"
     )
-    return note("channels.joined", words, value=len(topics))
+    return tuple(topics), note("channels.joined", words, value=len(topics))
 
 
 def _called(names: Sequence[str]) -> str:

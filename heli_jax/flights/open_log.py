@@ -160,29 +160,14 @@ def _reader(path: Path) -> _Reader:
 
 def _by_content(head: bytes) -> _Reader | None:
     """The reader of a file whose first bytes say what it is, whatever it is called."""
-    if head.startswith(ulog.MAGIC):
-        return _one(ulog.open_ulog)
-    if head.startswith(dataflash.MAGIC):
-        return _one(dataflash.open_dataflash)
+    for mark, reader in _READERS:
+        if head.startswith(mark):
+            return reader
     # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
     # mind what stands before the first.
     if blackbox_fields.MARK in head:
         return open_blackbox
-    if head.startswith(b"PAR1"):
-        return parquet_table.open_parquet
-    if head.startswith(b"MATLAB "):
-        return array_table.open_mat
-    if head.startswith((b"CDF\x01", b"CDF\x02")):
-        return array_table.open_netcdf
-    if head.startswith(array_table.HDF5_MAGIC):
-        return array_table.open_hdf5
-    if head.startswith(array_table.NUMPY_MAGIC):
-        return array_table.open_numpy
-    if head.startswith(parquet_table.ARROW_MARK):
-        return parquet_table.open_arrow
-    if dataflash.is_dataflash_text(head):
-        return _one(dataflash.open_dataflash_text)
-    return None
+    return _one(dataflash.open_dataflash_text) if dataflash.is_dataflash_text(head) else None
 
 
 def _is_exported(head: bytes) -> bool:
@@ -192,6 +177,20 @@ def _is_exported(head: bytes) -> bool:
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
     return lambda path: (reader(path),)
+
+
+_READERS: tuple[tuple[bytes, _Reader], ...] = (
+    (ulog.MAGIC, _one(ulog.open_ulog)),
+    (dataflash.MAGIC, _one(dataflash.open_dataflash)),
+    (b"PAR1", parquet_table.open_parquet),
+    (b"MATLAB ", array_table.open_mat),
+    (b"CDF\x01", array_table.open_netcdf),
+    (b"CDF\x02", array_table.open_netcdf),
+    (array_table.HDF5_MAGIC, array_table.open_hdf5),
+    (array_table.NUMPY_MAGIC, array_table.open_numpy),
+    (parquet_table.ARROW_MARK, parquet_table.open_arrow),
+)
+"""by what their files begin with"""
 
 
 # Files that hold flights and are not read: what each is, and what to make of it instead.

@@ -280,11 +280,11 @@ def open_arrow(path: Path) -> "ArrowTable":
     source, budget = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data))
     try:
         if data.startswith(_STREAM):
-            table = _joined(pa.ipc.open_stream(source), budget)
+            file = batches = pa.ipc.open_stream(source)
         else:
             file = pa.ipc.open_file(source)
             batches = (file.get_batch(i) for i in range(file.num_record_batches))
-            table = pa.Table.from_batches(list(_checked(batches, budget)), file.schema)
+        table = pa.Table.from_batches(list(_checked(batches, budget)), file.schema)
         table.validate(full=True)
     # pyarrow raises UnicodeDecodeError where the name of a column is no text.
     except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
@@ -293,12 +293,6 @@ def open_arrow(path: Path) -> "ArrowTable":
         raise wrong(where, "holds no rows, expected a log")
     require_few_columns(where, len(table.schema))
     return ArrowTable(where, len(data), Digest(data), table)
-
-
-def _joined(stream: "pa.RecordBatchReader", budget: Budget) -> "pa.Table":
-    import pyarrow as pa
-
-    return pa.Table.from_batches(list(_checked(stream, budget)), stream.schema)
 
 
 def _checked(

@@ -106,7 +106,7 @@ def read_parts(
         key: dataclasses.replace(s, values=measured(request.signals[key], s.values))
         if key[1] == "output"
         else s
-        for key, s in clocked(logs, request).items()
+        for key, s in clocked(logs, request)[0].items()
     }
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
@@ -202,8 +202,7 @@ def _of_part(
 def _notes(intervals: list[tuple[float, float]], left_out: list[str]) -> tuple[Finding, ...]:
     """A note on the gaps at which a log was split and the parts left out; `intervals` [s]."""
     gaps = [after - before for (_, before), (after, _) in itertools.pairwise(intervals)]
-    count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-    words = f"{count} of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
+    words = f"gaps of up to {max(gaps):.3g} s split the run into {len(intervals)} parts"
     split = note("clock.gaps-split", words, value=max(gaps))
     if not left_out:
         return (split,)

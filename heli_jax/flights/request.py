@@ -71,6 +71,24 @@ class ReadOptions:
     """whether runs are told by a time that begins anew, to become flights of their own"""
 
 
+def require_rate_and_window(
+    path: str, rate: float | None, window: tuple[float, float] | None
+) -> None:
+    """Refuse a rate or a window of which a log has no part.
+
+    Raises:
+        InputError: with what was expected.
+    """
+    # NaN passes no comparison, so each bound is written as what has to hold.
+    if rate is not None and not (rate > 0 and math.isfinite(rate)):
+        raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
+    if window is not None and not (
+        len(window) == 2 and all(map(math.isfinite, window)) and window[0] < window[1]
+    ):
+        problem = f"window is {list(window)}, expected two increasing numbers of seconds"
+        raise wrong(path, problem)
+
+
 class Request:
     """The signals, the rate and the window that a user wants from a log.
 
@@ -96,11 +114,10 @@ class Request:
             raise wrong(path, "no input or output is asked for, expected at least one")
         # Columns first: a column with two uses makes every further sentence about it doubtful.
         self._check_columns()
-        time = (
-            {} if self.time is None else {"the time": Signal(self.time.name, self.time.unit, "s")}
-        )
         uses = {f"{kind} {key!r}": signal for (key, kind), signal in self.signals.items()}
-        for use, signal in (time | uses).items():
+        if self.time is not None:
+            uses = {"the time": Signal(self.time.name, self.time.unit, "s"), **uses}
+        for use, signal in uses.items():
             if problem := _problem(use, signal):
                 raise wrong(path, problem, column(signal.name))
         self._check_numbers()
@@ -137,16 +154,7 @@ class Request:
                 raise wrong(self.path, problem, column(signal.name))
 
     def _check_numbers(self) -> None:
-        rate, window = self.options.rate, self.options.window
-        # NaN passes no comparison, so each bound is written as what has to hold.
-        if rate is not None and not (rate > 0 and math.isfinite(rate)):
-            raise wrong(self.path, f"rate is {rate:g}, expected a positive number in Hz")
-        if window is not None:
-            expected = "expected two increasing numbers of seconds"
-            if len(window) != 2 or not all(math.isfinite(w) for w in window):
-                raise wrong(self.path, f"window is {list(window)}, {expected}")
-            if not window[0] < window[1]:
-                raise wrong(self.path, f"window is empty or reversed, {list(window)}, {expected}")
+        require_rate_and_window(self.path, self.options.rate, self.options.window)
         for name, value in self.known.items():
             if not math.isfinite(value):
                 problem = f"known {name!r} is {value:g}, expected a finite number"

@@ -52,9 +52,8 @@ _RUNS = 20
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """An end of a signal's range: its value, and the times (K,) [s] of the samples there.
-
-    There are none where it is no rail.
+    """A value at which a signal is cut off, or to which it drops again and again, and the times
+    (K,) [s] of its samples there; none where an end of its range is no rail.
     """
 
     value: float
@@ -68,14 +67,6 @@ class Stuck:
     begin: float
     end: float
     value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Dropouts:
-    """A value to which a signal jumps again and again, and the times (K,) [s] of its samples."""
-
-    value: float
-    times: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +96,7 @@ class SignalFacts:
     moves: float
     usual: float
     stretches: tuple[Stuck, ...] = ()
-    dropouts: Dropouts | None = None
+    dropouts: Rail | None = None
     marked: tuple[Marked, ...] = ()
     strays: tuple[Strays, ...] = ()
 
@@ -148,10 +139,7 @@ class SignalFacts:
             if one.begin < end and one.end > begin
         ]
         stretches = _that_count(inside, end - begin)
-        drops = self.dropouts
-        if drops is not None:
-            times = drops.times[(drops.times >= begin) & (drops.times <= end)]
-            drops = replace(drops, times=times - begin) if times.size else None
+        drops = None if self.dropouts is None else cut(self.dropouts)
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
         marked = (m.within(begin, end) for m in self.marked)
@@ -161,7 +149,7 @@ class SignalFacts:
             low=cut(self.low),
             high=cut(self.high),
             stretches=stretches,
-            dropouts=drops,
+            dropouts=drops if drops and drops.times.size else None,
             marked=tuple(m._replace(places=m.places - begin) for m in marked),
             strays=tuple(s for s in strays if s.times.size),
         )
@@ -308,7 +296,7 @@ def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
     return max(_STUCK * usual, _TIMES * high) if longer <= _FAILURES else np.inf
 
 
-def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
+def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
     """The value to which a signal jumps from anywhere, again and again."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
@@ -332,7 +320,7 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
     far = max(5.0 * float(gap), 0.3 * float(np.median(moves[moves > 0])))
     if not often or float(np.median(jumps)) < far:
         return None
-    return Dropouts(float(levels[k]), s[at])
+    return Rail(float(levels[k]), s[at])
 
 
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

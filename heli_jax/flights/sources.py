@@ -78,16 +78,9 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
     return Opened(first, keys, tuple(beside)), everything
 
 
-def clocked(logs: Opened, request: Request) -> dict[Key, ClockedSignal]:
+def clocked(logs: Opened, request: Request) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
     """The signals inside the window, each on its clock, in seconds from the first log's
-    beginning."""
-    return _signals(logs, request)[0]
-
-
-def _signals(
-    logs: Opened, request: Request
-) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    """As `clocked`, and notes."""
+    beginning, and notes."""
     signals, notes = _clocked(logs.log, _only(request, logs.keys))
     for one in logs.beside:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
@@ -112,9 +105,9 @@ def flight_from(logs: Opened, request: Request) -> Flight:
             cautions=log.cautions,
             first_time=log.first_time,
         )
-        return flight_of_signals(_signals(logs, request)[0], request, source)
+        return flight_of_signals(clocked(logs, request)[0], request, source)
     with log.clock.hinting():
-        signals, more = _signals(logs, request)
+        signals, more = clocked(logs, request)
         source = Source(
             log.table.path,
             log.table.sha256,

@@ -28,15 +28,24 @@ def unstacked(
     deep = {n: x for n, x in arrays.items() if x.dtype.kind in "biuf" and x.ndim > 2 and x.size}
     cubes = {n: x for n, x in deep.items() if x.ndim == DEEPEST}
     times = {n: x for n, x in arrays.items() if _is_time(n, x)}
-    shape = _segments(cubes, times)
-    # Rotation matrices, (sample, row, column), stand beside signals of one run.
+    shapes = {x.shape[:2] for x in cubes.values()}
+    shape = shapes.pop() if len(shapes) == 1 else None
+    # Images and rotation matrices, (sample, row, column), stand beside times or signals of one run.
     alone = (x for n, x in arrays.items() if x.ndim == 1 and n not in times)
-    if shape is not None and (shape[1] < _FEWEST or any(x.size == shape[1] for x in alone)):
+    if shape is not None and (
+        shape[1] < _FEWEST
+        or any(x.shape != shape and x.size != shape[1] for x in times.values())
+        or any(x.size == shape[1] for x in alone)
+    ):
         shape = None
     made: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
-        if shape is not None and (flat := _flat(values, shape, name in times)) is not None:
-            made[name] = flat
+        if shape is None:
+            break
+        if name in times and values.size == shape[1]:
+            made[name] = np.tile(values.ravel(), shape[0])
+        elif values.dtype.kind in "biuf" and values.ndim <= DEEPEST and values.shape[:2] == shape:
+            made[name] = values.reshape(shape[0] * shape[1], -1)
     notes = []
     if shape is not None and made:
         made = _without_padding(made, {n: x for n, x in made.items() if n in times}, shape)
@@ -50,7 +59,7 @@ def unstacked(
             made.pop(NUMBER, None)
     left = [n for n in deep if n not in made]
     if left:
-        why = "which of their dimensions is the time is not known"
+        why = "runs are read of arrays (run, sample, channel), with a time for each sample"
         notes.append(note(LEFT_OUT, f"left out, since {why}: {_listed(left, arrays)}", *left))
     kept = {n: made.get(n, x) for n, x in arrays.items() if n not in left}
     return {**kept, **{n: x for n, x in made.items() if n not in kept}}, tuple(notes)
@@ -62,57 +71,6 @@ def _is_time(name: str, values: np.ndarray) -> bool:
     if not words or not TIME_NAMES & {words[0], words[-1]} or values.dtype.kind not in "biuf":
         return False
     return 1 <= values.ndim <= 2 and max(values.shape) >= _FEWEST
-
-
-def _segments(
-    cubes: Mapping[str, np.ndarray], times: Mapping[str, np.ndarray]
-) -> tuple[int, int] | None:
-    """How many segments there are, of how many samples; None without a stack."""
-    for values in times.values():
-        if values.ndim == 2 and min(values.shape) > 1 and (cubes or _all_increase(values)):
-            steps = [np.abs(np.diff(values.astype(float), axis=axis)) for axis in (0, 1)]
-            # From sample to sample less time goes by than from run to run, but for runs that all
-            # begin at 0.
-            moves = [float(np.nanmedian(s)) if s.size else 0.0 for s in steps]
-            by_rows = 0.0 < moves[1] < moves[0] or moves[0] == 0.0
-            return values.shape if by_rows else values.shape[::-1]
-    if not cubes:
-        return None
-    lengths = [x.size for x in times.values() if x.ndim == 1 or min(x.shape) == 1]
-    shapes = [x.shape for x in cubes.values()]
-    samples = next((n for n in lengths if all(n in shape for shape in shapes)), None)
-    samples = samples or max(shapes[0])
-    if not all(samples in shape for shape in shapes):
-        return None
-    # Which of the others counts segments, and which channels, is anybody's choice.
-    firsts = {shape[0] for shape in shapes}
-    return (firsts.pop(), samples) if len(firsts) == 1 and samples not in firsts else None
-
-
-def _all_increase(times: np.ndarray) -> bool:
-    """Whether a matrix of times increases along its longer side, in all of its rows."""
-    rows = times if times.shape[1] >= times.shape[0] else times.T
-    steps = np.diff(rows.astype(float), axis=1)
-    return bool(np.all(steps > 0))
-
-
-def _flat(values: np.ndarray, shape: tuple[int, int], is_time: bool) -> np.ndarray | None:
-    """A stack, or a matrix of a number a sample, in the order of the segments; None of others."""
-    segments, samples = shape
-    if is_time and values.size == samples and samples in values.shape:
-        return np.tile(values.ravel(), segments)
-    if values.dtype.kind not in "biuf" or not 2 <= values.ndim <= DEEPEST:
-        return None
-    if values.ndim == 2:
-        if sorted(values.shape) != sorted(shape):
-            return None
-        return (values if values.shape == shape else values.T).ravel()
-    order = [axis for axis, size in enumerate(values.shape) if size == segments][:1]
-    order += [a for a, size in enumerate(values.shape) if size == samples and a not in order][:1]
-    if len(order) < 2:
-        return None
-    (channel,) = {0, 1, 2} - set(order)
-    return values.transpose(*order, channel).reshape(segments * samples, -1)
 
 
 def _without_padding(

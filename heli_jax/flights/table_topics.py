@@ -1,22 +1,18 @@
 """A table of rows as a log of topics."""
 
 import fnmatch
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
-from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import without_overflow
-from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
+from heli_jax.flights.joined import row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.row_clock import ROWS, clock_scale, counted, with_runs
 from heli_jax.flights.table import Table, listed, shown, wrong
-
-_MOST_NAMED = 6
-"""columns that notes name"""
 
 
 def without_joins(log: ChannelLog, notes: list[Finding]) -> ChannelLog:
@@ -27,8 +23,8 @@ def without_joins(log: ChannelLog, notes: list[Finding]) -> ChannelLog:
         if not takes_turns(row_groups(columns)):
             topics.append(topic)
             continue
-        parts = topics_of(topic.times, columns, topic.units, topic.clock)
-        notes.append(joined_note(parts))
+        parts, said = topics_of(topic.times, columns, topic.units, topic.clock)
+        notes.append(said)
         topics += parts
     return replace(log, topics=tuple(topics))
 
@@ -85,8 +81,8 @@ def one_topic(
             remedy += ", or --time-rate HZ, samples a second"
         if clock:
             remedy += ", or a file without the rows that go back"
-        if not clock and (texts := [c.name for c in info.columns if c.kind == "text"]):
-            why += f" ({_why_unread(table, texts[0])})"
+        if not clock and (texts := [c for c in info.columns if c.kind == "text"]):
+            why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
     if clock.said:
         notes.append(rate_note(clock))
@@ -103,7 +99,9 @@ def one_topic(
         words = f"{listed(map(shown, others))}, not of {rows} samples as the clock"
         notes.append(note(LEFT_OUT, f"left out: {words}", *others))
     notes += table.notes
-    notes += _left_out(table, [c.name for c in info.columns if c.kind == "text"])
+    if texts := [c for c in info.columns if c.kind == "text"]:
+        words = listed(f"{shown(c.name)}{f' ({c.strays})' if c.strays else ''}" for c in texts)
+        notes.append(note(LEFT_OUT, f"left out: text in {words}", *(c.name for c in texts)))
     twice = next((n for n in names if names.count(n) > 1), None)
     # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
@@ -118,21 +116,3 @@ def one_topic(
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
     return ChannelLog(table.path, table.format, table.size, table.sha256, (topic,))
-
-
-def _left_out(table: Table, names: Sequence[str]) -> list[Finding]:
-    """Notes on columns that hold text, with where and what it is."""
-    why = {name: _why_unread(table, name) for name in names[:_MOST_NAMED]}
-    notes = [note(LEFT_OUT, f"left out: {words}", name) for name, words in why.items() if words]
-    if more := names[_MOST_NAMED:]:
-        notes.append(note(LEFT_OUT, f"left out: {len(more)} more columns of text", *more))
-    return notes
-
-
-def _why_unread(table: Table, name: str) -> str:
-    """The place and text that keep a column from being read; empty for a column of numbers."""
-    try:
-        table.numbers([name])
-    except InputError as e:
-        return e.within
-    return ""

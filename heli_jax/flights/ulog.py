@@ -31,8 +31,6 @@ _MOST_IN_ALL = 200_000
 """fields of all topics: logs have some thousand"""
 _FAR = 86_400_000_000
 """us: a row whose stamp is a day from its topic's others is damage"""
-_TOLD = 1.0
-"""% of a file, above which it is told how much is lost"""
 _TYPES = {
     "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
@@ -103,15 +101,12 @@ def open_ulog(path: Path) -> ChannelLog:
     require_samples(str(path), topics)
     notes = []
     if content.damaged:
-        count = content.damaged
         share = 100 * content.lost / len(data)
-        lost = f" ({share:.2g} % of the file)" if share >= _TOLD else ""
-        words = f"{count} damaged message{'' if count == 1 else 's'} skipped{lost}"
-        notes.append(note("damage.skipped", words, value=count))
+        words = f"damaged messages skipped: {content.damaged}, {share:.2g} % of the file"
+        notes.append(note("damage.skipped", words, value=content.damaged))
     if content.dropouts:
-        times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
         lost = content.dropped * 1e-3
-        words = f"the logger dropped data {times}, {lost:.3g} s in all"
+        words = f"times the logger dropped data: {content.dropouts}, {lost:.3g} s in all"
         notes.append(note("damage.dropouts", words, value=lost))
     information = content.information
     parts = (information.get("sys_name", ""), information.get("ver_hw", ""), _version(information))

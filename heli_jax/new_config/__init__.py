@@ -104,24 +104,17 @@ def write_config(
     written = f"wrote {', '.join(map(str, (out, *paths)))}"
     notes = [note("configuration.written", written), *read.notes]
     if todo:
-        words = "1 number is" if todo == 1 else f"{todo} numbers are"
-        notes.append(
-            note(
-                "configuration.numbers-to-give",
-                f"{words} yours to give, where {EDIT} stands",
-                value=todo,
-            )
-        )
+        words = f"numbers that are yours to give, where {EDIT} stands: {todo}"
+        notes.append(note("configuration.numbers-to-give", words, value=todo))
     lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
     if signals is not None and not signals.outputs:
         outputs = ", ".join(naming.names(chosen.model.Outputs))
         words = f"found none of {outputs} by its name: say which were logged, and as what"
         notes.append(note("channels.lacking", words, *naming.names(chosen.model.Outputs)))
     if lacking:
-        words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
-        words += (
-            ": name the stick's, which no rate or angle is, or write {constant: 0} in "
-            "place of {signal: EDIT} where it stayed where it was and was not logged"
+        words = (
+            f"no channel that may be {' or '.join(lacking)} was found by name or motion: name the "
+            "stick's, or write {constant: 0} in place of {signal: EDIT} where it was not moved"
         )
         notes.append(note("channels.lacking", words, *lacking))
     if signals is not None:

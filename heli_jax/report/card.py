@@ -21,8 +21,7 @@ from heli_jax.identification.validation.held_out_agreement import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import number, p_value, percent, vaf_percent
 from heli_jax.report import frequency
-from heli_jax.report.coherence import Coherence, coherences
-from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.frequency import Coherence, FittedFlight, coherences
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -81,8 +80,8 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     )
     for metrics, source, judged in sources:
         for name, m in metrics.items():
-            at = _of_agreement(name, m, source, judged=judged)
-            lines += _without_bias_part(at, _mean_is_fitted(fit))
+            fitted_mean = _mean_is_fitted(fit)
+            lines += _of_agreement(name, m, source, judged=judged, fitted_mean=fitted_mean)
     lines += _of_held_out(fit)
     lines += _of_disturbance(fit)
     lines += _of_whiteness(fit, f"whiteness of {estimator.errors}, p-value")
@@ -96,12 +95,7 @@ def failed(lines: tuple[Gate, ...]) -> tuple[Gate, ...]:
 
 
 def summary(lines: tuple[Gate, ...], most: int | None = None) -> str:
-    """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`.
-
-    Args:
-        lines: of the card.
-        most: how many failed gates are named; the others are counted.
-    """
+    """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`; at most `most` are named."""
     if not lines:
         return "none, since the optimiser stopped before an optimum"
     asked, missed = [gate for gate in lines if gate.passed is not None], failed(lines)
@@ -133,14 +127,14 @@ def shown(gate: Gate) -> str:
 
 
 def _most(what: str, of: str, value: float, unit: str, most: float, remark: str = "") -> Gate:
-    gate = f"at most {most:g}{f' {unit}' if unit else ''}"
+    gate = f"at most {most:g} {unit}".rstrip()
     # A NaN compares as False, and so fails. bool(): `failed` asks for False itself, which NumPy's
     # own is not.
     return Gate(what, of, value, unit, gate, bool(value <= most), remark)
 
 
 def _least(what: str, of: str, value: float, unit: str, least: float, remark: str = "") -> Gate:
-    gate = f"at least {least:g}{f' {unit}' if unit else ''}"
+    gate = f"at least {least:g} {unit}".rstrip()
     return Gate(what, of, value, unit, gate, bool(value >= least), remark)
 
 
@@ -152,17 +146,13 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
         named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
         determined = f"determined, by priors: {named}"
     adequate = f"no: {'; '.join(fit.denials)}" if fit.denials else fit.adequate_in_words
+    lines = (
+        ("identifiability", "all parameters", "determined", fit.verdict.identifiable, determined),
+        ("adequacy", "the model", "not no", fit.adequate, adequate),
+    )
     return [
-        Gate(
-            "identifiability",
-            "all parameters",
-            math.nan,
-            "",
-            "determined",
-            fit.verdict.identifiable,
-            words=determined,
-        ),
-        Gate("adequacy", "the model", math.nan, "", "not no", fit.adequate, words=adequate),
+        Gate(what, of, math.nan, "", gate, passed, words=words)
+        for what, of, gate, passed, words in lines
     ]
 
 
@@ -213,7 +203,9 @@ def _of_relations(fit: Fit) -> list[Gate]:
     return lines
 
 
-def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[Gate]:
+def _of_agreement(
+    name: str, m: Metrics, source: str, *, judged: bool, fitted_mean: str
+) -> list[Gate]:
     of = f"{name}, {source}"
     lines = [
         _least(_VAF, of, m.vaf, "", VAF)._replace(gate=f"at least {percent(VAF, 0)}"),
@@ -224,10 +216,13 @@ def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[G
         # What is left to covariance is no fault: ideally all of the error is.
         Gate("Theil covariance part", of, m.covariance, "", "", None),
     ]
-    if judged:
+    if not judged:
+        return [_not_asked(line, "a simulation does not know the disturbance") for line in lines]
+    if not fitted_mean:
         return lines
-    remark = "not asked: a simulation does not know the disturbance"
-    return [line._replace(gate="", passed=None, remark=remark) for line in lines]
+    # Where it cannot fail.
+    why = f"{fitted_mean} is estimated on this very flight, so that it is near 0 always"
+    return [_not_asked(line, why) if line.what == _BIAS_PART else line for line in lines]
 
 
 def _mean_is_fitted(fit: Fit) -> str:
@@ -240,15 +235,9 @@ def _mean_is_fitted(fit: Fit) -> str:
     return "an input offset" if 0 < outputs <= len(layout.offsets) else ""
 
 
-def _without_bias_part(lines: list[Gate], fitted: str) -> list[Gate]:
-    """The lines with nothing asked of Theil's bias part where it cannot fail."""
-    remark = f"not asked: {fitted} is estimated on this very flight, so that it is near 0 always"
-    return [
-        line._replace(gate="", passed=None, remark=line.remark or remark)
-        if fitted and line.what == _BIAS_PART
-        else line
-        for line in lines
-    ]
+def _not_asked(line: Gate, why: str) -> Gate:
+    """A line that informs; the first reason stays."""
+    return line._replace(gate="", passed=None, remark=line.remark or f"not asked: {why}")
 
 
 def _of_held_out(fit: Fit) -> list[Gate]:
@@ -286,8 +275,8 @@ def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
         lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
     if not estimator_of(fit.method).noise_spectrum:
         return lines
-    remark = "not asked: the noise's spectrum is estimated, and need not be white"
-    return [line._replace(gate="", passed=None, remark=remark) for line in lines]
+    why = "not asked: the noise's spectrum is estimated, and need not be white"
+    return [line._replace(gate="", passed=None, remark=why) for line in lines]
 
 
 def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:

@@ -1,17 +1,23 @@
-"""What a drawn figure shows, as plain data: its lines, error bars, bands and limits, panel by
-panel. The page draws it anew, so that it can be zoomed, and words about it come from it."""
+"""What a drawn figure shows, panel by panel: as plain data, with which the page draws it anew
+so that it can be zoomed, and in words for who does not see it.
 
-from typing import TYPE_CHECKING, NamedTuple
+A page holds each array once, in two or four bytes a number, as base64.
+"""
+
+import base64
+import hashlib
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from heli_jax.report.style import BARS
+from heli_jax.numbers import number
+from heli_jax.report.style import BARS, thinned
 
-# Imported where a figure is read: `info` and `--help` need none of it.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+
 
 PIXELS = 88.0
 """of the page in an inch of a figure"""
@@ -178,3 +184,152 @@ def _shades(ax: "Axes") -> tuple[tuple[float, float], ...]:
             box = patch.get_path().transformed(patch.get_patch_transform()).get_extents()
             shades.append((float(box.x0), float(box.x1)))
     return tuple(shades)
+
+
+_TOLD = 6
+"""lines of a panel that are told one by one"""
+
+
+def described(chart: Chart) -> str:
+    """Title, note, and of each panel which lines it has and from where to where they go."""
+    low, high = chart.x_limits
+    over = f"Over {chart.x_label}, {number(low, 3)} to {number(high, 3)}" if chart.x_label else ""
+    panels = [text for p in chart.panels if (text := _panel_in_words(p))]
+    sentences = [chart.title, chart.note, over, *panels]
+    return ". ".join(s for s in sentences if s) + "."
+
+
+def _panel_in_words(panel: Panel) -> str:
+    series = [s for s in panel.series if s.kind != "band" and np.isfinite(s.y).any()]
+    words = [_range(s) for s in series[:_TOLD]]
+    if len(series) > _TOLD:
+        words.append(f"{len(series) - _TOLD} further lines")
+    return f"{panel.label}: {', '.join(words)}" if words else ""
+
+
+def _range(series: Series) -> str:
+    y = series.y[np.isfinite(series.y)]
+    low, high = number(float(y.min()), 3), number(float(y.max()), 3)
+    return f"{series.label} {low}" + (f" to {high}" if low != high else "")
+
+
+_BYTES = 380_000
+"""of all lines of a page together: what is longer is thinned, its peaks kept"""
+_LEAST = 2000
+"""points that a line keeps in any case"""
+_MISSING = 65535
+_STEPS = 65534
+"""parts of an array's range that are told apart: far below a pixel, and below a hundredth of a
+percent"""
+
+
+class Logged(NamedTuple):
+    """How a log has a signal: SI times a factor, and an offset on top."""
+
+    unit: str
+    """or the column's name, where the log's numbers have no unit"""
+    factor: float
+    offset: float = 0.0
+
+
+class Numbers:
+    """Arrays and figures of one page."""
+
+    def __init__(self) -> None:
+        self.arrays: list[dict[str, Any]] = []
+        self.charts: list[dict[str, Any]] = []
+        self.scenes: list[dict[str, Any]] = []
+        self._known: dict[bytes, int] = {}
+        self._waiting: list[tuple[Chart, dict[str, Logged]]] = []
+
+    def add_chart(self, chart: Chart, logged: dict[str, Logged] | None = None) -> int:
+        """Keep a figure; its number on the page."""
+        self._waiting.append((chart, logged or {}))
+        return len(self._waiting) - 1
+
+    def content(self) -> dict[str, Any]:
+        """All as plain data for JSON."""
+        # Not before all figures are known: how many points a line may keep depends on how many
+        # lines there are. An input that five figures show counts once.
+        lines = {
+            hashlib.sha256(np.ascontiguousarray(s.y).tobytes()).digest(): s.y.size
+            for chart, _ in self._waiting
+            for p in chart.panels
+            for s in p.series
+        }
+        most = _most(list(lines.values()))
+        self.charts = [self._chart(chart, logged, most) for chart, logged in self._waiting]
+        return {"arrays": self.arrays, "charts": self.charts, "scenes": self.scenes}
+
+    def array(self, values: np.ndarray, *, exact: bool = False) -> int:
+        """Keep an array (n,); its number on the page.
+
+        Args:
+            values: finite, or NaN where a number is missing.
+            exact: in single precision; else as parts of the array's range.
+        """
+        values = np.ascontiguousarray(values, np.float64)
+        key = hashlib.sha256(values.tobytes() + bytes([exact])).digest()
+        if key not in self._known:
+            self._known[key] = len(self.arrays)
+            self.arrays.append(_uniform(values) or (_single(values) if exact else _coarse(values)))
+        return self._known[key]
+
+    def _chart(self, chart: Chart, logged: dict[str, Logged], most: int) -> dict[str, Any]:
+        panels = [
+            {
+                **p._asdict(),
+                "logged": _logged_unit(p.label, logged),
+                "series": [self._series(s, most) for s in p.series],
+            }
+            for p in chart.panels
+        ]
+        return {**chart._asdict(), "panels": panels}
+
+    def _series(self, s: Series, most: int) -> dict[str, Any]:
+        x, y = (s.x, s.y) if s.low is not None else thinned(s.x, s.y, most)
+        ends = {n: self.array(v) for n, v in (("low", s.low), ("high", s.high)) if v is not None}
+        kept = {"x": self.array(x, exact=True), "y": self.array(y), "width": round(s.width, 2)}
+        return {**s._asdict(), "low": None, "high": None, **kept, **ends}
+
+
+def _most(sizes: list[int]) -> int:
+    """Points that a line may have, so that all together stay within a page's share."""
+    # Two bytes a number, four base64 letters for three bytes; where a line is thinned it has times
+    # of its own, of four bytes.
+    if sum(sizes) * 2 * 4 / 3 <= _BYTES:
+        return max([_LEAST, *sizes])
+    return max(_LEAST, int(_BYTES / (6 * 4 / 3) / len(sizes)))
+
+
+def _logged_unit(label: str, logged: dict[str, Logged]) -> list[Any] | None:
+    unit = logged.get(label.partition(" [")[0])
+    return None if unit is None else [label.partition(" [")[2].rstrip("]"), *unit]
+
+
+def _uniform(values: np.ndarray) -> dict[str, Any] | None:
+    """First, step and count of what is equally spaced, as times are; None where it is not."""
+    if values.size < 3 or not np.isfinite(values).all():
+        return None
+    line, step = np.linspace(values[0], values[-1], values.size, retstep=True)
+    if np.max(np.abs(values - line)) > 1e-6 * max(abs(step), 1e-300):
+        return None
+    return {"from": float(values[0]), "step": float(step), "n": values.size}
+
+
+def _single(values: np.ndarray) -> dict[str, Any]:
+    return {"f": as_base64(values.astype("<f4").tobytes())}
+
+
+def _coarse(values: np.ndarray) -> dict[str, Any]:
+    good = np.isfinite(values)
+    low, high = (float(f(values[good])) for f in (np.min, np.max)) if good.any() else (0.0, 0.0)
+    step = (high - low) / _STEPS
+    parts = np.full(values.shape, _MISSING, "<u2")
+    parts[good] = np.round((values[good] - low) / step) if step else 0
+    return {"q": as_base64(parts.tobytes()), "low": low, "step": step}
+
+
+def as_base64(data: bytes) -> str:
+    """Bytes as text of a page."""
+    return base64.b64encode(data).decode("ascii")

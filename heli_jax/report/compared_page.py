@@ -9,21 +9,19 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from heli_jax import units
 from heli_jax.finding import sentences
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
-from heli_jax.report.compared_bode import BODE_WORDS, bode_overlay
+from heli_jax.report.charts import Numbers
 from heli_jax.report.compared_runs import ComparedRuns
-from heli_jax.report.embedded import Numbers
-from heli_jax.report.figures.panels import panels
-from heli_jax.report.figures.time_domain import time_label
+from heli_jax.report.figures import bode_overlay, time_label
+from heli_jax.report.figures.bode import OVERLAY_WORDS
 from heli_jax.report.origin import origin
-from heli_jax.report.page import filled
-from heli_jax.report.pictures import Picture, picture
+from heli_jax.report.page import Picture, filled, picture
 from heli_jax.report.saved_fit import SavedFit
+from heli_jax.report.style import Panels, panels
 
 _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
 _MOST_FIGURES = 24
@@ -33,12 +31,7 @@ _SI = ("1", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2")
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
-    """The page, self-contained.
-
-    Args:
-        path: the HTML file.
-        compared: the runs.
-    """
+    """The page, self-contained."""
     numbers = Numbers()
     pictures = list(_pictures(compared, numbers))
     folder = path.absolute().parent
@@ -95,7 +88,7 @@ def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Pictur
             draw = functools.partial(bode_overlay, by_run, name, output, input)
             made = picture("bode", draw, numbers)
             if made is not None:
-                yield made, BODE_WORDS
+                yield made, OVERLAY_WORDS
 
 
 def _overlaps(
@@ -137,8 +130,8 @@ def _unit(compared: ComparedRuns, output: str) -> str:
     return ""
 
 
-def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Figure:
-    (ax,) = panels(None, 2.9, [1.0])
+def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Panels:
+    (ax,) = panels(2.9, [1.0])
     first = by_run[0][1]
     # By what was measured: one run that diverges would leave of all others a straight line.
     measured = first.measured[output][np.isfinite(first.measured[output])]
@@ -165,4 +158,4 @@ def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit
     end = max(float(s.log_times[-1]) for _, s in by_run)
     ax.set_xlim(begin, end if end > begin else begin + 1.0)
     style.legend_above(ax)
-    return ax.figure  # pyright: ignore[reportReturnType]
+    return (ax,)

@@ -13,15 +13,14 @@ from heli_jax.finding import Finding, note, sentences
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import lowered, measured, number, rounded, vaf_percent
-from heli_jax.report.compared_combinations import combinations
 from heli_jax.report.saved_fit import SavedFit, load_fit
-from heli_jax.report.unit_symbols import pretty
+from heli_jax.report.style import pretty
+from heli_jax.report.tables import NOT_DETERMINED, Table, combination, product
 from heli_jax.summaries import Summary, as_html, as_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NOT_DETERMINED = "not determined"
 NOT_CONVERGED = "not converged"
 _ABSENT = "–"
 _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
@@ -45,13 +44,6 @@ _SAME = (
 )
 
 
-class Table(NamedTuple):
-    """Text in rows under a head."""
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
 class ComparedRuns(NamedTuple):
     """Fits, each with a name that no other has."""
 
@@ -70,12 +62,12 @@ class ComparedRuns(NamedTuple):
         """As `estimates`, with numbers and units as all pages have them."""
         head, rows = self._estimates(lambda value, sd: measured(sd, value), pretty)
         first = 1 + len(self.labels)
-        signed = (
-            tuple(c.replace("-", "−") if i >= first else c for i, c in enumerate(row[:-1]))
-            for row in rows
-        )
         return Table(
-            head, tuple((*cells, row[-1]) for cells, row in zip(signed, rows, strict=True))
+            head,
+            [
+                (*row[:first], *(c.replace("-", "−") for c in row[first:-1]), row[-1])
+                for row in rows
+            ],
         )
 
     def _estimates(
@@ -94,18 +86,21 @@ class ComparedRuns(NamedTuple):
                 for e, run in zip(estimates, self.runs, strict=True)
             ]
             # Where an optimiser stopped on its way there is nothing to compare.
-            there = [
-                e if _arrived(run) else None for e, run in zip(estimates, self.runs, strict=True)
-            ]
-            apart = [_difference(there[0], other) for other in there[1:]]
+            pairs = zip(estimates, self.runs, strict=True)
+            first_one, *others = (e if _arrived(run) else None for e, run in pairs)
+            apart = [_difference(first_one, other) for other in others]
             rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
-        return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
+        return Table(("parameter", *self.labels, *several, "unit"), rows)
 
     def _by_run(self) -> list[dict[str, Estimate]]:
         """Each run's estimates, the combinations that one of the runs determines, then what all its
         flights share beside them: gains, a time shift, the disturbance."""
-        pairs = zip(self.runs, combinations(self.runs), strict=True)
-        return [{**run.estimates, **of_run, **_shared(run)} for run, of_run in pairs]
+        by_run = []
+        for run, combined in zip(self.runs, _combinations(self.runs), strict=True):
+            # What belongs to a flight has FLIGHT/ before its name.
+            shared = {n: e for n, e in run.nuisance.items() if "/" not in n}
+            by_run.append({**run.estimates, **combined, **shared})
+        return by_run
 
     @property
     def agreement(self) -> Table:
@@ -119,7 +114,7 @@ class ComparedRuns(NamedTuple):
                     where = "held out" if held_out else "fitted"
                     cells = (_agreement(m.get(output), key, text) for m in of)
                     rows.append((output, where, words, *cells))
-        return Table(("output", "flights", "metric", *self.labels), tuple(rows))
+        return Table(("output", "flights", "metric", *self.labels), rows)
 
     @property
     def verdicts(self) -> Table:
@@ -140,7 +135,7 @@ class ComparedRuns(NamedTuple):
             for label, run in zip(self.labels, self.runs, strict=True)
         ]
         head = ("run", "model", "method", "optimiser", "what the data determine", "adequate")
-        return Table(head, tuple(rows))
+        return Table(head, rows)
 
     @property
     def notes(self) -> tuple[Finding, ...]:
@@ -217,7 +212,7 @@ class ComparedRuns(NamedTuple):
     def _summary(self) -> Summary:
         head, rows = self.estimates
         title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
-        return Summary(title, head, rows, tuple(sentences(self.notes)))
+        return Summary(title, head, tuple(rows), tuple(sentences(self.notes)))
 
     def __repr__(self) -> str:
         return as_text(self._summary())
@@ -239,26 +234,7 @@ def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
     if len(runs) < 2:
         raise InputError(f"compare: expected two runs at least, got {len(runs)}")
     fits = tuple(run if isinstance(run, SavedFit) else load_fit(run) for run in runs)
-    for fit in fits:
-        _require_whole(fit)
     return ComparedRuns(_labels([fit.directory for fit in fits]), fits)
-
-
-def _require_whole(fit: SavedFit) -> None:
-    """Refuse a run whose fit.json holds other kinds of values than a fit writes.
-
-    Raises:
-        InputError: naming it.
-    """
-    alone = ComparedRuns(("",), (fit,))
-    try:
-        _ = alone.estimates, alone.agreement, alone.verdicts, alone.notes, alone.to_csv()
-        _ = _share_a_log(fit, fit)
-    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as e:
-        raise InputError(
-            f"{fit.directory / 'fit.json'}: expected what heli-jax fit writes, got other content "
-            f"({type(e).__name__}: {e})"
-        ) from e
 
 
 def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
@@ -272,17 +248,47 @@ def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
     return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
 
 
+def _combinations(runs: Sequence[SavedFit]) -> list[dict[str, Estimate]]:
+    """By run the combinations that any of them determines without determining their parts.
+
+    A run that determines the parts themselves has them by its estimates, their correlations, and
+    the constants that it took as known; one that has neither lacks that entry.
+    """
+    stated = [_stated(run) for run in runs]
+    every = {n: c for of in stated for n, c in of.items()}
+    by_run: list[dict[str, Estimate]] = [{} for _ in runs]
+    for run, of, found in zip(runs, stated, by_run, strict=True):
+        constants, verdict = run.content.get("constants") or {}, run.content["verdict"]
+        among = verdict.get("names") or [], verdict.get("correlation") or []
+        for name, c in every.items():
+            made = None
+            if name in of:
+                made = combination(*(of[name][key] for key in _NUMBERS))
+            elif c.get("kind", "product") == "product":
+                made = product(c["exponents"], run.estimates, constants, *among)
+            if made is not None:
+                found[name] = made
+    return by_run
+
+
+_NUMBERS = ("value", "sd", "lower95", "upper95")
+
+
+# Any: what fit.json holds.
+def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
+    """What the fit itself says that the data determine; nothing of one without an optimum."""
+    every = run.content.get("determined_combinations") or ()
+    known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
+    return {c["name"]: c for c in known if _arrived(run)}
+
+
 # Any: mappings of estimates or of metrics by name.
 def _in_order(mappings: Any) -> list[str]:
     return list(dict.fromkeys(name for mapping in mappings for name in mapping))
 
 
 def method_of(run: SavedFit) -> str:
-    """The method, and by which inputs' instruments: such a fit is another estimator.
-
-    Args:
-        run: what `load_fit` read.
-    """
+    """The method, and by which inputs' instruments: such a fit is another estimator."""
     inputs = run.content.get("instruments") or ()
     return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
 
@@ -325,24 +331,17 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
     return text(getattr(m, key, None))
 
 
-def _shared(run: SavedFit) -> dict[str, Estimate]:
-    """The nuisance parameters that belong to no flight: those have FLIGHT/ before their name."""
-    return {n: e for n, e in run.nuisance.items() if "/" not in n}
-
-
 def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
     """Whether both were fitted to the same samples of a log, or some of them."""
+    ours, others = (
+        [f for f in run.content["data"] if f.get("sha256") and not f.get("hold_out")]
+        for run in (first, second)
+    )
     return any(
         a["sha256"] == b["sha256"] and _overlap(a.get("window"), b.get("window"))
-        for a in _logged(first)
-        for b in _logged(second)
+        for a in ours
+        for b in others
     )
-
-
-def _logged(run: SavedFit) -> list[dict[str, Any]]:
-    """The flights that were fitted and are from a log."""
-    fitted = [flight for flight in run.content["data"] if not flight.get("hold_out")]
-    return [flight for flight in fitted if flight.get("sha256")]
 
 
 def _overlap(a: list[float] | None, b: list[float] | None) -> bool:

@@ -1,8 +1,10 @@
-"""Which figures a report has, each drawn when it is asked for."""
+"""Which figures a report has: each drawn when it is asked for, with the words under it and those
+for who does not see it."""
 
+import functools
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,47 +14,102 @@ from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.numbers import measured, number, percent, vaf_percent
 from heli_jax.report import figures
-from heli_jax.report.embedded import Logged
-from heli_jax.report.files import SupplementaryAnalyses
-from heli_jax.report.fitted_responses import FittedPair
+from heli_jax.report.charts import Logged
+from heli_jax.report.figures.estimates import MOST, share_within
+from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.page import Kind, Picture
+from heli_jax.report.style import Panels
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-type Draw = Callable[[], Figure | None]
-"""draws a figure; None where there is nothing to draw"""
+type Draw = Callable[[], Panels]
+"""draws a figure; () where there is nothing to draw"""
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
+_MOST = 6
+"""correlations that are told one by one"""
 
 
-class Analysis(NamedTuple):
-    """A fit, and all that its report is made of."""
+class Group(NamedTuple):
+    """Figures whose names begin alike."""
 
-    fit: Fit
-    problem: Problem
-    baseline: Baseline | None = None
-    supplementary: SupplementaryAnalyses = SupplementaryAnalyses()
+    caption: str
+    """what a figure shows, after its title"""
+    kind: Kind = "image"
+    """those over time and over frequency the page draws itself, to be zoomed"""
+
+
+# No group may begin another's name.
+GROUPS = {
+    "response": Group(
+        "From above, over time: measured and simulated, what is left between them, inputs.",
+        "live",
+    ),
+    "residual": Group(
+        "From above, by lag: its correlation with itself, then with each input; of white noise "
+        "99 % of the lags lie within the band.",
+        "panels",
+    ),
+    "bode": Group(
+        "Magnitude and phase of the fitted model,{rls} and of the record where its coherence "
+        "allows.",
+        "live",
+    ),
+    "match": Group(
+        "From above: gain and phase of model and data with 95 % intervals, partial coherence of "
+        "the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
+        "did not notice (Wood and Hodgkinson, 1980).",
+        "live",
+    ),
+    "held": Group(
+        "The same of all flights held out together: gain and phase of model and data with 95 % "
+        "intervals, partial coherence of the data, and data over model.",
+        "live",
+    ),
+    "correlation": Group("Near +1 or -1 the data hardly tell two parameters apart."),
+    "starts": Group("The misfit that each start of the optimiser reached, best first."),
+    "rls": Group("Each coefficient while the record goes by: one to be trusted settles.", "live"),
+    "intervals": Group("Of each parameter, by every method; the dotted line is the estimate."),
+    "trace": Group(
+        "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift."
+    ),
+    "pairs": Group(
+        "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its intervals' "
+        "sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do intervals "
+        "and correlations."
+    ),
+}
+
+
+def group_of(name: str) -> Group:
+    """The group of a figure by its file name."""
+    [group] = [group for begins, group in GROUPS.items() if name.startswith(begins)]
+    return group
 
 
 def drawings(analysis: Analysis) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
+    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
+    later = functools.partial
     fit, problem, baseline, supplementary = analysis
-    model, drawings = problem.model, {}
-    if supplementary.intervals is not None:
-        drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
-        drawings |= _samples(supplementary.intervals, fit)
+    model, drawings = problem.model, dict[str, Draw]()
+    if (comparison := supplementary.intervals) is not None:
+        drawings["intervals"] = later(figures.intervals, comparison, fit)
+        if comparison.posterior is not None:
+            drawings["trace"] = later(figures.trace, comparison.posterior, fit)
+            drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
+        if comparison.bootstrap is not None:
+            drawings["pairs_bootstrap"] = later(figures.bootstrap_pairs, comparison.bootstrap, fit)
     parts = _parts([s.flight for s in fit.signals])
     for i in _drawn([s.hold_out for s in fit.signals]):
         s, part = fit.signals[i], parts[i]
         for output in s.measured:
-            drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
+            drawings[f"response{part}_{output}"] = later(figures.response, s, output, model)
             # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
-                drawings[f"residual{part}_{output}"] = _drawing(
+                drawings[f"residual{part}_{output}"] = later(
                     figures.residual_correlation,
                     s,
                     output,
@@ -62,31 +119,59 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     if fit.signals[0].inputs:
         drawings["bode"] = _bode(fit, problem, baseline)
     if (responses := supplementary.responses) is not None:
+        about = (
+            f"model linearised about {responses.about}" if responses.about else "continuous model"
+        )
         for group, pairs, whose in (
             ("match", responses.pairs, "flights together"),
             ("held", responses.held_out, "flights held out together"),
         ):
+            note = f"{about}; data without the hold of the input, {whose}"
             for pair in pairs:
-                drawings[f"{group}_{pair.output}-{pair.input}"] = _match(pair, analysis, whose)
+                unit = figures.bode_unit(model, pair.output, pair.input)
+                name = f"{group}_{pair.output}-{pair.input}"
+                drawings[name] = later(figures.match, pair, unit, note)
     if len(fit.verdict.names) > 1:
-        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
-    drawings["starts"] = _drawing(figures.waterfall, fit.starts)
+        drawings["correlation"] = later(figures.correlation_matrix, fit.verdict)
+    drawings["starts"] = later(figures.waterfall, fit.starts)
     if baseline is not None:
-        drawings["rls"] = _drawing(
-            figures.rls_history, baseline, log_start=_log_start(fit, baseline.flight)
-        )
+        # Time in the log of its flight's first sample [s].
+        start = next((s.log_start for s in fit.signals if s.flight == baseline.flight), None)
+        drawings["rls"] = later(figures.rls_history, baseline, log_start=start)
     return drawings
 
 
-def _samples(comparison: Intervals, fit: Fit) -> dict[str, Draw]:
-    """Of what was sampled; nothing where nothing was."""
-    drawings, posterior, booted = {}, comparison.posterior, comparison.bootstrap
-    if posterior is not None:
-        drawings["trace"] = _drawing(figures.trace, posterior, fit)
-        drawings["pairs_posterior"] = _drawing(figures.posterior_pairs, posterior, fit)
-    if booted is not None:
-        drawings["pairs_bootstrap"] = _drawing(figures.bootstrap_pairs, booted, fit)
-    return drawings
+def _drawn(hold_out: list[bool]) -> list[int]:
+    """Which flights get figures: where there are too many, not only the fitted ones, which come
+    first, but half of them held out."""
+    held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
+    fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
+    rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
+    return sorted([*fitted, *held, *rest[: MOST_FLIGHTS - len(held) - len(fitted)]])
+
+
+def _parts(flights: list[str]) -> list[str]:
+    """What tells the flights' file names apart; nothing where there is one flight."""
+    if len(flights) == 1:
+        return [""]
+    # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
+    # number keeps their files apart.
+    return [
+        f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
+        for i, f in enumerate(flights)
+    ]
+
+
+def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
+    """The frequency response of the flight that the baseline saw, with what is known of it."""
+    # The first flight where there is no baseline.
+    i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
+    # What the flight states of the vehicle goes before the estimates, as in the fit.
+    # Signals hold the fitted flights first, in the order of `training`; those held out follow.
+    known = problem.training[i].known if i < len(problem.training) else {}
+    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
+    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
+    return functools.partial(figures.bode, flight, baseline)
 
 
 def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
@@ -141,57 +226,49 @@ def from_si(signal: Signal) -> float:
         return 1.0
 
 
-def _log_start(fit: Fit, flight: str) -> float | None:
-    """Time in the log of a flight's first sample [s]."""
-    return next((s.log_start for s in fit.signals if s.flight == flight), None)
+def caption(picture: Picture, *, rls: bool) -> str:
+    """What a figure shows, and the name of its files; `rls`: whether there are least squares."""
+    words = group_of(picture.name).caption
+    words = words.replace("{rls}", " of the recursive least squares," if rls else "")
+    return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
-def _drawn(hold_out: list[bool]) -> list[int]:
-    """Which flights get figures: where there are too many, not only the fitted ones, which come
-    first, but half of them held out."""
-    held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
-    fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
-    rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
-    return sorted([*fitted, *held, *rest[: MOST_FLIGHTS - len(held) - len(fitted)]])
+def alt_text(picture: Picture, analysis: Analysis) -> str:
+    """What a figure of the report shows, for who does not see it."""
+    fit, intervals = analysis.fit, analysis.supplementary.intervals
+    # Costs, intervals and chains are numbers of the tables beside.
+    if picture.name == "correlation":
+        return f"{picture.title}. {_correlations(fit)}."
+    if picture.name == "pairs_posterior" and intervals and intervals.posterior:
+        return f"{picture.title}. {_pairs(intervals.posterior.draws, fit)}."
+    if picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
+        return f"{picture.title}. {_pairs(intervals.bootstrap.values, fit)}."
+    for output, m in fit.metrics.items():
+        if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
+            return f"{picture.alt} Over the fitted flights: VAF {vaf_percent(m.vaf)}."
+    return picture.alt
 
 
-def _parts(flights: list[str]) -> list[str]:
-    """What tells the flights' file names apart; nothing where there is one flight."""
-    if len(flights) == 1:
-        return [""]
-    # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
-    # number keeps their files apart.
-    return [
-        f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
-        for i, f in enumerate(flights)
-    ]
+def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
+    """What samples show, pair by pair."""
+    names, each = list(samples)[:MOST], []
+    for name in names:
+        mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
+        each.append(f"{name} {mean}, {sd} {fit.estimates[name].unit}".rstrip())
+    pairs = [(names[j], names[i]) for i in range(len(names)) for j in range(i)]
+    shares = [(p, s) for p in pairs if (s := share_within(fit, samples, *p)) is not None]
+    # What is furthest from the 95 % that the curve stands for is told first.
+    worst = sorted(shares, key=lambda s: -abs(s[1] - 0.95))[:_MOST]
+    inside = ", ".join(f"{x} and {y} {percent(share, 0)}" for (x, y), share in worst)
+    count = next(iter(samples.values())).size
+    within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
+    return f"{count} samples, mean and sd: {'; '.join(each)}{within}"
 
 
-def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
-    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
-    def draw() -> "Figure | None":
-        axes = function(*args, **options)
-        return axes[0].figure if axes else None  # type: ignore[return-value]
-
-    return draw
-
-
-def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
-    """The frequency response of the flight that the baseline saw, with what is known of it."""
-    # The first flight where there is no baseline.
-    i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
-    # What the flight states of the vehicle goes before the estimates, as in the fit.
-    # Signals hold the fitted flights first, in the order of `training`; those held out follow.
-    known = problem.training[i].known if i < len(problem.training) else {}
-    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
-    return _drawing(figures.bode, flight, baseline)
-
-
-def _match(pair: FittedPair, analysis: Analysis, whose: str) -> Draw:
-    responses = analysis.supplementary.responses
-    assert responses is not None
-    about = f"model linearised about {responses.about}" if responses.about else "continuous model"
-    note = f"{about}; data without the hold of the input, {whose}"
-    unit = figures.bode_unit(analysis.problem.model, pair.output, pair.input)
-    return _drawing(figures.match, pair, unit, note)
+def _correlations(fit: Fit) -> str:
+    names, correlation = fit.verdict.names, fit.verdict.correlation
+    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
+    known = [(i, j) for i, j in pairs if np.isfinite(correlation[i, j])]
+    largest = sorted(known, key=lambda p: -abs(correlation[p]))[:_MOST]
+    words = (f"{names[j]} and {names[i]} {number(float(correlation[i, j]), 3)}" for i, j in largest)
+    return f"Largest: {', '.join(words)}"

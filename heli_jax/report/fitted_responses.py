@@ -86,14 +86,7 @@ class FittedResponses(NamedTuple):
 def fitted_responses(
     fit: Fit, problem: Problem, settings: Settings, asked: Sequence[HandlingPair]
 ) -> FittedResponses:
-    """The responses of a fit and of its flights, and handling qualities of both.
-
-    Args:
-        fit: the result.
-        problem: what was fitted.
-        settings: band and window of the measured responses.
-        asked: responses that handling qualities are read off.
-    """
+    """The responses of a fit and of its flights, and handling qualities of both."""
     try:
         responses = flight_responses(problem.training, settings)
     except ValueError as e:

@@ -1,7 +1,12 @@
-"""Frequency responses of a fit, of its baseline and of the record itself, on one phase branch."""
+"""Frequency responses of a fit, of its baseline and of the record itself, and the coherence of a
+record: of each input with the others taken out, and where the model lets expect it.
+
+A record shows coherence between an input and an output only where the one moves the other. Which
+do, and in which band, the model says: of an output that an input hardly moves nothing is asked.
+"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +19,15 @@ from heli_jax.analysis.operating_point import (
     OperatingPoint,
     operating_point,
 )
-from heli_jax.analysis.spectral import OWN, leakage, spectra
+from heli_jax.analysis.spectral import (
+    OWN,
+    leakage,
+    partial_coherence,
+    segment_transforms,
+    size_of,
+    spectra,
+    without,
+)
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
@@ -31,6 +44,10 @@ SHORTEST = 64
 """samples of a segment at least: fewer resolve nothing"""
 _BELOW = 1.0 - 1e-9
 """a frequency counts as the lowest itself although rounding has it below"""
+SIZEABLE = 0.1
+"""part of an output's power that the model puts down to an input, from which on it is asked for"""
+_MORE = 2
+"""half-overlapping segments more for every further input: each takes a degree of freedom"""
 _LONGEST = 4096
 """samples of a segment at most, unless the memory asks for more: further ones average better"""
 _MEMORIES = 16
@@ -63,24 +80,17 @@ class FittedFlight(NamedTuple):
 
 
 def log_grid(low: float, high: float, n: int = 900) -> np.ndarray:
-    """Frequencies (n,) [rad/s], equally spaced in the logarithm.
-
-    Args:
-        low: the first one [rad/s].
-        high: the last one [rad/s].
-        n: how many.
-    """
+    """Frequencies (n,) [rad/s], equally spaced in the logarithm."""
     return np.geomspace(low, high, n)
 
 
-def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
-    """The estimated gain and delay of an input as a factor (k,); 1 where neither was estimated.
+def sample_time(signals: Signals) -> float:
+    """Time between samples [s]; 1 for a single sample, which has none."""
+    return float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
 
-    Args:
-        fit: what may have estimated them.
-        input: the input's name.
-        omega: (k,) [rad/s]
-    """
+
+def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
+    """The estimated gain and delay of an input as a factor (k,); 1 where neither was estimated."""
     # A shift [s] is common to all inputs, a gain belongs to one.
     gain, shift = fit.nuisance.get(f"gain {input}"), fit.nuisance.get("time_shift")
     factor = np.full(omega.shape, 1.0 if gain is None else gain.value, complex)
@@ -94,7 +104,7 @@ def at_record(flight: FittedFlight) -> OperatingPoint:
     estimates = {n: flight.fit.nuisance.get(f"gain {n}") for n in signals.inputs}
     gains = {n: gain.value for n, gain in estimates.items() if gain is not None}
     inputs = {n: gains.get(n, 1.0) * np.asarray(u) for n, u in signals.inputs.items()}
-    dt = float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
+    dt = sample_time(signals)
     return operating_point(
         flight.model,
         flight.params,
@@ -117,54 +127,50 @@ def responses(
 
     The second holds the input over each sample: this, and not the first, is what a sampled record
     can show.
-
-    Args:
-        model: what is linearised.
-        params: its parameters.
-        output: the output's name.
-        input: the input's name.
-        dt: sample time [s].
-        at: about which point.
     """
     # One linearisation serves both, and NumPy evaluates them: a figure is no reason to compile.
-    A, B, C, D = (np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices)
+    matrices = linear_matrices(model, params, at)
     i = naming.names(model.Outputs).index(output)
     j = naming.names(model.Inputs).index(input)
+    delay = dict(model.delays).get(input)
+    late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
+
+    # With the phase that the input's delay takes.
+    def continuous(omega: np.ndarray) -> np.ndarray:
+        A, B, C, D = matrices
+        return _transfer(1j * omega, A, B[:, j], C[i], D[i, j]) * np.exp(-1j * omega * late)
+
+    def sampled(omega: np.ndarray) -> np.ndarray:
+        return held(matrices, i, j, dt, omega) * np.exp(-1j * omega * late)
+
+    return continuous, sampled
+
+
+def linear_matrices(model: Model, params: Any, at: OperatingPoint) -> list[np.ndarray]:
+    """A, B, C and D of the model linearised about a point."""
+    return [np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices]
+
+
+def held(
+    matrices: Sequence[np.ndarray], i: int, j: int, dt: float, omega: np.ndarray
+) -> np.ndarray:
+    """Hd(e^{i omega dt}) (k,) from input j, held over each sample, to output i.
+
+    Args:
+        matrices: A, B, C and D of a linear model.
+        i: of the output.
+        j: of the input.
+        dt: sample time [s].
+        omega: (k,) [rad/s]
+    """
+    A, B, C, D = matrices
     n = A.shape[0]
     # The exponential of [[A, b], [0, 0]] dt is [[Ad, bd], [0, 1]]: no inverse of A, which an
     # integrator does not have (Van Loan 1978).
     both = np.zeros((n + 1, n + 1))
     both[:n, :n], both[:n, n] = A, B[:, j]
-    held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
-
-    def response(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """The transfer function at some points, in s or in z.
-
-        Args:
-            points: s or z (k,), complex.
-            A: (n, n), continuous or discrete.
-            b: (n,), of the same kind.
-        """
-        return _transfer(points, A, b, C[i], D[i, j])
-
-    delay = dict(model.delays).get(input)
-    late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
-
-    def turned(omega: np.ndarray, points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """The same with the phase that the input's delay takes.
-
-        Args:
-            omega: (k,) [rad/s].
-            points: s or z (k,) at these.
-            A: (n, n), continuous or discrete.
-            b: (n,), of the same kind.
-        """
-        return response(points, A, b) * np.exp(-1j * omega * late)
-
-    return (
-        lambda omega: turned(omega, 1j * omega, A, B[:, j]),
-        lambda omega: turned(omega, np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
-    )
+    both = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
+    return _transfer(np.exp(1j * omega * dt), both[:n, :n], both[:n, n], C[i], D[i, j])
 
 
 def _transfer(
@@ -187,14 +193,8 @@ def memory(
     About an operating point a mode that is remembered for more than a sixteenth of the record's
     `duration` [s] counts as an integrator as well: the drift of a hovering helicopter has time
     constants of minutes, and within a segment it is a trend, which is taken out.
-
-    Args:
-        model: what is linearised.
-        params: its parameters.
-        at: about which point.
-        duration: of the record [s].
     """
-    A = np.asarray(linearize(model, params, at.state, at.inputs).matrices.A)
+    A = linear_matrices(model, params, at)[0]
     if not np.isfinite(A).all():
         return 0.0
     size = np.abs(np.linalg.eigvals(A))
@@ -295,3 +295,120 @@ def phase(H: np.ndarray) -> np.ndarray:
     first = unwrapped[0] if unwrapped.size else 0.0
     # Less 1e-6, so that rounding does not send a response that begins at +90 down to -270.
     return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)
+
+
+class Coherence(NamedTuple):
+    """One input and one output of a record."""
+
+    value: float
+    """mean of the partial coherence, weighted by the response that the model expects"""
+    expected: float
+    """the same of the simulated output"""
+    share: float
+    """of the simulated output's power, what the linearised model puts down to this input alone"""
+    segments: int
+    others: int
+    """further inputs that move, whose part was taken out"""
+    lowest: float = 0.0
+    """rad/s from which on it is said where a mode is too slow for the segments, else 0"""
+
+    @property
+    def asked(self) -> bool:
+        """Whether the model lets expect that the output follows this input coherently."""
+        return self.share >= SIZEABLE
+
+
+def coherences(
+    model: Model, params: Any, at: OperatingPoint, signals: Signals, fit: Fit
+) -> dict[tuple[str, str], Coherence | str]:
+    """By input and output of a flight: the partial coherence, or why there is none."""
+    dt = sample_time(signals)
+    memory_s = memory(model, params, at, dt * signals.times.size)
+    # One that stands still explains nothing, and its rounding would count as an input to take out.
+    moving = [n for n, u in signals.inputs.items() if np.std(u) > 0]
+    results: dict[tuple[str, str], Coherence | str] = {
+        (u, y): "the input does not move"
+        for u in signals.inputs
+        for y in signals.measured
+        if u not in moving
+    }
+    # Linearised once for all pairs of input and output: it traces the whole model.
+    matrices = linear_matrices(model, params, at)
+    for y in signals.measured:
+        record = _spectra(signals, moving, y, dt, memory_s)
+        if isinstance(record, str):
+            results |= {(u, y): record for u in moving}
+            continue
+        i = naming.names(model.Outputs).index(y)
+        for u in moving:
+            j = naming.names(model.Inputs).index(u)
+            H = held(matrices, i, j, dt, record.omega)
+            # What the model expects of the input as it was logged.
+            H = H * nuisance_factor(fit, u, record.omega)
+            results[u, y] = _coherence(record, moving.index(u), H)
+    return results
+
+
+class _Spectra(NamedTuple):
+    """Fourier transforms of the half-overlapping segments of a record."""
+
+    omega: np.ndarray
+    """(k,) [rad/s], above zero and below the Nyquist frequency"""
+    lowest: float
+    """rad/s, see `Segments`"""
+    inputs: np.ndarray
+    """(k, segments, inputs)"""
+    measured: np.ndarray
+    """(k, segments)"""
+    simulated: np.ndarray
+    """(k, segments)"""
+
+
+def _spectra(
+    signals: Signals, moving: list[str], output: str, dt: float, memory: float
+) -> _Spectra | str:
+    y, model = signals.measured[output], signals.simulated[output]
+    if np.isnan(y).any():
+        return "samples are missing"
+    if not np.isfinite(model).all():
+        return "the simulation diverges"
+    least = SEGMENTS + _MORE * (len(moving) - 1)
+    segments = segments_of(y.size, dt, memory, least)
+    if isinstance(segments, str):
+        return segments
+    channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
+    omega, transforms = segment_transforms(channels, dt, segments.length)
+    # Without the mean, which was taken out, and Nyquist's frequency; two periods in a segment are
+    # the second frequency above zero.
+    first = 2 if segments.lowest else 1
+    omega, transforms = omega[first:-1], transforms[first:-1]
+    inputs, measured, simulated = transforms[..., :-2], transforms[..., -2], transforms[..., -1]
+    return _Spectra(omega, segments.lowest, inputs, measured, simulated)
+
+
+def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
+    """Of input j, whose expected response is H (k,)."""
+    others = np.delete(record.inputs, j, axis=2)
+    alone = without(others, record.inputs[:, :, j])
+    power = np.sum(np.abs(alone) ** 2, axis=1)
+    # The power that the output owes to this input: where the model expects no response, noise may
+    # have its way, and a plain mean over frequencies would be that of the noise.
+    # Infinite where a pole lies on the unit circle at one of the frequencies: that one is left out.
+    weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
+    # Over its own size: the squares of a simulation that diverged would be no numbers.
+    size = size_of(record.simulated)
+    total = float(np.sum(np.abs(record.simulated / size) ** 2))
+    # By Parseval the sums over frequencies are powers, with the same factor above and below.
+    share = float(np.sum(weights)) / size / size / total if total > 0 else 0.0
+    # The simulated output has neither noise nor disturbance: its coherence is what could be seen.
+    value, expected = (
+        _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)
+        for y in (record.measured, record.simulated)
+    )
+    _, segments, others_count = others.shape
+    return Coherence(value, expected, share, segments, others_count, record.lowest)
+
+
+def _mean(coherence: np.ndarray, weights: np.ndarray) -> float:
+    seen = np.isfinite(coherence) & (weights > 0)
+    return float(np.average(coherence[seen], weights=weights[seen])) if seen.any() else 0.0

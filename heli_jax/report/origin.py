@@ -30,12 +30,7 @@ _asker: ContextVar[tuple[str, str] | None] = ContextVar("heli_jax_asker", defaul
 
 @contextlib.contextmanager
 def made_for(command: str, point: str) -> Iterator[None]:
-    """What is made meanwhile was asked for by another process.
-
-    Args:
-        command: what was typed there, as of `command`.
-        point: as of `Origin`.
-    """
+    """What is made meanwhile was asked for by another process."""
     token = _asker.set((command, point))
     try:
         yield
@@ -49,12 +44,7 @@ def command() -> str:
 
 
 def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
-    """Of a page that this process makes now.
-
-    Args:
-        config: the configuration in full, as YAML.
-        files: beside the page, by their names relative to it.
-    """
+    """Of a page that this process makes now."""
     now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     typed, point = _asker.get() or (command(), "")
     return Origin(typed, now, config, files, point)

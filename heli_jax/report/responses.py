@@ -12,19 +12,19 @@ from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
 from heli_jax.analysis.response_curves import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
+from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
-from heli_jax.numbers import number, with_sd
-from heli_jax.report.embedded import Numbers
-from heli_jax.report.figures.responses import branch_of, draw_response, seen_of
-from heli_jax.report.handling_json import handling_json
+from heli_jax.numbers import NOTHING, number, with_sd
+from heli_jax.report import tables
+from heli_jax.report.charts import Numbers
+from heli_jax.report.document import handling_content
+from heli_jax.report.figures.bode import branch_of, draw_response, seen_of
+from heli_jax.report.files import as_json
 from heli_jax.report.origin import origin
-from heli_jax.report.page import filled
-from heli_jax.report.pictures import picture
-from heli_jax.report.responses_netcdf import quotient, write_netcdf
-from heli_jax.report.tables.handling import handling as handling_table
-from heli_jax.report.tables.handling import handling_sentences
-from heli_jax.report.tables.table import Table
+from heli_jax.report.page import filled, picture
+from heli_jax.report.style import Panels
+from heli_jax.report.tables import Table
 
 _FILES = (
     "responses.csv",
@@ -54,37 +54,33 @@ def write_responses(
 ) -> None:
     """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json,
     figures/ and responses.html.
-
-    Args:
-        directory: exists.
-        responses: the responses.
-        units: SI, of inputs and outputs by name.
-        title: of the page.
-        handling: what the data say of handling qualities.
-        config: in full, as YAML.
-        png: whether figures are PNG files too.
     """
     write_table(directory / "responses.csv", table(responses))
     write_netcdf(directory / "responses.nc", responses, units)
     fits = [_content(*fit, responses.window) for fit in responses.fits]
-    (directory / "transfer_functions.json").write_text(
-        json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    (directory / "handling_qualities.json").write_text(
-        json.dumps(handling_json(handling), indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    for name, content in (
+        ("transfer_functions.json", fits),
+        ("handling_qualities.json", handling_content(handling)),
+    ):
+        (directory / name).write_text(as_json(content) + "\n", encoding="utf-8")
     (directory / "figures").mkdir()
-    pictures, numbers = [], Numbers()
-    for name, output in responses.outputs.items():
-        for input in output.pairs:
-            draw = functools.partial(_draw, responses, units, input, name)
-            pictures.append(
-                picture(_stem(input, name), draw, numbers, folder=directory / "figures", png=png)
-            )
+    numbers = Numbers()
+    pictures = [
+        picture(
+            # A model's names are Python's: nothing in them that a file's name may not have.
+            f"{name}-{input}",
+            functools.partial(_draw, responses, units, input, name),
+            numbers,
+            folder=directory / "figures",
+            png=png,
+        )
+        for name, output in responses.outputs.items()
+        for input in output.pairs
+    ]
     page = filled(
         "responses.html.j2",
         title=title,
-        pictures=[p for p in pictures if p is not None],
+        pictures=pictures,
         numbers=numbers.content(),
         origin=origin(config, _FILES),
         notes=responses.notes,
@@ -101,8 +97,8 @@ def write_responses(
             for sentence in fit_sentences(fit, responses.window)
         ],
         window=f"{responses.window:g}",
-        handling=handling_table(handling),
-        handling_sentences=handling_sentences(handling),
+        handling=tables.handling(handling),
+        handling_sentences=tables.handling_sentences(handling),
     )
     (directory / "responses.html").write_text(page, encoding="utf-8")
 
@@ -110,15 +106,10 @@ def write_responses(
 def _averages(responses: FlightResponses, request: Wanted) -> str:
     """Of the response that a transfer function is fitted to, as text."""
     output = responses.outputs.get(request.output)
-    return "–" if output is None else number(output.averages, 3)
+    return NOTHING if output is None else number(output.averages, 3)
 
 
-def _stem(input: str, output: str) -> str:
-    # A model's names are Python's: nothing in them that a file's name may not have.
-    return f"{output}-{input}"
-
-
-def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Any:
+def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Panels:
     measured = responses.outputs[output]
     curves = [
         (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(responses.omega, responses.holds[input]))
@@ -129,50 +120,40 @@ def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, outp
     ]
     by = "by its instrument" if input in responses.instruments else "direct"
     note = f"{by}, windows of {responses.window:g} s, {measured.averages:.1f} independent averages"
-    unit = quotient(units[output], units[input])
-    return draw_response(
-        (input, output),
-        responses.omega,
-        measured.pairs[input],
-        unit,
-        note,
-        measured.averages,
-        curves,
-    )
+    unit, pair = quotient(units[output], units[input]), measured.pairs[input]
+    names, omega = (input, output), responses.omega
+    return draw_response(names, omega, pair, unit, note, measured.averages, curves)
 
 
 def table(responses: FlightResponses) -> dict[str, Any]:
     """A row for each frequency of each pair: the columns of responses.csv."""
-    columns: dict[str, list[Any]] = {n: [] for n in ("input", "output")}
-    numbers: dict[str, list[np.ndarray]] = {}
+    parts: dict[str, list[Any]] = {}
+    omega = responses.omega
     for name, output in responses.outputs.items():
         for input, pair in output.pairs.items():
-            k, seen = responses.omega.size, seen_of(responses.omega, pair, output.averages)
-            columns["input"] += [input] * k
-            columns["output"] += [name] * k
+            seen = seen_of(omega, pair, output.averages)
             with np.errstate(all="ignore"):
                 each = {
-                    "frequency_hz": responses.omega / (2.0 * np.pi),
+                    "input": [input] * omega.size,
+                    "output": [name] * omega.size,
+                    "frequency_hz": omega / (2.0 * np.pi),
                     "gain": np.abs(pair.H),
                     "gain_db": 20.0 * np.log10(np.abs(pair.H)),
-                    "phase_deg": branch_of(responses.omega, pair.H, seen),
+                    "phase_deg": branch_of(omega, pair.H, seen),
                     "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
                     "multiple_coherence": output.multiple,
-                    "half95_in_sd": np.full(k, pair.half95),
+                    "half95_in_sd": np.full(omega.size, pair.half95),
                 }
             for n, v in each.items():
-                numbers.setdefault(n, []).append(v)
-    return {**columns, **{n: np.concatenate(v) for n, v in numbers.items()}}
+                parts.setdefault(n, []).append(v)
+    names = {n: [name for part in parts.pop(n) for name in part] for n in ("input", "output")}
+    return {**names, **{n: np.concatenate(v) for n, v in parts.items()}}
 
 
 def transfer_status(fit: TransferFit | str) -> str:
-    """In the words of fit.json: converged, not-identifiable or not-converged.
-
-    Args:
-        fit: the transfer function, or why there is none.
-    """
+    """In the words of fit.json: converged, not-identifiable or not-converged."""
     if isinstance(fit, str):
         return "not-identifiable"
     if not fit.converged:
@@ -184,59 +165,55 @@ def transfer_status(fit: TransferFit | str) -> str:
 
 
 def _content(request: Wanted, fit: TransferFit | str, window: float) -> dict[str, Any]:
+    """One entry of transfer_functions.json; what the response does not determine has no number."""
     status = transfer_status(fit)
-    if isinstance(fit, str):
-        return {
-            "input": request.input,
-            "output": request.output,
-            "numerator": [{}] * (request.zeros + 1),
-            "denominator": [{"value": 1.0}, *([{}] * request.poles)],
-            "delay_s": {} if request.delay else None,
-            "poles": None,
-            "zeros": None,
-            "chi_squared_per_degree": None,
-            "J": None,
-            "status": status,
-            "converged": False,
-            "determined": False,
-            "windows_taken_off": False,
-            "sentences": fit_sentences(fit, window),
-        }
-    poles_known = all(c.determined for c in fit.denominator)
-    zeros_known = all(c.determined for c in fit.numerator)
-    return {
+    content: dict[str, Any] = {
         "input": request.input,
         "output": request.output,
+        "numerator": [{}] * (request.zeros + 1),
+        "denominator": [{"value": 1.0}, *([{}] * request.poles)],
+        "delay_s": {} if request.delay else None,
+        "poles": None,
+        "zeros": None,
+        "chi_squared_per_degree": None,
+        "J": None,
+        "status": status,
+        "converged": status == "converged",
+        "determined": False,
+        "windows_taken_off": False,
+        "sentences": fit_sentences(fit, window),
+    }
+    if isinstance(fit, str):
+        return content
+    # Roots of coefficients that are not known are no numbers either.
+    roots = {}
+    for name, root, of in (
+        ("poles", fit.poles, fit.denominator),
+        ("zeros", fit.zeros, fit.numerator),
+    ):
+        known = all(c.determined for c in of)
+        roots[name] = [[r.real, r.imag] for r in root] if known else None
+    return {
+        **content,
+        **roots,
         "numerator": [_number(c) for c in fit.numerator],
         "denominator": [{"value": 1.0}, *(_number(c) for c in fit.denominator)],
         "delay_s": None if fit.delay is None else _number(fit.delay),
-        # Roots of coefficients that are not known are no numbers either.
-        "poles": [[p.real, p.imag] for p in fit.poles] if poles_known else None,
-        "zeros": [[z.real, z.imag] for z in fit.zeros] if zeros_known else None,
         "chi_squared_per_degree": fit.chi_squared,
         "J": fit.J,
-        "status": status,
-        "converged": status == "converged",
         "determined": fit.determined,
         "windows_taken_off": forgets(fit, window),
-        "sentences": fit_sentences(fit, window),
     }
 
 
 def _number(c: Coefficient) -> dict[str, float]:
-    # What the response does not determine has no number.
     if not c.determined:
         return {}
     return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
 
 
 def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
-    """What is to be heeded of a transfer function.
-
-    Args:
-        fit: the transfer function, or why there is none.
-        window: [s]
-    """
+    """What is to be heeded of a transfer function."""
     if isinstance(fit, str):
         return [f"not fitted: {fit}"]
     if not fit.determined:
@@ -357,3 +334,77 @@ def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
         return mean, "–", "–"
     low, high = (number(float(w) / (2.0 * np.pi), 3) for w in band)
     return mean, low, high
+
+
+def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str]) -> None:
+    """Write responses.nc; `units` are SI, of inputs and outputs by name."""
+    # Here: it takes long to load, for this file alone.
+    import xarray as xr
+
+    outputs = responses.outputs.values()
+    inputs = list(next(iter(outputs)).pairs)
+    unit = [[quotient(units[o], units[i]) for i in inputs] for o in responses.outputs]
+    one = {u for row in unit for u in row}
+    # An attribute is that of all pairs; where these differ the coordinate `unit` has each.
+    of_H = {"units": one.pop()} if len(one) == 1 else {}
+    parts = "in the coordinate unit, output over input"
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([[getattr(o.pairs[i], name) for i in inputs] for o in outputs])
+
+    H, composite = stacked("H"), stacked("picture")
+    # NetCDF 3 has no complex numbers.
+    of_pairs = {
+        "real": (np.real(H), f"real part, {parts}", of_H),
+        "imaginary": (np.imag(H), f"imaginary part, {parts}", of_H),
+        "sd": (stacked("sd"), f"of the real and of the imaginary part, {parts}", of_H),
+        "composite_real": (np.real(composite), f"real part of several windows, {parts}", of_H),
+        "composite_imaginary": (
+            np.imag(composite), f"imaginary part of several windows, {parts}", of_H
+        ),
+        "coherence": (stacked("coherence"), "partial coherence", {"units": "1"}),
+    }  # fmt: skip
+    of_outputs = {
+        "multiple_coherence": ("multiple", "coherence with all inputs together", "1"),
+        "noise": ("noise", "density of what the inputs leave", "SI^2/Hz"),
+    }
+    half95 = [next(iter(o.pairs.values())).half95 for o in outputs]
+    words = {"long_name": "half of a 95 % interval in sd", "units": "1"}
+    data = xr.Dataset(
+        {
+            **{
+                name: (("output", "input", "frequency"), values, {"long_name": words, **unit})
+                for name, (values, words, unit) in of_pairs.items()
+            },
+            "half95": ("output", half95, words),
+            **{
+                name: (
+                    ("output", "frequency"),
+                    np.stack([getattr(o, field) for o in outputs]),
+                    {"long_name": words, "units": unit},
+                )
+                for name, (field, words, unit) in of_outputs.items()
+            },
+        },
+        {
+            "output": list(responses.outputs),
+            "input": inputs,
+            "unit": (("output", "input"), unit),
+            "frequency": ("frequency", responses.omega / (2.0 * np.pi), {"units": "Hz"}),
+        },
+        {
+            "window_s": responses.window,
+            "instruments": " ".join(responses.instruments),
+            "units_of_outputs": " ".join(units[n] for n in responses.outputs),
+            "units_of_inputs": " ".join(units[n] for n in inputs),
+            "notes": json.dumps([as_data(f) for f in responses.notes]),
+        },
+    )
+    data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+
+
+def quotient(output: str, input: str) -> str:
+    """The unit of output over input."""
+    if input == "1":
+        return output
+    return f"{output}/({input})" if "/" in input else f"{output}/{input}"

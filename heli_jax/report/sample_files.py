@@ -2,7 +2,7 @@
 
 import importlib.util
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,13 +57,6 @@ def write_samples(
     """Write posterior.nc (NetCDF 4, for arviz) and bootstrap.nc (NetCDF 3), where there are draws
     and samples.
 
-    Args:
-        folder: where; it exists.
-        fit: whose unknowns they are.
-        comparison: with the draws and samples; None where nothing was sampled.
-        origin: command and date.
-        config: the path of the configuration.
-
     Raises:
         InputError: h5netcdf is not installed (extra `bayes`).
     """
@@ -98,11 +91,6 @@ def write_samples(
 def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]) -> "xr.DataTree":
     """The draws with what arviz looks for beside them: groups posterior, sample_stats,
     observed_data (outputs as measured) and constant_data (inputs).
-
-    Args:
-        fit: whose unknowns they are.
-        posterior: the draws.
-        attributes: of the file.
     """
     import xarray as xr
 
@@ -121,26 +109,19 @@ def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]
     }
     chains, count = next(iter(posterior.draws.values())).shape
     coordinates = {"chain": np.arange(chains), "draw": np.arange(count)}
-    outputs, inputs = _records([s for s in fit.signals if not s.hold_out])
     groups = {
         # The attributes at each group too: arviz takes a group by itself.
         "/": xr.Dataset(attrs=dict(attributes)),
         "posterior": xr.Dataset(draws, coordinates, dict(attributes)),
         "sample_stats": xr.Dataset(statistics, coordinates, dict(attributes)),
-        "observed_data": xr.Dataset(outputs[0], outputs[1]),
-        "constant_data": xr.Dataset(inputs[0], inputs[1]),
+        "observed_data": _records(fit, lambda s: s.measured),
+        "constant_data": _records(fit, lambda s: s.inputs),
     }
     return xr.DataTree.from_dict({n: g for n, g in groups.items() if n == "/" or g.data_vars})
 
 
 def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]) -> "xr.Dataset":
-    """The samples of the bootstrap, each parameter over `record`, the number of the record.
-
-    Args:
-        fit: whose unknowns they are.
-        booted: the samples.
-        attributes: of the file.
-    """
+    """The samples of the bootstrap, each parameter over `record`, the number of the record."""
     import xarray as xr
 
     variables: _Variables = {
@@ -152,28 +133,20 @@ def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]
     return xr.Dataset(variables, {"record": record}, {**attributes, **counts})
 
 
-type _Coordinates = dict[str, tuple[str, np.ndarray, dict[str, str]]]
+def _records(fit: Fit, signals_of: Callable[[Signals], Mapping[str, np.ndarray]]) -> "xr.Dataset":
+    """Signals of the fitted flights, SI, each over its flight's time."""
+    import xarray as xr
 
-
-def _records(
-    signals: list[Signals],
-) -> tuple[tuple[_Variables, _Coordinates], tuple[_Variables, _Coordinates]]:
-    """Outputs as measured and inputs of the fitted flights, SI, each over its flight's time."""
-    outputs: _Variables = {}
-    inputs: _Variables = {}
-    times: _Coordinates = {}
-    for i, s in enumerate(signals):
+    flights = [s for s in fit.signals if not s.hold_out]
+    variables: _Variables = {}
+    times: _Variables = {}
+    for i, s in enumerate(flights):
         # Flights differ in length: of several each has a time of its own.
-        end = f"_{i + 1}" if len(signals) > 1 else ""
-        time = f"time{end}"
-        times[time] = (time, s.times, {"units": "s", "flight": s.flight})
-        outputs |= {
-            n + end: (time, np.asarray(v), {"flight": s.flight}) for n, v in s.measured.items()
-        }
-        inputs |= {
-            n + end: (time, np.asarray(v), {"flight": s.flight}) for n, v in s.inputs.items()
-        }
-    return (outputs, times), (inputs, times)
+        end = f"_{i + 1}" if len(flights) > 1 else ""
+        times[f"time{end}"] = (f"time{end}", s.times, {"units": "s", "flight": s.flight})
+        for name, values in signals_of(s).items():
+            variables[name + end] = (f"time{end}", np.asarray(values), {"flight": s.flight})
+    return xr.Dataset(variables, times)
 
 
 def _variable(name: str, taken: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import adequacy_of
 from heli_jax.regular_file import read_regular
+from heli_jax.report.document import FitFile, checked
 from heli_jax.summaries import Summary, as_html, as_text, of_estimates
 
 if TYPE_CHECKING:
@@ -104,10 +105,13 @@ def load_fit(directory: str | Path) -> SavedFit:
         )
     content = _content(directory / "fit.json")
     try:
+        checked(FitFile, content)
         # Fixed ones are listed for who looks for them; they are no estimates.
-        estimates = {
-            n: _estimate(e) for n, e in content["parameters"].items() if not e.get("fixed", False)
-        }
+        estimates = _estimates(
+            {n: e for n, e in content["parameters"].items() if not e.get("fixed", False)}
+        )
+        # Others were asked for, or the estimates hold the Gaussian ones.
+        asked = content["intervals"]
         return SavedFit(
             directory=directory,
             model=content["model"],
@@ -117,13 +121,13 @@ def load_fit(directory: str | Path) -> SavedFit:
             identifiable=content["identifiable"],
             adequate=content["adequate"],
             estimates=estimates,
-            nuisance={n: _estimate(e) for n, e in content["nuisance"].items()},
-            intervals=_intervals(estimates, content["intervals"]),
-            metrics={n: _metrics(m) for n, m in content["metrics"].items()},
-            validation={n: _metrics(m) for n, m in content["validation"].items()},
+            nuisance=_estimates(content["nuisance"]),
+            intervals=_gaussian(estimates) if asked is None else _intervals(asked),
+            metrics=_metrics(content["metrics"]),
+            validation=_metrics(content["validation"]),
             signals=_signals(directory / "signals.csv", content),
-            notes=tuple(str(f["sentence"]) for f in content.get("findings", ())),
-            untrusted=tuple(dict(content.get("untrusted", {}))),
+            notes=tuple(f["sentence"] for f in content.get("findings", ())),
+            untrusted=tuple(content.get("untrusted", {})),
             content=content,
         )
     except InputError:
@@ -147,39 +151,32 @@ def _content(path: Path) -> dict[str, Any]:
     return content
 
 
-def _estimate(saved: Mapping[str, Any]) -> Estimate:
-    # By name and these alone: a file may have keys that a later version added.
-    fields = {name: saved[name] for name in Estimate._fields}
+# By name and these fields alone: a file may have keys that a later version added.
+
+
+def _estimates(saved: Mapping[str, Mapping[str, Any]]) -> dict[str, Estimate]:
     # What the data do not determine has no number in the file.
-    numbers = {n: v if v is None else float(v) for n, v in fields.items() if n in _NUMBERS}
-    unit = str.join("", (fields["unit"],))  # a text
-    return Estimate(**{**fields, **numbers, "unit": unit, "value": _number(fields["value"])})
+    made = {n: Estimate(*(e[field] for field in Estimate._fields)) for n, e in saved.items()}
+    return {n: e._replace(value=_number(e.value)) for n, e in made.items()}
 
 
-_NUMBERS = tuple(
-    name for name, kind in Estimate.__annotations__.items() if kind in (float, float | None)
-)
-
-
-def _metrics(saved: Mapping[str, float | None]) -> Metrics:
-    # JSON has no NaN: fit.json says null.
-    return Metrics(*(_number(saved[name]) for name in Metrics._fields))
+def _metrics(saved: Mapping[str, Mapping[str, float | None]]) -> dict[str, Metrics]:
+    return {n: Metrics(*(_number(m[f]) for f in Metrics._fields)) for n, m in saved.items()}
 
 
 def _number(value: float | None) -> float:
+    # JSON has no NaN: fit.json says null.
     return math.nan if value is None else float(value)
 
 
-def _intervals(
-    estimates: Mapping[str, Estimate], saved: Mapping[str, Any] | None
-) -> dict[str, dict[str, tuple[float, float]]]:
-    """By parameter and method; the Gaussian ones alone where no others were asked for."""
-    # null in fit.json where no other method was asked for: the estimates hold the Gaussian ones.
-    if saved is not None:
-        return {
-            name: {method: (_number(ends[0]), _number(ends[1])) for method, ends in by.items()}
-            for name, by in saved["by_parameter"].items()
-        }
+def _intervals(saved: Mapping[str, Any]) -> dict[str, dict[str, tuple[float, float]]]:
+    return {
+        name: {method: (_number(low), _number(high)) for method, (low, high) in by.items()}
+        for name, by in saved["by_parameter"].items()
+    }
+
+
+def _gaussian(estimates: Mapping[str, Estimate]) -> dict[str, dict[str, tuple[float, float]]]:
     return {
         name: {"gaussian": (e.lower95, e.upper95)}
         for name, e in estimates.items()

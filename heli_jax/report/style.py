@@ -1,19 +1,17 @@
 """How figures look: colours, one set of rcParams, thinning of long lines, saving."""
 
 import io
+import itertools
 import re
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from heli_jax.report.thinning import MOST_POINTS, thinned
-from heli_jax.report.unit_symbols import pretty
 
 # Imported where it draws: `info` and `--help` need none of it, and would wait half a second for it.
 if TYPE_CHECKING:
@@ -68,6 +66,8 @@ STYLE: dict[Any, Any] = {
     "path.simplify_threshold": 0.2,
 }
 
+type Panels = tuple[Axes, ...]
+
 WIDTH = 7.4
 """width of a figure [inch]"""
 TOP = 0.5
@@ -76,6 +76,8 @@ ROW = 15.0 / 72.0
 """height of a row between title and axes [inch]: a subtitle or a legend"""
 BOTTOM = 0.48
 """margin below the last panel [inch]"""
+MOST_POINTS = 800
+"""points of a drawn line at most: the lowest and the highest of every 1.5 pixels of a page"""
 _POINTS = 72.0
 """in an inch"""
 _DPI = 110
@@ -87,41 +89,81 @@ _NOT_XML = bytes(set(range(32)) - {9, 10, 13})
 """control characters"""
 
 
-def figure(height: float, width: float = WIDTH) -> "Figure":
-    """An empty figure with its own canvas."""
+def figure(height: float, width: float = WIDTH, *, constrained: bool = False) -> "Figure":
+    """An empty figure with its own canvas; `constrained`: laid out by Matplotlib, which is slow and
+    gives labels of any length their room."""
     # Without pyplot, which keeps every figure alive in a global list, and is not for threads.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(width, height))
+    drawing = Figure(figsize=(width, height), layout="constrained" if constrained else None)
     FigureCanvasAgg(drawing)
     return drawing
 
 
-def place(
-    drawing: "Figure", panels: int, *, right: float = 0.2, gap: float = 0.2, top: float = TOP
-) -> None:
-    """Margins and gaps between panels.
+def panels(
+    height: float,
+    ratios: Sequence[float],
+    *,
+    sharex: bool = True,
+    right: float = 0.2,
+    top: float = TOP,
+) -> Panels:
+    """Panels below each other in a new figure, their labels in line.
 
     Args:
-        drawing: the figure.
-        panels: how many there are below each other.
-        right: margin at the right [inch].
-        gap: between two panels [inch].
-        top: margin above the first panel [inch].
+        height: of the figure [inch].
+        ratios: heights of the panels, relative to each other.
+        sharex: whether the panels have one x axis.
+        right: margin [inch].
+        top: likewise, above the first panel.
     """
-    # Fixed, for a layout engine draws every tick twice more and takes half the report's time.
-    width, height = drawing.get_size_inches()
-    left = 0.82
-    # matplotlib takes margins as parts of the figure, and gaps as parts of a panel's height.
-    each = (height - top - BOTTOM - gap * (panels - 1)) / panels
+    from matplotlib.transforms import ScaledTranslation
+
+    n, drawing = len(ratios), figure(height)
+    axes = drawing.subplots(n, 1, sharex=sharex, squeeze=False, height_ratios=ratios)[:, 0]
+    # Margins are fixed, for a layout engine draws every tick twice more and takes half the report's
+    # time. Panels with an x axis each need room for its tick labels. Matplotlib takes margins as
+    # parts of the figure, and gaps as parts of a panel's height.
+    gap = 0.22 if sharex else 0.36
+    each = (height - top - BOTTOM - gap * (n - 1)) / n
     drawing.subplots_adjust(
-        left=left / width,
-        right=1.0 - right / width,
+        left=0.82 / WIDTH,
+        right=1.0 - right / WIDTH,
         top=1.0 - top / height,
         bottom=BOTTOM / height,
         hspace=gap / each,
     )
+    # As far away in every figure: `align_ylabels` measures the tick labels of every panel at each
+    # drawing, and figures of the same kind would differ with their numbers' widths.
+    for ax in axes:
+        at = ax.transAxes + ScaledTranslation(-0.57, 0.0, drawing.dpi_scale_trans)
+        ax.yaxis.set_label_coords(0.0, 0.5, transform=at)
+    return tuple(axes)
+
+
+def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """At most `most` points of a line: the lowest and the highest of each bin.
+
+    No peak is lost, and the first and the last point stay.
+
+    Args:
+        x: (N,), ascending.
+        y: (N,)
+        most: points to keep, 4 at least.
+    """
+    # Not every k-th sample: that aliases an oscillation and misses spikes.
+    n = y.size
+    if n <= most:
+        return x, y
+    bins = (most - 2) // 2  # two points each, and the two ends
+    edges = np.linspace(0, n, bins + 1).astype(int)
+    # A missing sample is neither the lowest nor the highest.
+    down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
+    low = [a + int(np.argmin(down[a:b])) for a, b in itertools.pairwise(edges)]
+    high = [a + int(np.argmax(up[a:b])) for a, b in itertools.pairwise(edges)]
+    keep = np.unique(np.concatenate([[0, n - 1], low, high]))
+    return x[keep], y[keep]
 
 
 _LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()
@@ -140,27 +182,13 @@ def thin(drawn: "Figure") -> None:
 
 
 def line(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw a line of any length; it is thinned when the figure is saved.
-
-    Args:
-        ax: where.
-        x: (N,), ascending.
-        y: (N,)
-        **line_style: as of matplotlib's `plot`.
-    """
+    """Draw a line of any length; it is thinned when the figure is saved."""
     _LONG.update(ax.plot(np.asarray(x), np.asarray(y), **line_style))
 
 
 def samples(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw what was measured: a line, or where few samples have neighbours a dot for each, of which
-    a line would show nothing.
-
-    Args:
-        ax: where.
-        x: (N,), ascending.
-        y: (N,), NaN where one is missing.
-        **line_style: as of matplotlib's `plot`; of dots all but the width.
-    """
+    """Draw what was measured, NaN where it is missing: a line, or where few samples have neighbours
+    a dot for each, of which a line would show nothing."""
     x, y = np.asarray(x), np.asarray(y)
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
@@ -179,16 +207,7 @@ def bars(
     color: str,
     label: str | None = None,
 ) -> None:
-    """Draw dots with error bars.
-
-    Args:
-        ax: where.
-        x: (N,)
-        y: (N,)
-        reach: of the bars down and up, (2, N), or the same for both, (N,).
-        color: of both.
-        label: of the dots.
-    """
+    """Draw dots with error bars; `reach`: of the bars down and up, (2, N), or of both, (N,)."""
     ax.plot(x, y, "o", ms=2.2, mew=0.0, color=color, label=label)
     down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
     # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.
@@ -200,19 +219,20 @@ BARS = "_bars"
 """label of the bars of the dots that were drawn before them"""
 
 
+def pretty(unit: str | None) -> str:
+    """A unit as it is printed: kg m², 1/s²; `–` for a plain number."""
+    if unit is None or unit in ("", "1"):
+        return "–"
+    return unit.replace("^2", "²").replace("^3", "³").replace("^4", "⁴").replace("*", " ")
+
+
 def label(name: str, unit: str | None) -> str:
     """`roll [rad]`; the name alone where the unit is not known."""
     return f"{name} [{pretty(unit)}]" if unit is not None else name
 
 
 def subtitle(ax: "Axes", text: str, *, raised: bool = False) -> None:
-    """A quiet line between the title and the axes.
-
-    Args:
-        ax: where; it has its title.
-        text: of the line.
-        raised: whether it lies over a legend (`legend_above`), the title over both.
-    """
+    """A quiet line between the title and the axes."""
     row = _POINTS * ROW if raised else 0.0
     ax.set_title(ax.get_title("left"), loc="left", pad=19 + row)
     ax.annotate(
@@ -290,10 +310,15 @@ def phase_ticks(ax: "Axes") -> None:
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 
-def styled(draw: Callable[[], "Figure | None"]) -> "Figure | None":
-    """Draw a figure in the style."""
+def figure_of(axes: Panels) -> "Figure | None":
+    """The figure of panels; None where there are none."""
+    return axes[0].figure if axes else None  # type: ignore[return-value]
+
+
+def styled(draw: Callable[[], Panels]) -> "Figure | None":
+    """Draw panels in the style; None where there is nothing to draw."""
     with in_style():
-        return draw()
+        return figure_of(draw())
 
 
 @contextmanager

@@ -7,11 +7,10 @@ from typing import Any
 
 from heli_jax.numbers import NOTHING, number
 from heli_jax.report.origin import origin
-from heli_jax.report.page import filled
-from heli_jax.report.pictures import Picture, of_file
-from heli_jax.report.sweeps.files import stems
-from heli_jax.report.tables.table import Table
-from heli_jax.report.unit_symbols import pretty
+from heli_jax.report.page import Picture, filled, of_file
+from heli_jax.report.style import pretty
+from heli_jax.report.sweeps import stems
+from heli_jax.report.tables import Table
 
 _QUANTILES = ("min", "q05", "median", "q95", "max")
 _FILES = ("config.yaml", "summary.json", "figures/")
@@ -28,13 +27,7 @@ _OTHERS = {
 
 
 def write_page(path: Path, directory: Path, title: str) -> None:
-    """Write the page.
-
-    Args:
-        path: the HTML file.
-        directory: of the sweep, with summary.json and figures/, and config.yaml if it has one.
-        title: of the page.
-    """
+    """Write the page."""
     content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     config = directory / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
@@ -64,23 +57,17 @@ def _results(content: dict[str, Any]) -> Table:
 def _elements(content: dict[str, Any]) -> Table:
     """Result, whether worst or best, value, and where it lies: a column for each axis."""
     listed = [
-        (name, words, element)
+        (name, words, pretty(content["results"].get(name, {}).get("unit")), element)
         for words in ("worst", "best")
         for name, elements in content[words].items()
         for element in elements
     ]
     axes = list(dict.fromkeys(axis for *_, e in listed for axis in e["axes"]))
-    rows = [
-        (
-            name,
-            words,
-            number(e.get("value"), _DIGITS),
-            pretty(content["results"].get(name, {}).get("unit")),
-            str(e["element"]),
-            *(number(e["axes"][a], _DIGITS) if a in e["axes"] else NOTHING for a in axes),
-        )
-        for name, words, e in listed
-    ]
+    rows = []
+    for name, words, unit, e in listed:
+        # `number` writes a dash for what is not there.
+        value, *places = (number(v, _DIGITS) for v in (e.get("value"), *map(e["axes"].get, axes)))
+        rows.append((name, words, value, unit, str(e["element"]), *places))
     return Table(("result", "which", "value", "unit", "element", *axes), rows)
 
 

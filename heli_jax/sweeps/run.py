@@ -200,8 +200,7 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
         # the answer.
         done = store.whole()
         if damaged := int(np.count_nonzero(store.done() & ~done)):
-            words = "1 chunk is damaged" if damaged == 1 else f"{damaged} chunks are damaged"
-            options.say(Note(f"{where}: {words} and computed again"))
+            options.say(Note(f"{where}: damaged chunks that are computed again: {damaged}"))
         _same_cut(store, job, options, where)
         # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
         if changed := changed_since(store.attributes.get("versions", {})):

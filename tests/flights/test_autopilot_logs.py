@@ -312,27 +312,6 @@ def test_names_that_a_terminal_would_obey(tmp_path):
 
 
 @pytest.mark.skipif(not ULOG.exists(), reason=ABSENT)
-def test_the_real_ulog_has_all_its_messages():
-    # Counted once more by hand: the file is whole, so each message leads to the next.
-    data, at, names, counts = ULOG.read_bytes(), 16, {}, {}
-    while at + 3 <= len(data):
-        size, kind = struct.unpack_from("<HB", data, at)
-        body = data[at + 3 : at + 3 + size]
-        if kind == ord("A"):
-            names[struct.unpack_from("<H", body, 1)[0]] = (body[3:].decode(), body[0])
-        elif kind == ord("D"):
-            key = names[struct.unpack_from("<H", body)[0]]
-            counts[key] = counts.get(key, 0) + 1
-        at += 3 + size
-    (log,) = open_flights(ULOG)
-    several = {name for name, instance in counts if instance}
-    wanted = {f"{n}[{i}]" if n in several else n: count for (n, i), count in counts.items()}
-    assert {topic.name: topic.times.size for topic in log.topics} == wanted
-    q = np.array([log.channel(f"vehicle_attitude.q[{i}]").values for i in range(4)])
-    np.testing.assert_allclose(np.linalg.norm(q, axis=0), 1.0, atol=1e-6)
-
-
-@pytest.mark.skipif(not ULOG.exists(), reason=ABSENT)
 def test_the_numbers_are_pyulogs():
     pyulog = pytest.importorskip("pyulog", reason="pyulog is not installed")
     (log,) = open_flights(ULOG)

@@ -219,13 +219,6 @@ def test_a_counter_of_32_bits_goes_on_and_other_faults_are_refused_with_their_li
             read(stamped(tmp_path, [f"{s:.3f}" for s in stamps]))
 
 
-def test_rows_of_one_time_are_counted(tmp_path):
-    path = written(tmp_path, [row for row in ROWS for _ in range(2)])
-    with pytest.raises(InputError, match="300 of 600"):
-        read(path)
-    assert "300 of 600" in clock(path).problem
-
-
 def test_a_step_of_the_clock_is_told_with_its_time():
     t = 0.01 * np.arange(6000)
     t[3000:] += 0.1

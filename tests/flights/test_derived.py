@@ -228,19 +228,3 @@ def test_the_phase_turns_the_axes():
 def test_no_swashplate(angles, changes):
     with pytest.raises(ValueError, match="expected"):
         plate(angles, **changes)
-
-
-def test_an_angle_that_jumps_is_told_with_its_remedy(tmp_path):
-    path = tmp_path / "log.csv"
-    heading = (350 + np.arange(60)) % 360
-    rows = [f"{i / 50:.2f},{i % 7},{h}" for i, h in enumerate(heading)]
-    path.write_text("\n".join(["t,u,heading", *rows]))
-    asked = {"time": "t", "inputs": {"u": Signal("u", "1", "1")}}
-    jumping = read_flight(path, **asked, outputs={"yaw": Signal("heading", "deg", "rad")})
-    (note,) = jumping.source.notes
-    assert (note.code, note.value) == ("angles.unwrapped", 1)
-    np.testing.assert_allclose(np.rad2deg(jumping.outputs["yaw"]), 350 + np.arange(60))
-    whole = Signal("unwrap(heading, 360)", "deg", "rad")
-    flight = read_flight(path, **asked, outputs={"yaw": whole})
-    assert flight.source.notes == ()
-    np.testing.assert_allclose(np.rad2deg(flight.outputs["yaw"]), 350 + np.arange(60))

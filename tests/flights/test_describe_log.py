@@ -8,7 +8,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from heli_jax import log_output
 from heli_jax.errors import InputError
 from heli_jax.flights import Gap, Signal, describe_log, read_flight
 
@@ -27,18 +26,6 @@ def test_columns_of_a_csv(tmp_path):
     assert info.time is not None
     assert (info.time.column, info.time.duration, info.time.rate) == ("time", 3.0, 1.0)
     assert info.time.uniform
-
-
-def test_a_single_cell_of_text_among_numbers_is_named(tmp_path, capsys):
-    path = tmp_path / "log.csv"
-    rows = [f"{k / 100},{'ERR' if k == 40 else k},{'on' if k % 2 else 'off'}" for k in range(100)]
-    path.write_text("\n".join(["t,x,mode", *rows]))
-    x, mode = describe_log(path).columns[1:]
-    assert (x.kind, x.strays) == ("text", "1 of 100 is no number: 'ERR' in line 42")
-    assert (mode.kind, mode.strays) == ("text", "")
-    log_output.print_flights([describe_log(path)])
-    lines = capsys.readouterr().out.splitlines()
-    assert any(n.split() == ["t", "0", "0.99", "0.495", "0"] for n in lines)
 
 
 def test_gaps_and_unit_of_the_clock(tmp_path):

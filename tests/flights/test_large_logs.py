@@ -18,21 +18,8 @@ import scipy.io
 from heli_jax import stages
 from heli_jax.errors import InputError
 from heli_jax.flights import parquet_table
-from heli_jax.flights.digest import Digest
 from heli_jax.flights.open_log import open_log, open_table
 from tests.flights import log_writers as writers
-
-
-@pytest.mark.parametrize("size", [0, 10, 5_000_001])
-def test_the_fingerprint_is_that_of_hashlib(tmp_path, size):
-    data = np.random.default_rng(0).bytes(size)
-    path = tmp_path / "log"
-    path.write_bytes(data)
-    expected = hashlib.sha256(data).hexdigest()
-    assert Digest(data).hex() == expected
-    digest = Digest(path)
-    digest.begin()
-    assert digest.hex() == expected
 
 
 def test_a_tables_fingerprint_is_the_files(tmp_path):
@@ -120,20 +107,6 @@ def test_a_few_bytes_claim_no_memory(tmp_path, name, write):
     write(tmp_path / name)
     with pytest.raises(InputError):
         open_table(tmp_path / name).survey()
-
-
-def test_columns_that_are_not_plain_are_found_among_those_that_are(tmp_path):
-    path = tmp_path / "log.csv"
-    rows = "".join(f"{i},{i / 8},{'AUTO' if i % 2 else ''},+{i}\r\n" for i in range(20))
-    path.write_bytes(b"\xef\xbb\xbft,x,mode,y\r\n" + rows.encode())
-    t, x, mode, y = open_table(path).survey()
-    assert t.name == "t"
-    np.testing.assert_array_equal(x.values, np.arange(20) / 8)
-    assert (mode.values, mode.n_filled) == (None, 10)
-    np.testing.assert_array_equal(y.values, np.arange(20.0))
-    german = tmp_path / "german.csv"
-    german.write_text("t;x\n" + "".join(f"{i};{i},25\n" for i in range(20)))
-    np.testing.assert_array_equal(open_table(german).numbers(["x"])["x"], np.arange(20) + 0.25)
 
 
 class Heard:

@@ -89,7 +89,7 @@ def test_texts_that_name_no_columns_are_left_alone(tmp_path: Path) -> None:
         assert open_table(saved(tmp_path / "a.mat", y=two, **others)).names == ("y[0]", "y[1]")
 
 
-def test_hdf5_has_names_in_data_sets_and_attributes(tmp_path: Path) -> None:
+def test_hdf5_has_names_in_data_sets(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         group = file.create_group("df")  # as pandas writes a frame
@@ -97,11 +97,8 @@ def test_hdf5_has_names_in_data_sets_and_attributes(tmp_path: Path) -> None:
         group["axis1"] = np.arange(N)
         group["block0_items"] = np.array(NAMES, "S")
         group["block0_values"] = TABLE
-        file["log"] = TABLE
-        file["log"].attrs["columns"] = NAMES
         file.attrs["fs"] = 50.0
     check(path, "df/block0_values.")
-    check(path, "log.")
     info = describe_log(path)
     assert info.time is not None
     assert info.time.column == "df/block0_values.t"

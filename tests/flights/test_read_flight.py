@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -179,20 +179,9 @@ def test_no_bytes_break_the_reader(tmp_path_factory, data, ending):
 
 @settings(max_examples=60, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255))
+@example(0.55078125, 128)  # in the name of a column
+@example(569 / 1266, 182)  # pyarrow ends the process where the metadata of this column are asked
 def test_no_damaged_parquet_breaks_the_reader(tmp_path_factory, place, byte):
-    damaged_parquet(tmp_path_factory, place, byte)
-
-
-def test_a_parquet_column_whose_name_is_damaged(tmp_path_factory):
-    damaged_parquet(tmp_path_factory, 0.55078125, 128)
-
-
-def test_damaged_statistics_of_a_parquet_column(tmp_path_factory):
-    """pyarrow ends the process where the metadata of this column are asked."""
-    damaged_parquet(tmp_path_factory, 569 / 1266, 182)
-
-
-def damaged_parquet(tmp_path_factory, place, byte):
     path = tmp_path_factory.getbasetemp() / "damaged.parquet"
     pq.write_table(pa.table({"t": T, "stick": STICK, "phi": PHI}), path)
     data = bytearray(path.read_bytes())

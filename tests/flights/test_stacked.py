@@ -46,11 +46,8 @@ def flights(path: Path, u: str = "u", y: str = "x[1]", **options):
         (".npz", {"t": TIMES, "x": X, "u": U}),
         (".mat", {"t": TIMES, "x": X, "u": U}),
         (".h5", {"t": TIMES, "x": X, "u": U}),
-        # One clock for all; channels before samples; pages of MATLAB; samples first.
+        # One clock for all.
         (".npz", {"t": T, "x": X, "u": U}),
-        (".npz", {"t": TIMES, "x": X.transpose(0, 2, 1), "u": U.transpose(0, 2, 1)}),
-        (".mat", {"t": TIMES.T, "x": X.transpose(1, 2, 0), "u": U.transpose(1, 2, 0)}),
-        (".npz", {"t": TIMES.T, "x": X.transpose(1, 0, 2), "u": U.transpose(1, 0, 2)}),
         # A channel by itself is a matrix.
         (".npz", {"t": TIMES, "x": X, "u": U[:, :, 0]}),
     ],

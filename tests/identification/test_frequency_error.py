@@ -37,7 +37,7 @@ from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.report.method_content import methods_content
+from heli_jax.report.document import MethodsCompared, written
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
 
 DT = 0.02
@@ -173,8 +173,8 @@ def test_methods_are_laid_side_by_side(by):
     a, b = main.estimates["If"], other.estimates["If"]
     apart = (b.value - a.value) / (a.sd**2 + b.sd**2) ** 0.5
     assert compared.difference(results[1], "If") == pytest.approx(apart, rel=1e-12)
-    written = methods_content(compared)["results"]
-    assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
+    content = written(MethodsCompared, compared)["results"]
+    assert content["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
     # A delay that was free beside them is compared too.
     late = [
         r._replace(fit=dataclasses.replace(r.fit, nuisance={**r.fit.nuisance, "time_shift": delay}))

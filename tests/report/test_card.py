@@ -7,7 +7,6 @@ import numpy as np
 
 from heli_jax.finding import Finding
 from heli_jax.report.card import card, failed, shown, summary
-from heli_jax.report.tables import prior_note
 
 
 def test_a_sound_fit_passes(sound):
@@ -27,16 +26,6 @@ def test_a_sound_fit_passes(sound):
         assert math.isclose(by["Cramér-Rao", name].value, 100 * estimate.sd / estimate.value)
         # Known others can only help.
         assert by["insensitivity", name].value <= by["Cramér-Rao", name].value * (1 + 1e-9)
-
-
-def test_the_prior_share_of_a_parameter_without_a_prior_says_whose_it_is(sound):
-    fit, problem, _ = sound
-    held = fit.estimates["Ixx"]._replace(prior_share=0.17)
-    weak = dataclasses.replace(fit, estimates={**fit.estimates, "Ixx": held})
-    [line] = [g for g in card(problem, weak) if g.what == "prior share"]
-    assert "it has none itself" in line.remark
-    assert prior_note(problem, fit) == ""
-    assert prior_note(problem, weak).startswith("Ixx: the prior share is that of the weak priors")
 
 
 def test_a_correlation_keeps_its_sign_and_the_digits_that_tell_it_from_one(sound):

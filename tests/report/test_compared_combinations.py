@@ -46,15 +46,3 @@ def test_a_ratio_of_two_estimates_needs_their_correlation(tmp_path: Path) -> Non
     assert row([a, b])[1] == "200.0 ± 7.2"
     c = write_run(tmp_path / "c", both)
     assert row([a, c])[1] == "–"
-
-
-def test_what_a_run_cannot_say_of_a_ratio(tmp_path: Path) -> None:
-    a = write_run(tmp_path / "a", OPEN, determined_combinations=[RATIO])
-    neither = write_run(tmp_path / "b", OPEN)
-    without = write_run(tmp_path / "c", {"If": (1e-4, 1e-5)})
-    stopped = write_run(
-        tmp_path / "d", {"Ixx": (0.025, 0.001)}, constants={"a": 5.0}, status="not-converged"
-    )
-    assert row([a, neither])[1] == "not determined"
-    assert row([a, without])[1] == "–"
-    assert row([a, stopped])[1] == "not converged"

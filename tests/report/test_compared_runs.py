@@ -5,7 +5,6 @@ import io
 import json
 import math
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 
 from heli_jax import cli, compare_runs, load_fit
 from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate
 from heli_jax.report import compared_page
 
 METRICS = dict.fromkeys(
@@ -25,21 +25,11 @@ def write_run(
 ) -> Path:
     """A run directory with what `load_fit` reads, its numbers made up."""
     folder.mkdir(parents=True)
-    parameters = {
-        name: {
-            "value": value,
-            "sd": sd,
-            "lower95": None if sd is None else value - 1.96 * sd,
-            "upper95": None if sd is None else value + 1.96 * sd,
-            "unit": "kg m^2",
-            "start": 1.0,
-            "prior_share": 0.0,
-            "at_bound": False,
-            "sd_white": sd,
-            "sd_alone": sd,
-        }
-        for name, (value, sd) in estimates.items()
-    }
+    parameters = {}
+    for name, (value, sd) in estimates.items():
+        ends = (None, None) if sd is None else (value - 1.96 * sd, value + 1.96 * sd)
+        made = Estimate(value, sd, *ends, "kg m^2", 1.0, 0.0, at_bound=False, sd_white=sd)
+        parameters[name] = made._asdict()
     content = {
         "model": "roll",
         "method": "output-error",
@@ -92,17 +82,6 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert ("compared.one-log", ("a1", "a2")) in said
 
 
-def test_on_a_narrow_terminal_each_piece_says_which_metric(tmp_path, monkeypatch, capsys) -> None:
-    runs = [write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}) for name in "abcdef"]
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", "60")
-    assert cli.main(["compare", *map(str, runs)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    shown = [line.split() for line in lines if line.startswith(" p ")]
-    assert len(shown) == 6
-    assert all(row[:2] == ["p", "fitted"] and row[2] in ("VAF", "fit", "TIC") for row in shown)
-
-
 @pytest.mark.parametrize(("window", "shared"), [([10.0, 20.0], False), ([9.0, 20.0], True)])
 def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window, shared) -> None:
     def run(name: str, part: list[float]) -> Path:
@@ -111,16 +90,6 @@ def test_parts_of_a_log_without_a_common_sample_are_independent(tmp_path, window
 
     compared = compare_runs([run("a", [0.0, 10.0]), run("b", window)])
     assert ("compared.one-log" in {n.code for n in compared.notes}) == shared
-
-
-def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
-    summary = "no (VAF of p is 20.0 %)"
-    limited = {"adequacy": {"summary": summary}, "residuals": {"overconfident": True}}
-    a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)}, **limited)
-    b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)})
-    compared = compare_runs([a, b])
-    assert [row[-1] for row in compared.verdicts.rows] == [summary, "yes"]
-    assert ("compared.overconfident", ("a",)) in [(n.code, n.subjects) for n in compared.notes]
 
 
 def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path, capsys) -> None:
@@ -140,9 +109,7 @@ def test_what_is_not_to_be_trusted_is_said_of_compared_and_listed_fits(tmp_path,
 
 def test_what_flights_share_is_compared_too(tmp_path: Path) -> None:
     def of(value: float, sd: float | None, unit: str, *, at_bound: bool = False) -> dict:
-        numbers = {"value": value, "sd": sd, "lower95": None, "upper95": None, "start": 1.0}
-        numbers |= {"sd_white": sd, "sd_alone": sd, "prior_share": 0.0}
-        return numbers | {"unit": unit, "at_bound": at_bound}
+        return Estimate(value, sd, None, None, unit, 1.0, 0.0, at_bound)._asdict()
 
     a = {"sigma_w": of(2.0, 0.3, "rad/s^2"), "flight 1/bias p": of(0.1, 0.1, "rad/s")}
     b = {"sigma_w": of(0.0, None, "rad/s^2", at_bound=True), "time_shift": of(0.05, 0.01, "s")}
@@ -240,35 +207,6 @@ def test_damaged_signals_end_in_a_sentence(tmp_path: Path, signals: bytes) -> No
     (run / "signals.csv").write_bytes(signals)
     with pytest.raises(InputError):
         load_fit(run)
-
-
-def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None:
-    a = write_run(tmp_path / "a", {"K": (2.0, 0.1)}, instruments=["lat"])
-    b = write_run(tmp_path / "b", {"K": (2.0 - 1e-9, 0.1)})
-    c = write_run(tmp_path / "c", {"K": (5.0, 0.1)}, status="not-converged")
-    compared = compare_runs([a, b, c])
-    ((_, _, _, lost, apart, *_),) = compared.estimates.rows
-    assert lost == "not converged"
-    assert apart == "0.0"  # and not -0.0
-    assert [row[2] for row in compared.verdicts.rows][:2] == [
-        "output-error by instrument (lat)",
-        "output-error",
-    ]
-    assert compared.notes[0].code == "compared.joint-sd"
-    assert "one standard deviation" in compared.to_latex()
-    assert np.isnan(compared.to_dataframe().set_index("run").loc["c", "sd"])
-
-
-def test_one_run_that_diverges_leaves_the_others_their_axes(tmp_path: Path) -> None:
-    runs = [write_run(tmp_path / n, {"K": (2.0, 0.1)}) for n in ("a1", "a2")]
-    signals = (runs[1] / "signals.csv").read_text().splitlines()
-    signals = [signals[0], *(f"{line.rsplit(',', 1)[0]},1e14" for line in signals[1:])]
-    (runs[1] / "signals.csv").write_text("\n".join(signals))
-    ((name, output, found),) = compared_page._overlaps(compare_runs(runs))
-    (ax,) = compared_page._overlay(found, name, output, "rad/s").axes
-    assert max(map(abs, ax.get_ylim())) < 10.0
-    assert ax.get_ylabel() == "p [rad/s]"
-    assert any("diverges" in str(line.get_label()) for line in ax.get_lines())
 
 
 def test_latex_has_powers_of_ten_and_no_bare_special_characters(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Figures: nothing empty, no peak lost, bands where they belong, curves on one phase branch."""
 
-import itertools
-
 import matplotlib
 import matplotlib.image
 import numpy as np
@@ -16,8 +14,7 @@ from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.fit import Signals, StartRow
 from heli_jax.identification.validation.metrics import lags_for
 from heli_jax.report import card, figures, frequency, style
-from heli_jax.report.coherence import Coherence, _spectra
-from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.frequency import Coherence, FittedFlight, _spectra
 
 
 def noise_signals(n=900, inputs=("x_roll",), seed=0):
@@ -98,19 +95,6 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
         assert pixels.std() > 0.02
 
 
-def test_labels_carry_units(sound):
-    fit, problem, _ = sound
-    top, below, stick = figures.response(fit.signals[0], "roll", problem.model)
-    assert top.get_ylabel() == "roll [rad]"
-    assert below.get_ylabel() == "residual [rad]"
-    assert stick.get_ylabel() == "x_roll [m]"
-    assert stick.get_xlabel() == "time in the log [s]"
-
-
-def test_one_start_is_no_waterfall():
-    assert figures.waterfall((StartRow({"a": 1.0}, {"a": 2.0}, 1.0, 3, True, 1),)) == ()
-
-
 def test_waterfall_marks_failures_and_spans_decades():
     rows = tuple(
         StartRow({}, {}, cost, 1, ok, k)
@@ -123,7 +107,7 @@ def test_waterfall_marks_failures_and_spans_decades():
     assert converged.tolist() == [1.0, 9.0]
     assert failed[0] == 1e3
     assert np.isfinite(failed).all()
-    assert {t.get_text() for t in ax.texts} >= {"optimum 1", "optimum 2"}
+    assert figures.waterfall(rows[:1]) == ()
 
 
 def test_sampled_response_is_that_of_c2d(sound):
@@ -182,38 +166,12 @@ def test_a_slow_mode_leaves_the_response_from_two_periods_of_a_segment_on():
         assert f"Hz ({found.lowest:.2g} rad/s) on" in said.remark
 
 
-def test_empirical_response_says_why_it_is_missing():
-    still = frequency.empirical(np.zeros(4000), np.ones(4000), 0.02, 1.0)
-    short = frequency.empirical(np.arange(100.0), np.ones(100), 0.02, 1.0)
-    assert still == "the input does not move"
-    assert isinstance(short, str)
-    assert "segments" in short
-
-
-def test_bode_says_why_the_record_is_missing(sound):
+def test_a_record_may_have_no_response(sound):
+    assert isinstance(frequency.empirical(np.zeros(4000), np.ones(4000), 0.02, 1.0), str)
+    assert isinstance(frequency.empirical(np.arange(100.0), np.ones(100), 0.02, 1.0), str)
     fit, problem, baseline = sound
-    s = fit.signals[0]
-    s = s._replace(inputs={"x_roll": np.zeros_like(s.times)})
-    axes = figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline)
-    assert len(axes) == 2
-    notes = " ".join(t.get_text() for t in axes[0].texts)
-    assert "no empirical response: the input does not move" in notes
-
-
-def test_bode_s_legend_title_and_subtitle_have_rows_of_their_own(sound):
-    fit, problem, baseline = sound
-    flight = FittedFlight(problem.model, fit.params, fit, fit.signals[0])
-    with matplotlib.rc_context(style.STYLE):
-        ax = figures.bode(flight, baseline)[0]
-        ax.figure.canvas.draw()  # only now texts have their places
-        [note] = [t for t in ax.texts if "record" in t.get_text()]
-        # From below; the legend's words, for its box has an unseen margin.
-        rows = [*ax.get_legend().get_texts()[:1], note, ax._left_title]
-        extents = [row.get_window_extent() for row in rows]
-    assert ax.bbox.y1 < extents[0].y0
-    for lower, upper in itertools.pairwise(extents):
-        assert lower.y1 < upper.y0
-    assert extents[-1].y1 < ax.figure.bbox.y1
+    s = fit.signals[0]._replace(inputs={"x_roll": np.zeros_like(fit.signals[0].times)})
+    assert len(figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline)) == 2
 
 
 def test_phase_begins_on_one_branch():
@@ -221,9 +179,3 @@ def test_phase_begins_on_one_branch():
     assert frequency.phase(turns)[0] == pytest.approx(-180.0)
     assert frequency.phase(turns)[-1] == pytest.approx(-900.0)
     assert frequency.phase(-turns)[0] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_style_does_not_leak():
-    before = dict(matplotlib.rcParams)
-    style.save(lambda: None, None)  # type: ignore[arg-type]
-    assert dict(matplotlib.rcParams) == before

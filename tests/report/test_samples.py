@@ -12,7 +12,7 @@ from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Convergence, Posterior
 from heli_jax.report import figures, tables
 from heli_jax.report.drawings import Analysis, drawings
-from heli_jax.report.figures.samples import coordinate, gaussian_ellipse, share_within
+from heli_jax.report.figures.estimates import coordinate, gaussian_ellipse, share_within
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.html import write_report
 from heli_jax.report.origin import Origin
@@ -138,7 +138,6 @@ def test_the_page_shows_chains_pairs_and_their_diagnostics(white, sampled, tmp_p
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'href="posterior.nc"' in page
     assert 'href="bootstrap.nc"' in page
-    assert "4 chains of 300 draws, 1 divergent" in page
     assert "Within the Gaussian 95 % curve: Ixx and If 9" in page
     assert len(page) < 700_000
     table = tables.sampling(sampled.posterior)

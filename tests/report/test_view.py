@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from heli_jax import models
 from heli_jax.dynamics.helicopter import HelicopterInputs, HelicopterOutputs
-from heli_jax.report import animation, manoeuvre
-from heli_jax.report.embedded import Numbers
+from heli_jax.report import figures
+from heli_jax.report import view as page_view
+from heli_jax.report.charts import Numbers
 from heli_jax.report.view import write_view
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.vehicle import load_vehicle
@@ -56,7 +57,7 @@ def xcell(vehicles_folder):
 )
 def test_the_shape_turns_as_the_machine_does(angle, part, expected):
     states = SimpleNamespace(**{"phi": 0.0, "theta": 0.0, "psi": 0.0, angle: 0.3})
-    shape = animation.placed(np.array([part], float), animation.attitude(states), np.zeros(3))
+    shape = page_view.placed(np.array([part], float), page_view.attitude(states), np.zeros(3))
     np.testing.assert_allclose(shape[0], expected, atol=1e-12)
 
 
@@ -66,8 +67,8 @@ def test_the_mast_points_where_the_thrust_does(xcell):
     x = HELICOPTER.State(**{f: at.get(f, 0.0) for f in HELICOPTER.State._fields})
     rates = HELICOPTER.vector_field(xcell, x, HelicopterInputs(0.0, 0.0, 0.0, 0.5))
     pull = np.array([rates.dx, rates.dy, rates.dz + xcell.g])
-    up = animation.placed(
-        np.array([[0.0, 0.0, -1.0]]), animation.attitude(SimpleNamespace(**at)), np.zeros(3)
+    up = page_view.placed(
+        np.array([[0.0, 0.0, -1.0]]), page_view.attitude(SimpleNamespace(**at)), np.zeros(3)
     )[0]
     np.testing.assert_allclose(up * [1, -1, 1], pull / np.linalg.norm(pull), atol=1e-9)
 
@@ -87,7 +88,7 @@ def test_the_scene_follows_the_run(xcell):
     t = 0.02 * np.arange(1000)
     run = flown(1000, x=2.0 * t, y=0.5 * t, z=0.1 * t, phi=0.2 * np.sin(t), psi=0.6 * t)
     numbers = Numbers()
-    made = animation.scene(run, xcell, numbers)
+    made = page_view.scene(run, xcell, numbers)
     content = numbers.content()
     path = np.array([decoded(content, n) for n in made["path"]])
     np.testing.assert_allclose(path, [2.0 * t, -0.5 * t, 0.1 * t], atol=1e-3)
@@ -98,25 +99,18 @@ def test_the_scene_follows_the_run(xcell):
     assert np.max((Rotation.from_quat(turns) * expected.inv()).magnitude()) < 2e-4
     disk = np.array(made["parts"][1]["points"])
     radius = np.linalg.norm(disk[1:] - disk[0], axis=1)
-    assert radius == pytest.approx(animation.size_of(run, float(xcell.R)) * float(xcell.R), 1e-3)
+    assert radius == pytest.approx(page_view.size_of(run, float(xcell.R)) * float(xcell.R), 1e-3)
     for (low, high), ticks in zip(np.transpose(made["bounds"]), made["ticks"], strict=True):
         assert 3 <= len(ticks) <= 8
         assert low <= ticks[0] < ticks[-1] <= high
-
-
-@pytest.mark.parametrize("n", [2, 3, 2999, 3000, 3001, 50000])
-def test_a_scene_thins_the_record(n):
-    kept = animation.moments_of(n)
-    assert (kept[0], kept[-1]) == (0, n - 1)
-    assert kept.size == min(n, animation.MOST_MOMENTS)
 
 
 def test_figures_show_everything_and_shade_what_was_left():
     t = 0.02 * np.arange(300)
     run = flown(z=np.sin(t), Omega=150 + t)
     for axes, labels in (
-        (manoeuvre.motion(run, HELICOPTER), ["attitude", "rates", "position", "velocity"]),
-        (manoeuvre.sticks(run, HELICOPTER), ["sticks [mm]", "sticks [–]", "rotor speed [rad/s]"]),
+        (figures.motion(run, HELICOPTER), ["attitude", "rates", "position", "velocity"]),
+        (figures.sticks(run, HELICOPTER), ["sticks [mm]", "sticks [–]", "rotor speed [rad/s]"]),
     ):
         assert len(axes) == len(labels)
         for ax, text in zip(axes, labels, strict=True):
@@ -170,17 +164,17 @@ def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
     assert "canvas" not in Links(text).tags
     assert Links(text).tags.count("img") == 2
     assert "needs the whole helicopter" in words(text)
-    [ax] = manoeuvre.sticks(run, model)
+    [ax] = figures.sticks(run, model)
     assert ax.get_ylabel() == "x_roll [µm]"
 
 
 def test_what_is_nearly_constant_is_not_blown_up_to_its_panel():
     t = 0.02 * np.arange(300)
     run = flown(phi=1e-9 * np.sin(t), Omega=150 + 0.01 * np.sin(t), z=np.sin(t))
-    attitude, _, position, _ = manoeuvre.motion(run, HELICOPTER)
+    attitude, _, position, _ = figures.motion(run, HELICOPTER)
     assert np.ptp(attitude.get_ylim()) == pytest.approx(1.1 * 0.005)
     # What moves keeps matplotlib's own limits, 5 % beside its range.
     assert np.ptp(position.get_ylim()) == pytest.approx(1.1 * np.ptp(np.sin(t)), rel=1e-2)
-    rotor = manoeuvre.sticks(run, HELICOPTER)[-1]
+    rotor = figures.sticks(run, HELICOPTER)[-1]
     assert np.ptp(rotor.get_ylim()) == pytest.approx(1.1 * 0.05 * 150.01, rel=1e-3)
     assert np.mean(rotor.get_ylim()) == pytest.approx(150.0, abs=0.02)

@@ -45,25 +45,6 @@
     return splits.map(v => v == null ? null : String(+v.toFixed(8)).replace("-", "−"));
   }
 
-  // Where a panel has its numbers, as in the figures' files: angles in parts of a right angle, and two at least.
-  function levels(low, high, most, degrees) {
-    if (!(high > low)) return [];
-    const least = (high - low) / most, tens = v => 10 ** Math.floor(Math.log10(v));
-    const round = v => [0.5, 1, 2, 5, 10, 20].map(f => f * tens(v));
-    const steps = degrees && least > 0.2 ? [1, 2, 5, 15, 30, 45, 90, 180, ...round(least / 360).filter(n => n >= 1).map(n => 360 * n)] : round(least);
-    let before = [];
-    for (const step of steps) {
-      const first = Math.ceil(low / step - 1e-9), last = Math.floor(high / step + 1e-9);
-      if (last - first < most) {
-        const found = Array.from({ length: last - first + 1 }, (_, k) => (first + k) * step);
-        // One number tells no size.
-        return found.length > 1 ? found : [...new Set([...before, ...found])].sort((a, b) => a - b);
-      }
-      before = [first * step, last * step];
-    }
-    return before;
-  }
-
   // As many digits as the range leaves sense to: five.
   function text(value, span) {
     if (value == null || !Number.isFinite(value)) return "–";
@@ -90,7 +71,7 @@
     const tables = [], of = [];
     for (const s of panel.series) {
       const table = [array(s.x), array(s.y)];
-      const extra = "low" in s ? [array(s.low), array(s.high)] : [];
+      const extra = s.low != null ? [array(s.low), array(s.high)] : [];
       of.push(extra.length);
       tables.push([...table, ...extra]);
     }
@@ -175,14 +156,14 @@
     const unit = (/\[(.*)\]$/.exec(panel.label) ?? [])[1]?.replace("–", "");
     const { list, bands, bars } = seriesOf(panel, of, unit);
     const x0 = data[0][0], x1 = data[0].at(-1);
-    list[0] = { label: last ? chart.xLabel.replace(/ \[.*/, "") : "", class: last ? "listed" : "unlisted",
-      value: (u, v) => v == null ? "–" : `${text(v, u.scales.x.max - u.scales.x.min)} ${(/\[(.*)\]/.exec(chart.xLabel) ?? [])[1] ?? ""}` };
+    list[0] = { label: last ? chart.x_label.replace(/ \[.*/, "") : "", class: last ? "listed" : "unlisted",
+      value: (u, v) => v == null ? "–" : `${text(v, u.scales.x.max - u.scales.x.min)} ${(/\[(.*)\]/.exec(chart.x_label) ?? [])[1] ?? ""}` };
     // What x will be: the plot itself has that only after y has been ranged, so at first nothing.
-    let across = chart.xLimits;
-    const xRange = (u, low, high) => across = low === x0 && high === x1 ? chart.xLimits : [low, high];
+    let across = chart.x_limits;
+    const xRange = (u, low, high) => across = low === x0 && high === x1 ? chart.x_limits : [low, high];
     // The limits of the figure while all is seen; zoomed, what is seen.
     const range = (u, low, high) => {
-      const [first, last] = chart.xLimits, hair = 1e-9 * (last - first);
+      const [first, last] = chart.x_limits, hair = 1e-9 * (last - first);
       const whole = across[0] <= first + hair && across[1] >= last - hair;
       if (whole || low == null) return panel.limits;
       // What stands still is shown with room for ticks of its own size, and not from -1 to 1.
@@ -194,9 +175,9 @@
     const u = new uPlot({
       width: Math.max(260, place.clientWidth), height: panel.height + (last ? 52 : 10),
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
-      scales: { x: { time: false, distr: chart.log ? 3 : 1, range: xRange }, y: { range } },
-      axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.xLabel : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
-        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 16, splits: (u, i, low, high) => levels(low, high, Math.max(3, Math.floor(u.bbox.height / uPlot.pxRatio / 20)), panel.label.endsWith("[deg]")), values: (u, splits) => ticks(splits) }],
+      scales: { x: { time: false, distr: chart.logarithmic ? 3 : 1, range: xRange }, y: { range } },
+      axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.x_label : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.logarithmic ? decades : undefined, filter: chart.logarithmic ? (u, s) => s : undefined,
+        values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 20, values: (u, splits) => ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {
@@ -215,21 +196,21 @@
   const inGroup = chart => groups.get(chart.group);
   const own = chart => inGroup(chart).find(u => u.chart === chart);
   const zoom = (chart, low, high) => inGroup(chart).forEach(u => u.setScale("x", { min: low, max: high }));
-  const reset = chart => inGroup(chart).forEach(u => u.setScale("x", { min: u.chart.xLimits[0], max: u.chart.xLimits[1] }));
+  const reset = chart => inGroup(chart).forEach(u => u.setScale("x", { min: u.chart.x_limits[0], max: u.chart.x_limits[1] }));
 
   // Of a logarithmic axis in powers: half of it is half of its decades.
   function closer(chart, factor, about) {
     const { min, max } = own(chart).scales.x;
-    const to = chart.log ? Math.log : v => v, back = chart.log ? Math.exp : v => v;
-    const a = to(min), b = to(max), [first, last] = chart.xLimits.map(to), m = about == null ? (a + b) / 2 : to(about);
+    const to = chart.logarithmic ? Math.log : v => v, back = chart.logarithmic ? Math.exp : v => v;
+    const a = to(min), b = to(max), [first, last] = chart.x_limits.map(to), m = about == null ? (a + b) / 2 : to(about);
     const low = Math.max(first, m - (m - a) * factor), high = Math.min(last, m + (b - m) * factor);
     zoom(chart, back(low), back(high));
   }
 
   function pan(chart, part) {
     const { min, max } = own(chart).scales.x;
-    const to = chart.log ? Math.log : v => v, back = chart.log ? Math.exp : v => v;
-    const [a, b, first, last] = [min, max, ...chart.xLimits].map(to);
+    const to = chart.logarithmic ? Math.log : v => v, back = chart.logarithmic ? Math.exp : v => v;
+    const [a, b, first, last] = [min, max, ...chart.x_limits].map(to);
     const by = Math.max(first - a, Math.min(last - b, part * (b - a)));
     zoom(chart, back(a + by), back(b + by));
   }
@@ -289,7 +270,7 @@
     // Of a figure without any line the image says as much.
     if (!chart.panels.some(p => p.series.length)) return;
     // Figures over the same quantity move together; over time those of one flight.
-    chart.group = (chart.xLabel || "x") + (chart.of ? `, ${chart.of}` : "");
+    chart.group = (chart.x_label || "x") + (chart.of ? `, ${chart.of}` : "");
     const box = document.createElement("div");
     box.className = "live";
     box.tabIndex = 0;

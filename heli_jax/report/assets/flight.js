@@ -298,7 +298,7 @@
     seen?.keyOfPage(event);
   });
   listen((chart, time) => {
-    if (chart.xLabel !== TIME) return;
+    if (chart.x_label !== TIME) return;
     for (const f of flights) { f.stop(); f.show(time, true); }
   });
   window.heliFlights = flights;

@@ -1,29 +1,42 @@
-"""The report's figures: plain data in, matplotlib Axes out.
+"""The report's figures: plain data in, Matplotlib Axes out, each on a figure of its own.
 
-Each function draws on the `figure` it is given, or on one of its own (`axes[0].figure`). Draw
-within `matplotlib.rc_context(style.STYLE)` to get the report's look.
+Draw within `style.in_style()` to get the report's look.
 """
 
-from heli_jax.report.figures.estimates import correlation_matrix, intervals, waterfall
-from heli_jax.report.figures.frequency_domain import bode, bode_unit
-from heli_jax.report.figures.match import match
-from heli_jax.report.figures.panels import Panels
-from heli_jax.report.figures.residuals import residual_correlation
-from heli_jax.report.figures.samples import bootstrap_pairs, posterior_pairs, trace
-from heli_jax.report.figures.time_domain import response, rls_history
+from heli_jax.report.figures.bode import bode, bode_overlay, bode_unit, draw_response, match
+from heli_jax.report.figures.estimates import (
+    bootstrap_pairs,
+    correlation_matrix,
+    intervals,
+    posterior_pairs,
+    trace,
+    waterfall,
+)
+from heli_jax.report.figures.signals import (
+    motion,
+    residual_correlation,
+    response,
+    rls_history,
+    sticks,
+    time_label,
+)
 
 __all__ = [
-    "Panels",
     "bode",
+    "bode_overlay",
     "bode_unit",
     "bootstrap_pairs",
     "correlation_matrix",
+    "draw_response",
     "intervals",
     "match",
+    "motion",
     "posterior_pairs",
     "residual_correlation",
     "response",
     "rls_history",
+    "sticks",
+    "time_label",
     "trace",
     "waterfall",
 ]

@@ -1,45 +1,34 @@
-"""Figures of the estimates: their correlation, their intervals, and what each start reached."""
+"""Figures of the estimates: correlation, intervals, what each start reached, what was sampled."""
 
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.result import Fit, StartRow
+from heli_jax.identification.result import Estimate, Fit, StartRow
+from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.report import style
-from heli_jax.report.figures.panels import Panels, panels
-from heli_jax.report.style import legend_above, subtitle
+from heli_jax.report.style import Panels, legend_above, panels, subtitle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
-def correlation_matrix(verdict: Verdict, *, figure: "Figure | None" = None) -> Panels:
+def correlation_matrix(verdict: Verdict) -> Panels:
     """How the estimates of the parameters are correlated: near +1 or -1 the data cannot tell two
     of them apart."""
     names, r = verdict.names, verdict.correlation
-    n = len(names)
-    side = min(style.WIDTH, 1.5 + 0.62 * n)
-    drawing = style.figure(side, min(style.WIDTH, side + 0.5)) if figure is None else figure
-    if figure is None:
-        # Slow, but names of any length stand beside the matrix, and no fixed margin suits all.
-        drawing.set_layout_engine("constrained")
-    ax = drawing.subplots()
+    side = min(style.WIDTH, 1.5 + 0.62 * len(names))
+    # Names of any length stand beside the matrix, and no fixed margin suits all.
+    ax = style.figure(side, min(style.WIDTH, side + 0.5), constrained=True).subplots()
     # Two colours of equal weight, told apart with every common kind of colour blindness.
     ax.pcolormesh(r, cmap="PuOr", vmin=-1.0, vmax=1.0, edgecolors="white", linewidth=1.5)
     ax.set_aspect("equal")
-    _name_cells(ax, names)
-    _write_correlations(ax, r)
-    ax.set_title("Correlation of the estimates", loc="left")
-    if verdict.undetermined:
-        subtitle(ax, "directions that are not identifiable are left out")
-    return (ax,)
-
-
-def _name_cells(ax: "Axes", names: tuple[str, ...]) -> None:
     # The first parameter on top, as a matrix is read; pcolormesh counts from below.
     ax.invert_yaxis()
     centres = np.arange(len(names)) + 0.5
@@ -48,20 +37,19 @@ def _name_cells(ax: "Axes", names: tuple[str, ...]) -> None:
     ax.grid(visible=False)
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
-
-
-def _write_correlations(ax: "Axes", r: np.ndarray) -> None:
     size = 8.5 if len(r) < 9 else 6.0
     for (i, j), value in np.ndenumerate(r):
         color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
-        text = _cell_text(float(value), i == j)
+        text = "1" if i == j else _cell_text(float(value))
         ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
+    ax.set_title("Correlation of the estimates", loc="left")
+    if verdict.undetermined:
+        subtitle(ax, "directions that are not identifiable are left out")
+    return (ax,)
 
 
-def _cell_text(r: float, diagonal: bool) -> str:
-    """A correlation in two digits, five where the last ones count; 1 on the diagonal."""
-    if diagonal:
-        return "1"
+def _cell_text(r: float) -> str:
+    """A correlation in two digits, five where the last ones count."""
     if not np.isfinite(r):
         return ""
     # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
@@ -70,77 +58,43 @@ def _cell_text(r: float, diagonal: bool) -> str:
     return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
 
 
-def waterfall(starts: tuple[StartRow, ...], *, figure: "Figure | None" = None) -> Panels:
+def waterfall(starts: tuple[StartRow, ...]) -> Panels:
     """The cost that each start reached, best first; () where there is one start or none."""
     if len(starts) < 2:
         return ()
-    [ax] = panels(figure, 2.8, [1.0])
+    [ax] = panels(2.8, [1.0])
     rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost = np.array([s.cost for s in rows])
-    finite = np.isfinite(cost)
-    low, top = _cost_range(cost[finite])
+    cost, x = np.array([s.cost for s in rows]), np.arange(1, len(rows) + 1)
+    finite, ok = np.isfinite(cost), np.array([s.converged for s in rows])
+    low, top = (cost[finite].min(), cost[finite].max()) if finite.any() else (1.0, 1.0)
     logarithmic = low > 0 and top > 30 * low
     # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
     # differences where there are none.
     span = max(top - low, 0.02 * abs(top), 1e-300)
     shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
-    ok = np.array([s.converged for s in rows])
-    x = np.arange(1, len(rows) + 1)
     ax.plot(x[finite], shown[finite], color=style.PALE, lw=0.8, zorder=1)
     ax.plot(x[ok], shown[ok], "o", ms=6, color=style.BLUE, label="converged")
     if not ok.all():
         ax.plot(x[~ok], shown[~ok], "X", ms=7, color=style.VERMILLION, label="failed")
-    _number_optima(ax, rows, x, shown)
-    _scale_cost(ax, 0.5 * (top + low), span, logarithmic=logarithmic)
-    ax.set_xlim(0.4, len(rows) + 0.6)
-    style.few_ticks(ax, "x", 16, integer=True)
-    ax.set_xlabel("start, sorted by cost")
-    ax.set_ylabel("cost")
-    ax.set_title(_starts_title(rows), loc="left")
-    if not finite.all():
-        subtitle(ax, "starts that ended without a finite cost are drawn on top")
-    legend_above(ax, raised=not finite.all())
-    return (ax,)
-
-
-def _scale_cost(ax: "Axes", middle: float, span: float, *, logarithmic: bool) -> None:
     if logarithmic:
         ax.set_yscale("log")
         ax.margins(y=0.25)
         style.plain_log_ticks(ax, "y")
     else:
-        # More room above, where the optima's names stand.
-        ax.set_ylim(middle - 0.9 * span, middle + 1.1 * span)
+        ax.set_ylim(0.5 * (top + low) - 0.9 * span, 0.5 * (top + low) + 1.1 * span)
         # The cost itself, not its difference from a number that stands elsewhere on the axis.
         ax.ticklabel_format(axis="y", useOffset=False)
-
-
-def _cost_range(cost: np.ndarray) -> tuple[float, float]:
-    return (float(cost.min()), float(cost.max())) if cost.size else (1.0, 1.0)
-
-
-def _number_optima(ax: "Axes", rows: list[StartRow], x: np.ndarray, shown: np.ndarray) -> None:
-    """Name each optimum once, at the first start that reached it."""
-    named: set[int] = set()
-    for i, row in enumerate(rows):
-        # Twelve at most: further ones are far from the best, and their names would overlap.
-        if row.optimum and row.optimum not in named and len(named) < 12:
-            named.add(row.optimum)
-            ax.annotate(
-                f"optimum {row.optimum}" if len(named) < 4 else f"{row.optimum}",
-                (x[i], shown[i]),
-                xytext=(0, 9),
-                textcoords="offset points",
-                ha="left" if i == 0 else "center",
-                fontsize=8,
-            )
-
-
-def _starts_title(rows: list[StartRow]) -> str:
-    best = sum(r.optimum == 1 for r in rows)
-    failed = sum(not r.converged for r in rows)
-    text = f"{best} of {len(rows)} starts reached the best optimum"
-    return f"{text}, {failed} failed" if failed else text
+    ax.set_xlim(0.4, len(rows) + 0.6)
+    style.few_ticks(ax, "x", 16, integer=True)
+    ax.set_xlabel("start, sorted by cost")
+    ax.set_ylabel("cost")
+    best, failed = sum(r.optimum == 1 for r in rows), np.count_nonzero(~ok)
+    title = f"{best} of {len(rows)} starts reached the best optimum"
+    ax.set_title(f"{title}, {failed} failed" if failed else title, loc="left")
+    if not finite.all():
+        subtitle(ax, "starts that ended without a finite cost are drawn on top")
+    legend_above(ax, raised=not finite.all())
+    return (ax,)
 
 
 _METHODS = {
@@ -151,21 +105,12 @@ _METHODS = {
 }
 
 
-def intervals(comparison: Intervals, fit: Fit, *, figure: "Figure | None" = None) -> Panels:
-    """95 % intervals by every method, and the likelihood of the profile; one panel a parameter.
-
-    Args:
-        comparison: the intervals, by parameter and method.
-        fit: its estimates are marked.
-        figure: to draw on; a new one where None.
-    """
+def intervals(comparison: Intervals, fit: Fit) -> Panels:
+    """95 % intervals by every method, and the likelihood of the profile; one panel a parameter."""
     names = list(comparison.by_parameter)
     if not names:
         return ()
-    drawing = style.figure(1.9, style.WIDTH) if figure is None else figure
-    if figure is None:
-        drawing.set_layout_engine("constrained")
-    axes = np.atleast_1d(drawing.subplots(1, len(names)))
+    axes = np.atleast_1d(style.figure(1.9, constrained=True).subplots(1, len(names)))
     # The methods that any parameter has, so that a row is the same method in every panel.
     present = [m for m in _METHODS if any(m in by for by in comparison.by_parameter.values())]
     for ax, name in zip(axes, names, strict=True):
@@ -191,3 +136,209 @@ def _draw_likelihood(ax: "Axes", profile: Profile, rows: int) -> None:
     # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.
     height = 0.2 - (rows - 1) * (1.0 - np.exp(-0.5 * profile.deviance[near]))
     ax.plot(profile.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
+
+
+MOST = 6
+"""parameters that are drawn: of more the cells are too small to be read"""
+_RADIUS = 2.4477
+"""sd that an ellipse reaches for 95 % of a normal distribution in two dimensions to lie in it: the
+root of chi-squared's 95 % point at two degrees of freedom"""
+_DOTS = 1500
+"""samples of which dots are drawn: of more they hide one another"""
+
+
+def trace(posterior: Posterior, fit: Fit) -> Panels:
+    """The chains by draw, one panel for each of the first parameters."""
+    names = list(posterior.draws)[:MOST]
+    # Draws differ in their last digits, and ticks with all of them need the room they need.
+    drawing = style.figure(0.9 + 1.05 * len(names), constrained=True)
+    axes = tuple(drawing.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+    for ax, name in zip(axes, names, strict=True):
+        for i, chain in enumerate(posterior.draws[name]):
+            style.line(ax, np.arange(chain.size), chain, color=style.CYCLE[i], lw=0.5)
+        ax.axhline(fit.estimates[name].value, color=style.GREY, lw=0.9, ls=":")
+        style.few_ticks(ax, "y", 4)
+        ax.set_ylabel(style.label(name, fit.estimates[name].unit))
+    _mark_divergent(axes[-1], posterior)
+    axes[-1].set_xlabel("draw")
+    axes[0].set_title("Draws of the chains", loc="left")
+    subtitle(axes[0], f"dotted: the estimate{_left_out(len(posterior.draws))}")
+    return axes
+
+
+def _mark_divergent(ax: "Axes", posterior: Posterior) -> None:
+    diverging = posterior.statistics.get("diverging")
+    if diverging is None or not np.any(diverging):
+        return
+    at = np.flatnonzero(np.any(diverging, axis=0))
+    # At the foot of the last panel, whatever the draws' values.
+    foot = ax.get_xaxis_transform()
+    ax.plot(at, np.zeros(at.size), "|", color=style.BLACK, ms=9, transform=foot, clip_on=False)
+
+
+def posterior_pairs(posterior: Posterior, fit: Fit) -> Panels:
+    """Draws by pairs of parameters, divergent ones marked."""
+    draws = {name: np.asarray(v).ravel() for name, v in posterior.draws.items()}
+    diverging = posterior.statistics.get("diverging")
+    marked = None if diverging is None else np.asarray(diverging).ravel()
+    return _pairs(draws, fit, "Draws from the posterior", style.PURPLE, marked)
+
+
+def bootstrap_pairs(booted: Bootstrap, fit: Fit) -> Panels:
+    """Estimates from simulated records by pairs of parameters; () where fewer than two were
+    fitted."""
+    if len(next(iter(booted.values.values()), ())) < 2:
+        return ()
+    return _pairs(booted.values, fit, "Estimates of the bootstrap", style.GREEN, None)
+
+
+def _pairs(
+    samples: Mapping[str, np.ndarray],
+    fit: Fit,
+    title: str,
+    color: str,
+    marked: np.ndarray | None,
+) -> Panels:
+    names = list(samples)[:MOST]
+    n = len(names)
+    side = min(style.WIDTH, 2.2 + 1.3 * n)
+    drawing = style.figure(side if n > 1 else 2.6, side, constrained=True)
+    # The title is wider than the cell that it stands above: it has a row of its own.
+    height = float(drawing.get_size_inches()[1])
+    drawing.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - style.TOP / height))
+    grid = drawing.subplots(n, n, squeeze=False, sharex="col")
+    shown = slice(None, None, max(1, -(-next(iter(samples.values())).size // _DOTS)))
+    for i, below in enumerate(names):
+        _histogram(grid[i, i], samples[below], fit.estimates[below], color)
+        for j, left in enumerate(names[:i]):
+            ax = grid[i, j]
+            x, y = samples[left], samples[below]
+            ax.plot(x[shown], y[shown], ".", color=color, ms=2.5, mew=0.0, rasterized=True)
+            if marked is not None and marked.any():
+                ax.plot(x[marked], y[marked], "x", color=style.BLACK, ms=4.0)
+            _interval_lines(ax.axhline, fit.estimates[below])
+            ellipse = gaussian_ellipse(fit, left, below)
+            if ellipse is not None:
+                ax.plot(*ellipse, color=style.BLUE, lw=1.2)
+        for ax in grid[i, i + 1 :]:
+            ax.set_visible(False)
+    _label(grid, names, fit)
+    first = grid[0, 0]
+    heading = first.set_title(title, loc="left")
+    diverged = "; ×: divergent" if marked is not None and marked.any() else ""
+    subtitle(first, f"blue: Gaussian, dotted: its 95 % ends{diverged}{_left_out(len(samples))}")
+    for text in (heading, first.texts[-1]):
+        text.set_in_layout(False)
+    return tuple(ax for i in range(n) for ax in grid[i, : i + 1])
+
+
+def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:
+    """Names at the left and at the foot; ticks between would be read for another cell's."""
+    for i, name in enumerate(names):
+        label = style.label(name, fit.estimates[name].unit)
+        grid[-1, i].set_xlabel(label)
+        # A power of ten beside the axis and not upon its label, in narrow cells.
+        power = grid[-1, i].xaxis.get_offset_text()
+        power.set_horizontalalignment("left")
+        for ax in grid[i:, i]:
+            style.few_ticks(ax, "x", 3)
+            ax.tick_params(axis="x", rotation=30)
+            _interval_lines(ax.axvline, fit.estimates[name])
+        for j, ax in enumerate(grid[i, :i]):
+            style.few_ticks(ax, "y", 4)
+            ax.tick_params(axis="y", labelleft=j == 0)
+        if i:
+            grid[i, 0].set_ylabel(label)
+        # Heights of a histogram are of no interest beside its shape.
+        grid[i, i].set_yticks([])
+        grid[i, i].spines["left"].set_visible(False)
+
+
+# One of matplotlib's two methods: axvline or axhline.
+def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
+    for end in (e.lower95, e.upper95):
+        if end is not None and np.isfinite(end):
+            draw(end, color=style.BLUE, lw=0.8, ls=":")
+
+
+def _histogram(ax: "Axes", values: np.ndarray, e: Estimate, color: str) -> None:
+    ax.hist(values, bins=min(40, max(8, round(values.size**0.5))), density=True, color=color)
+    x = np.linspace(*ax.get_xlim(), 200)
+    sd = e.sd
+    if sd is None or not sd > 0:
+        return
+    # By the coordinate in which the interval is symmetric, as the ellipses are.
+    at, slope = coordinate(x, e), 1.0
+    if logarithmic(e):
+        sd, slope = sd / abs(e.value), 1.0 / np.abs(x)
+    density = np.exp(-0.5 * (at / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)) * slope
+    ax.plot(x, np.where(np.isfinite(density), density, 0.0), color=style.BLUE, lw=1.2)
+
+
+def logarithmic(e: Estimate) -> bool:
+    """Whether an estimate's interval reaches by equal factors and not by equal amounts."""
+    if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
+        return False
+    if not max(e.lower95, e.upper95) * e.value > 0:
+        return False
+    by_factors = abs(np.log(e.upper95 / e.value) + np.log(e.lower95 / e.value))
+    return bool(by_factors < abs(e.upper95 + e.lower95 - 2.0 * e.value) / abs(e.value))
+
+
+def coordinate(values: np.ndarray, e: Estimate) -> np.ndarray:
+    """Values less the estimate, in the coordinate in which the interval is symmetric: log |value|
+    or the value itself."""
+    if not logarithmic(e):
+        return values - e.value
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.log(values / e.value)
+
+
+def _factor(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 2"] | None:
+    """Cholesky factor of the covariance of two estimates in those coordinates; None where there is
+    none."""
+    names = fit.verdict.names
+    if x not in names or y not in names:
+        return None
+    sds = []
+    for e in (fit.estimates[x], fit.estimates[y]):
+        if e.sd is None or not (np.isfinite(e.sd) and e.sd > 0):
+            return None
+        sds.append(e.sd / abs(e.value) if logarithmic(e) else e.sd)
+    r = float(fit.verdict.correlation[names.index(x), names.index(y)])
+    if not abs(r) < 1.0:
+        return None
+    return np.array([[sds[0], 0.0], [r * sds[1], np.sqrt(1.0 - r**2) * sds[1]]])
+
+
+def gaussian_ellipse(fit: Fit, x: str, y: str) -> Float[np.ndarray, "2 n"] | None:
+    """The curve within which 95 % of the fit's Gaussian approximation lie, of two parameters.
+
+    It is an ellipse in the coordinates in which their intervals are symmetric. None where the data
+    do not determine both.
+    """
+    factor = _factor(fit, x, y)
+    if factor is None:
+        return None
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    away = _RADIUS * factor @ np.array([np.cos(angle), np.sin(angle)])
+    curve = []
+    for d, e in zip(away, (fit.estimates[x], fit.estimates[y]), strict=True):
+        curve.append(e.value * np.exp(d) if logarithmic(e) else e.value + d)
+    return np.array(curve)
+
+
+def share_within(fit: Fit, samples: Mapping[str, np.ndarray], x: str, y: str) -> float | None:
+    """The share of the samples within the ellipse of two parameters; 0.95 where the Gaussian
+    approximation holds."""
+    factor = _factor(fit, x, y)
+    if factor is None:
+        return None
+    away = np.array([coordinate(np.ravel(samples[n]), fit.estimates[n]) for n in (x, y)])
+    white = np.linalg.solve(factor, away)
+    # A sample of the other sign has no logarithm, and lies outside.
+    return float(np.mean(np.sum(white**2, axis=0) < _RADIUS**2))
+
+
+def _left_out(count: int) -> str:
+    return f"; the first {MOST} of {count} parameters" if count > MOST else ""

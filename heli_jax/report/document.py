@@ -1,0 +1,755 @@
+"""fit.json: one table of its keys, by which it is written, checked when it is read, and documented.
+
+A section is a class whose fields are keys. The value of a key is the attribute of its name, unless
+`Annotated` states another attribute or a function. A number that is not finite is null in the file,
+whatever its kind.
+"""
+
+import functools
+import math
+import operator
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.attitude_responses import Handling, HandlingPair
+from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
+from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
+from heli_jax.finding import Distrust, Finding
+from heli_jax.flights import Flight
+from heli_jax.flights.origins import as_content
+from heli_jax.identification.equation_error.first_guess import (
+    Equation,
+    EquationErrorStart,
+    StartValue,
+)
+from heli_jax.identification.equation_error.stepwise import Step
+from heli_jax.identification.estimation.multistart import StartRow
+from heli_jax.identification.fit import Fit
+from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.identifiability.verdict import Combination, Pair
+from heli_jax.identification.method_comparison import MethodComparison
+from heli_jax.identification.model_selection import Candidate, Nested
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Status
+from heli_jax.identification.uncertainty.nuts import Convergence
+from heli_jax.identification.uncertainty.profile_likelihood import Profile
+from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
+from heli_jax.identification.validation.advice import OutputAdequacy
+from heli_jax.identification.validation.follows_response import LEVEL, Feedback
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
+from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.report.card import Gate, card
+from heli_jax.report.statements import whiteness_note
+from heli_jax.versions import versions
+
+ABSENT = object()
+"""what a source returns where the file lacks the key"""
+
+
+class VerdictContent(TypedDict):
+    """What the data determine, with all that it was read off."""
+
+    text: str
+    """in a sentence"""
+    identifiable: bool
+    """whether they determine every free parameter"""
+    rank: int
+    """directions that are determined, priors included"""
+    rank_without_priors: int
+    condition_number: Annotated[float, "condition"]
+    singular_values: list[float]
+    """of the whitened sensitivities in relative coordinates: one over the sd of a direction"""
+    null_directions: list[dict[str, float]]
+    """by parameter, in relative coordinates, along which nothing changes"""
+    determined_combinations: Annotated[list[Combination], "combinations"]
+    """what is determined where not every parameter is"""
+    strong_pairs: Annotated[list[Pair], "pairs"]
+    """parameters that the data hardly tell apart"""
+    without_effect: list[str]
+    """parameters that no output shows"""
+    resting_on_priors: Annotated[list[str], "resting"]
+    """parameters that the priors determine, and not the data"""
+    exchangeable_nuisances: Annotated[list[str], "exchangeable"]
+    """nuisances, as `flight 1/bias p`, that make up for what is not determined"""
+    other_solutions: Annotated[list[dict[str, float]], lambda v: [s.values for s in v.second]]
+    """other values of the free parameters that fit as well [SI]"""
+    names: list[str]
+    """the order of `correlation` and `covariance_log`"""
+    correlation: list[list[float]]
+    covariance_log: Annotated[list[list[float]], "covariance"]
+    """in relative coordinates (a logarithm, or the value over a scale); what is not determined is
+    left out of it"""
+
+
+class AdequacyAgainst(TypedDict):
+    """The limits of the version that wrote the file."""
+
+    explained_at_least: Annotated[float, lambda _: EXPLAINED]
+    or_other_than_white_noise_at_most: Annotated[float, lambda _: NEARLY_WHITE]
+    or_power_over_what_the_disturbance_makes_at_most: Annotated[float, lambda _: EXPECTED]
+
+
+class AdequacyContent(TypedDict):
+    """Whether the model explains the record."""
+
+    summary: Annotated[str, "adequate_in_words"]
+    """the answer in a few words, as the first line has it"""
+    judged: Annotated[list[OutputAdequacy], "adequacy.judged"]
+    by_chance: Annotated[bool, "adequacy.by_chance"]
+    """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
+    ahead: Annotated[float | None, "adequacy.ahead"]
+    """[s] that is predicted at most where that, and no simulation, was judged"""
+    against: Annotated[AdequacyAgainst, lambda fit: fit]
+
+
+class Fixed(TypedDict):
+    """Beside the fields of the class."""
+
+    value: float | list[float] | None
+    """the estimate; null where it is not determined; of what flights state a number of each"""
+    fixed: Annotated[bool, lambda _: False]
+    """whether flights state it, and it was not free; then there is nothing else"""
+
+
+class Residuals(TypedDict):
+    """What is left of the measurements."""
+
+    white: bool
+    overconfident: bool
+    """whether intervals count samples as news that repeat each other"""
+    note: Annotated[str, whiteness_note]
+    """what follows where they are not white"""
+    by_output: Annotated[dict[str, Whiteness], "whiteness"]
+    """by `flight/output`; under filter error of the innovations"""
+
+
+class FeedbackToo(TypedDict):
+    """Beside the fields of the class."""
+
+    present: bool
+    """whether the input follows the response: the p value is below the level"""
+    level: Annotated[float, lambda _: LEVEL]
+
+
+class ResponsesToo(TypedDict):
+    """Beside the fields of the class."""
+
+    averages: Annotated[dict[str, float], lambda agreement: dict(agreement.averages)]
+    """independent ones by output"""
+    usual_J: Annotated[float, lambda _: USUAL_J]
+    """Tischler's limit of a good fit"""
+
+
+class CandidatesCompared(TypedDict):
+    """Models compared."""
+
+    candidates: list[Candidate]
+    """best AIC first"""
+    nested: list[Nested]
+    """likelihood-ratio tests"""
+    sentences: list[str]
+
+
+class MethodContent(TypedDict):
+    """The same problem by a method."""
+
+    status: str
+    """as above, or refused"""
+    verdict: str
+    reason: str | None
+    """why it was refused, or is no result"""
+    seconds: float
+    parameters: dict[str, Estimate]
+    difference_joint_sd: dict[str, float]
+    """from the first method's estimate, in their joint standard deviation"""
+    findings: list[Finding]
+
+
+class MethodsCompared(TypedDict):
+    """Methods side by side."""
+
+    results: Annotated[dict[str, MethodContent], lambda compared: _methods(compared)]
+    sentences: list[str]
+
+
+class Nuts(TypedDict):
+    """Whether the draws may be believed."""
+
+    rhat: float
+    """the largest"""
+    effective: float
+    """independent draws, the fewest"""
+    divergent: int
+    trusted: bool
+    by_parameter: Annotated[dict[str, Convergence], "convergence"]
+
+
+class IntervalsContent(TypedDict, total=False):
+    """95 % intervals by several methods."""
+
+    by_parameter: dict[str, dict[str, list[float]]]
+    """by parameter and method (gaussian, profile, bootstrap, nuts) both ends"""
+    profiles: dict[str, Profile]
+    sentences: list[str]
+    bootstrap_failures: Annotated[int, lambda i: i.bootstrap.failures if i.bootstrap else ABSENT]
+    """of a bootstrap: refits that did not arrive"""
+    nuts: Annotated[Nuts, lambda i: i.posterior or ABSENT]
+    """of NUTS"""
+
+
+class Compatibility(TypedDict):
+    """Of `heli-jax compatibility`."""
+
+    compatible: bool
+    verdict: str
+    doubts: list[Finding]
+    shows: Annotated[dict[str, str], lambda s: {r[0]: r[s.head.index("shows")] for r in s.errors}]
+    """by error of a sensor whether it shows"""
+
+
+class Continuous(TypedDict):
+    """The transfer function of the recursive least squares."""
+
+    num: Annotated[list[float], "continuous_num"]
+    """coefficients, highest power of s first"""
+    den: Annotated[list[float], "continuous_den"]
+    exact: bool
+    """whether it is that of the discrete one with a zero-order hold"""
+    note: str
+
+
+class BaselineContent(TypedDict):
+    """The recursive least squares, from an input to an output of one flight."""
+
+    flight: str
+    input: str
+    output: str
+    order: int
+    forgetting: float
+    theta: list[float]
+    """coefficients of the difference equation"""
+    poles: Annotated[list[list[float]], lambda b: [[p.real, p.imag] for p in b.poles]]
+    """real and imaginary part of each"""
+    continuous: Annotated[Continuous, lambda b: b]
+    combinations: dict[str, float]
+    """of the paper's equation 23"""
+    metrics: Annotated[dict[str, Metrics], lambda b: {b.output: b.metrics}]
+    """of its simulation"""
+    trusted: bool
+    sentences: list[str]
+
+
+class QualityToo(TypedDict):
+    """Beside the fields of the class."""
+
+    unit: str
+
+
+class Qualities(TypedDict, total=False):
+    """What a response says, of the model or of the data."""
+
+    numbers: dict[str, Number | None]
+    """by name; null is not determined"""
+    sentences: list[str]
+    sign: int
+    """-1 where the response was turned over"""
+    band_rad_s: list[float]
+    """in which it is known"""
+
+
+class HandlingToo(TypedDict):
+    """Beside the fields of the class."""
+
+    model: Qualities | None
+    data: Qualities | None
+    """null where no response was asked for"""
+
+
+class Stepwise(TypedDict):
+    """The terms that stepwise regression chose."""
+
+    selected: list[str]
+    steps: list[Step]
+    f_ratios: dict[str, float]
+
+
+class EquationErrorContent(TypedDict):
+    """First guesses by equation error."""
+
+    values: dict[str, StartValue]
+    equations: list[Equation]
+    smoothing_half_width_s: Annotated[float, "half_width"]
+    not_measured: Annotated[list[str], "hidden"]
+    """states that nothing measured shows"""
+    stepwise: Annotated[Stepwise | None, "selection"]
+    sentences: list[str]
+
+
+class FrequencyErrorContent(TypedDict):
+    """First guesses by frequency error."""
+
+    status: Status
+    seconds: float
+    values: dict[str, StartValue]
+    sentences: list[str]
+    notes: list[str]
+
+
+class SignalSource(TypedDict, total=False):
+    """Where a signal of the model came from."""
+
+    signal: str
+    """the channel of the log; without one a constant stands there"""
+    constant: float
+    unit: str
+    scale: float
+    offset: float
+    invert: bool
+    origin: str
+    """what was made of it on the way, in words"""
+
+
+class SignalSources(TypedDict):
+    """By name of the model's signal."""
+
+    inputs: dict[str, SignalSource]
+    outputs: dict[str, SignalSource]
+
+
+class FlightSource(TypedDict, total=False):
+    """Where a flight came from; one that was given in memory has no path and no signals."""
+
+    path: str | None
+    sha256: str | None
+    """of the whole file"""
+    flight: str
+    hold_out: bool
+    """whether it served for validation alone"""
+    n_samples: int
+    dt: float
+    """[s]"""
+    window: list[float]
+    """[s] from the log's beginning"""
+    log_first_time: float
+    """[s] in the log's own count"""
+    notes: list[Finding]
+    """what the reader of the log assumed or did"""
+    signals: SignalSources
+
+
+class HoldContent(TypedDict):
+    """What an input does between samples."""
+
+    hold: Literal["zero-order", "linear", "mixed"]
+    reason: str
+
+
+def _start(kind: type) -> Callable[[Any], Any]:
+    """Starts that were found so: where the fit began, not its result."""
+
+    def found(analysis: Any) -> Any:
+        guess = analysis.problem.first_guess
+        return guess if isinstance(guess, kind) else None
+
+    return found
+
+
+_NOISE = ("white", "coloured residuals")
+
+
+class FitFile(TypedDict):
+    """fit.json."""
+
+    status: Annotated[Status, "fit.status"]
+    """whether the optimiser converged, and whether the data determine what was asked"""
+    exit_code: Annotated[Literal[0, 3, 4], "fit.exit_code"]
+    """0: the intervals may be used; 3: not identifiable, or not trusted; 4: not converged, or not
+    adequate"""
+    model: Annotated[str, "fit.model"]
+    method: Annotated[str, "fit.method"]
+    instruments: Annotated[list[str], "fit.instruments"]
+    """inputs that were taken by a logged excitation"""
+    n_samples: Annotated[int, "fit.n_samples"]
+    """measured numbers that were fitted"""
+    identifiable: Annotated[bool, "fit.verdict.identifiable"]
+    """whether the data and the priors determine every free parameter"""
+    adequate: Annotated[bool | None, lambda a: _adequate(a.fit)]
+    """whether the model explains the record; null where that was not judged"""
+    adequacy: Annotated[AdequacyContent, "fit"]
+    null_directions: Annotated[list[dict[str, float]], "fit.verdict.null_directions"]
+    """as in `verdict`"""
+    determined_combinations: Annotated[list[Combination], "fit.verdict.combinations"]
+    """as in `verdict`"""
+    verdict: Annotated[VerdictContent, "fit.verdict"]
+    """at the estimates"""
+    verdict_before: Annotated[VerdictContent, "fit.verdict_before"]
+    """at the start values"""
+    parameters: Annotated[dict[str, Estimate], lambda a: _parameters(a)]
+    """the free ones, and those that flights state [SI]"""
+    constants: Annotated[dict[str, float], lambda a: _constants(a.fit, a.problem)]
+    """the vehicle's numbers that the fit took as known [SI]"""
+    nuisance: Annotated[dict[str, Estimate], lambda a: _shown(a.fit.nuisance, a.fit.status)]
+    """gains, delays, disturbances, initial states, biases; of one flight as `flight/name`"""
+    noise_sd: Annotated[dict[str, float], "fit.noise"]
+    """of the measurements, by `flight/output` [SI]"""
+    metrics: Annotated[dict[str, Metrics], "fit.metrics"]
+    """by output, of the flights that were fitted, simulated"""
+    validation: Annotated[dict[str, Metrics], "fit.validation"]
+    """the same of flights held out"""
+    validation_free_run: Annotated[dict[str, Metrics], "fit.validation_free_run"]
+    """the same in one piece, where windows were asked for"""
+    one_step: Annotated[dict[str, Metrics], "fit.one_step"]
+    """predicted one sample ahead, of the flights that were fitted"""
+    one_step_validation: Annotated[dict[str, Metrics], "fit.one_step_validation"]
+    """the same of flights held out"""
+    acceptance: Annotated[list[Gate], lambda a: card(a.problem, a.fit)]
+    """the lines of the acceptance card"""
+    models: Annotated[CandidatesCompared | None, "supplementary.choice"]
+    methods: Annotated[MethodsCompared | None, "supplementary.methods"]
+    intervals: Annotated[IntervalsContent | None, "supplementary.intervals"]
+    record: Annotated[list[Finding], "supplementary.findings"]
+    """whether the log is enough"""
+    compatibility: Annotated[Compatibility | None, "supplementary.sensors"]
+    log_likelihood: Annotated[float, "fit.log_likelihood"]
+    unknowns: Annotated[int, "fit.unknowns"]
+    """estimated numbers, those of the noise included"""
+    aic: Annotated[float, "fit.aic"]
+    bic: Annotated[float, "fit.bic"]
+    covariance: Annotated[Literal["white", "coloured residuals"], lambda a: _NOISE[a.fit.coloured]]
+    """what the intervals take the residuals for"""
+    residuals: Annotated[Residuals, "fit"]
+    feedback: Annotated[list[Feedback], "fit.feedback"]
+    """by flight and input that moves freely"""
+    untrusted: Annotated[dict[str, Distrust], "fit.distrusts"]
+    """by parameter, why its interval may not be used"""
+    distrust: Annotated[str, "fit.distrust"]
+    """the same in a sentence; empty where all is trusted"""
+    responses: Annotated[ResponseAgreement | None, "fit.responses"]
+    """of a fit of frequency responses"""
+    held_out_frequency: Annotated[HeldOutFrequency | None, "fit.held_out_frequency"]
+    """of a fit in frequency what flights held out say there"""
+    baseline_rls: Annotated[BaselineContent | None, "baseline"]
+    handling_qualities: Annotated[list[HandlingPair], lambda a: _handling(a)]
+    equation_error_start: Annotated[EquationErrorContent | None, _start(EquationErrorStart)]
+    frequency_error_start: Annotated[FrequencyErrorContent | None, _start(FrequencyErrorStart)]
+    starts: Annotated[list[StartRow], lambda a: _starts(a.fit)]
+    """where each start led"""
+    steps: Annotated[int, "fit.steps"]
+    """of the optimiser, to the best optimum"""
+    findings: Annotated[list[Finding], "fit.findings"]
+    """about the record, the model and the fit"""
+    timing_s: Annotated[dict[str, float], "fit.timing"]
+    """by what was done, and in all"""
+    versions: Annotated[dict[str, str], lambda _: versions()]
+    """of Python and the libraries"""
+    data: Annotated[list[FlightSource], lambda a: map(_flight, a.problem.flights)]
+    inputs: Annotated[list[dict[str, HoldContent]], lambda a: map(_holds, a.problem.flights)]
+    """by flight and input"""
+    seed: Annotated[int, "fit.seed"]
+
+
+TOO: dict[type, type] = {
+    Estimate: Fixed,
+    Feedback: FeedbackToo,
+    ResponseAgreement: ResponsesToo,
+    Number: QualityToo,
+    HandlingPair: HandlingToo,
+}
+"""what the file has beside the fields of a class, or in their place"""
+
+
+# Values that are no attribute: a mapping holds keys as they stand in the file. An analysis is
+# `heli_jax.report.files.Analysis`, which imports this module.
+
+
+def _shown(estimates: Mapping[str, Estimate], status: Status) -> dict[str, Any]:
+    """The estimates, without numbers for what the data do not determine."""
+    # Where the optimiser stopped in a direction that nothing determines is an accident, and a
+    # program that reads the file would take it for an estimate. A status that says that nothing is
+    # a result leaves them: whoever goes on from there has to know where it is.
+    none: dict[str, Any] = dict.fromkeys(("value", "sd_white", "sd_alone"))
+    arrived = status != "not-converged"
+    return {n: e._replace(**none) if arrived and e.sd is None else e for n, e in estimates.items()}
+
+
+def _adequate(fit: Fit) -> bool | None:
+    return None if fit.status == "not-converged" else fit.adequate
+
+
+def _parameters(analysis: Any) -> dict[str, Any]:
+    fit = analysis.fit
+    return _fixed(analysis.problem) | _shown(fit.estimates, fit.status)
+
+
+def _fixed(problem: Problem) -> dict[str, Any]:
+    """The parameters a user might look for that were not free: those that flights replace."""
+    # A list, since each flight may have a value of its own; null where it has none.
+    return {
+        n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True}
+        for n in sorted({n for f in problem.flights for n in f.known})
+    }
+
+
+def _constants(fit: Fit, problem: Problem) -> dict[str, float]:
+    """The vehicle's numbers that the fit took as known [SI]: those that no flight replaces."""
+    others = {*fit.estimates, *fit.nuisance, *_fixed(problem)}
+    params = {n: np.asarray(v) for n, v in naming.asdict(fit.params).items() if n not in others}
+    # A model of a user's own may have parameters that are no single numbers.
+    return {n: float(v) for n, v in params.items() if v.size == 1 and v.dtype.kind in "fiu"}
+
+
+def _starts(fit: Fit) -> list[StartRow]:
+    """Where each start led; None for what is not determined."""
+    shown = _shown(fit.estimates, fit.status)
+    open_ones: dict[str, Any] = {n: None for n, e in shown.items() if e.value is None}
+    return [
+        row._replace(end={n: open_ones.get(n, v) for n, v in row.end.items()}) for row in fit.starts
+    ]
+
+
+def _methods(compared: MethodComparison) -> dict[str, Any]:
+    """By method its estimates, and how far they are from those of the first."""
+    results = {}
+    for r in compared.results:
+        found = {n: e for n in compared.names if (e := compared.estimate(r, n)) is not None}
+        results[r.method] = {
+            "status": "refused" if r.fit is None else r.fit.status,
+            "verdict": r.word,
+            "reason": r.reason or None,
+            "seconds": r.seconds,
+            "parameters": _shown(found, "converged"),
+            "difference_joint_sd": {n: compared.difference(r, n) for n in found},
+            "findings": () if r.fit is None else r.fit.findings,
+        }
+    return results
+
+
+def _handling(analysis: Any) -> list[dict[str, Any]]:
+    responses = analysis.supplementary.responses
+    return handling_content(responses.handling if responses else ())
+
+
+def handling_content(entries: Sequence[Handling]) -> list[dict[str, Any]]:
+    """Plain data: by response what model and data say, numbers in SI (and deg, dB)."""
+    mappings = [
+        {**h.pair._asdict(), "model": _qualities(h.model), "data": _qualities(h.data)}
+        for h in entries
+    ]
+    return written(list[HandlingPair], mappings)
+
+
+def _qualities(of: HandlingQualities | str | None) -> dict[str, Any] | None:
+    if of is None or isinstance(of, str):
+        return None if of is None else {"numbers": {}, "sentences": [of]}
+    # What is not determined is null, and not left out: programs ask by name.
+    known = {name: n for name, n in of.numbers.items() if n.known}
+    numbers = {
+        name: {**known[name]._asdict(), "unit": UNITS[name]} if name in known else None
+        for name in NUMBERS[of.kind]
+    }
+    return {"numbers": numbers, "sentences": of.sentences, "sign": of.sign, "band_rad_s": of.band}
+
+
+def _flight(flight: Flight) -> dict[str, Any]:
+    source = flight.source
+    # A flight that was given in memory: `null`, so that nobody looks for a file.
+    content = {
+        "path": source.path if source else None,
+        "sha256": source.sha256 if source else None,
+        "flight": flight.name,
+        "hold_out": flight.hold_out,
+        "n_samples": flight.n_samples,
+        "dt": flight.dt,
+    }
+    if source is None:
+        return content
+    return content | {
+        "window": flight.window,
+        "log_first_time": source.first_time,
+        "notes": source.notes,
+        "signals": {
+            "inputs": {n: as_content(s) for n, s in source.inputs.items()},
+            "outputs": {n: as_content(s) for n, s in source.outputs.items()},
+        },
+    }
+
+
+def _holds(flight: Flight) -> dict[str, dict[str, str]]:
+    """By input what it is taken to do between samples, and what of the log spoke for it."""
+    reason = flight.hold_reason
+    return {n: {"hold": h, "reason": reason.get(n, "as stated")} for n, h in flight.hold.items()}
+
+
+def written(kind: Any, value: Any) -> Any:
+    """A value as plain data for JSON; a number that is not finite becomes None.
+
+    Args:
+        kind: of the table; a section, or a mapping or list of such.
+        value: what has its keys as attributes, or in a mapping as they stand in the file.
+    """
+    if value is None:
+        return None
+    for option in _options(kind):
+        if _is_section(option):
+            fields = _fields(option)
+            if isinstance(value, Mapping):
+                return {n: written(fields[n][0], v) for n, v in value.items()}
+            found = {n: source(value) for n, (_, source) in fields.items()}
+            return {n: written(fields[n][0], v) for n, v in found.items() if v is not ABSENT}
+        if typing.get_origin(option) in _MAPPINGS and isinstance(value, Mapping):
+            return {str(n): written(typing.get_args(option)[1], v) for n, v in value.items()}
+        if (inner := _item(option)) is not None and not isinstance(value, str | float):
+            return [written(inner, v) for v in value]
+    return plain(value)
+
+
+def plain(value: Any) -> Any:
+    """Only what JSON has; a number that is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    # Infinite counts as missing too: strict JSON has neither, and a reader has one case to think
+    # of.
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def checked(kind: Any, value: Any, place: str = "") -> None:
+    """Refuse plain data that is of another kind than the table says.
+
+    Keys may be missing, or be none of the table: another version has others.
+
+    Raises:
+        ValueError: naming the place, what was expected and what was found.
+    """
+    if value is None:
+        return
+    for option in _options(kind):
+        if _is_section(option) and isinstance(value, Mapping):
+            fields = _fields(option)
+            for n in value.keys() & fields.keys():
+                checked(fields[n][0], value[n], f"{place}.{n}")
+            return
+        if typing.get_origin(option) in _MAPPINGS and isinstance(value, Mapping):
+            for n, v in value.items():
+                checked(typing.get_args(option)[1], v, f"{place}.{n}")
+            return
+        if (inner := _item(option)) is not None and isinstance(value, list):
+            for v in value:
+                checked(inner, v, f"{place}[]")
+            return
+        accepted = {float: float | int, bool: bool, int: int, str: str}.get(option, ())
+        if isinstance(value, accepted) or typing.get_origin(option) is Literal:
+            return
+    raise ValueError(f"{place.lstrip('.')}: expected {_kind(kind)}, got {str(value)[:40]}")
+
+
+class Key(NamedTuple):
+    """One key of fit.json."""
+
+    path: str
+    """in full: `parameters.NAME.sd`"""
+    kind: str
+    """what stands there, in words"""
+    meaning: str
+    """empty where the name says it all"""
+
+
+def fit_keys() -> list[Key]:
+    """All keys, each before what stands in it."""
+    return list(_walk(FitFile, ""))
+
+
+def matching(text: str) -> list[Key]:
+    """The keys whose path holds a text, in any case; else those whose meaning does."""
+    words, every = text.strip().lower(), fit_keys()
+    by_path = [k for k in every if words in k.path.lower()]
+    return by_path or [k for k in every if words in k.meaning.lower()]
+
+
+_MAPPINGS, _SEQUENCES = (dict, Mapping), (list, tuple, Sequence)
+
+
+def _walk(section: Any, path: str) -> Iterator[Key]:
+    stated = naming.texts(section) | (naming.texts(TOO[section]) if section in TOO else {})
+    for name, (kind, _) in _fields(section).items():
+        place = f"{path}.{name}" if path else name
+        yield Key(place, _kind(kind), stated.get(name, ""))
+        # `verdict_before` has the keys of `verdict`: told once.
+        if name not in ("verdict_before", "determined_combinations") or path == "verdict":
+            for inner, suffix in _within(kind):
+                yield from _walk(inner, place + suffix)
+
+
+def _within(kind: Any) -> Iterator[tuple[Any, str]]:
+    """The sections within a field, and what stands between its path and their keys."""
+    for option in _options(kind):
+        if _is_section(option):
+            yield option, ""
+        elif typing.get_origin(option) in _MAPPINGS:
+            yield from ((s, f".NAME{rest}") for s, rest in _within(typing.get_args(option)[1]))
+        elif (inner := _item(option)) is not None:
+            yield from ((s, f"[]{rest}") for s, rest in _within(inner))
+
+
+def _is_section(kind: Any) -> bool:
+    return typing.is_typeddict(kind) or (isinstance(kind, type) and hasattr(kind, "_fields"))
+
+
+@functools.cache
+def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
+    """By key its kind, and what finds its value."""
+    hints = typing.get_type_hints(section, include_extras=True)
+    if section in TOO:
+        hints |= typing.get_type_hints(TOO[section], include_extras=True)
+    fields = {}
+    for name, kind in hints.items():
+        source: Any = name
+        if typing.get_origin(kind) is Annotated:
+            kind, source = typing.get_args(kind)
+        fields[name] = kind, source if callable(source) else operator.attrgetter(source)
+    return fields
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return typing.get_args(kind)
+    return (kind,)
+
+
+def _item(kind: Any) -> Any:
+    """What a list has in it; None of what is no list."""
+    if typing.get_origin(kind) not in _SEQUENCES:
+        return None
+    return typing.get_args(kind)[0]
+
+
+def _kind(kind: Any) -> str:
+    return " or ".join(dict.fromkeys(_one_kind(option) for option in _options(kind)))
+
+
+_PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text", type(None): "null"}
+
+
+def _one_kind(kind: Any) -> str:
+    if kind in _PLAIN:
+        return _PLAIN[kind]
+    if _is_section(kind):
+        return "section"
+    if typing.get_origin(kind) is Literal:
+        return " | ".join(map(str, typing.get_args(kind)))
+    if typing.get_origin(kind) in _MAPPINGS:
+        return f"{_kind(typing.get_args(kind)[1])} by name"
+    items = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple and Ellipsis not in items:
+        return f"[{', '.join(map(_kind, items))}]"
+    if (inner := _item(kind)) is not None:
+        return f"list of {_kind(inner)}"
+    return "list of numbers"  # an array

@@ -1,0 +1,572 @@
+"""Quick-look figures of a sweep: a Dataset over `element` in, Matplotlib Figures out.
+
+Elements that are not ok, and values that are not finite, count in no median and no histogram; the
+former are marked in red where their axes are finite. A result of several flights is drawn as its
+mean over them. Draw within `matplotlib.rc_context(style.STYLE)`, as `write_figures` does, to get
+the report's look.
+"""
+
+import functools
+import itertools
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
+from scipy.stats import binned_statistic_2d
+
+from heli_jax.numbers import number
+from heli_jax.report import style
+from heli_jax.report.style import pretty
+from heli_jax.sweeps.datasets import chunks_of
+
+RESULTS = 6
+"""results with figures of their own"""
+DRAWN = 1 << 16
+"""elements that are drawn at most, by lot: more change no quantile that the eye could see"""
+_DOTS, _MARKS, _LINES = 2000, 300, 300
+"""dots, red marks and faint lines of a panel at most"""
+_SLICES, _PAIRS, _VARIABLES, _UPRIGHT = 8, 6, 7, 12
+"""panels of slices and of maps, rows of the corner, axes side by side, at most"""
+_WIDE = 30.0
+"""Factor over which numbers of one sign are drawn logarithmically: on a linear scale the lower half
+of that range, in decades, would lie within a sixth of the panel."""
+_BINS, _A_BIN = 20, 5
+"""bins of an axis at most, and elements in each at least: a band of fewer is their range"""
+_CELLS, _GRID = 24, 180
+"""cells along an axis at most, and distinct values that are cells of their own: a grid is seen at
+its own resolution"""
+_BARS = 30
+"""bars of a histogram at most"""
+_LETTERS = 24
+"""of a name at most"""
+_DPI = 160
+"""of what is pixels in an SVG"""
+_OK = 0
+"""the status of an element that counts; that of heli_jax.sweeps, whose import takes JAX"""
+# As many results as colours, as many elements of each as dashes.
+_COLOURS = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.BLACK, style.SKY)
+_DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)))
+
+type Which = Literal["x", "y"]
+
+
+class Column:
+    """An axis or a result: a number (n,) for each element drawn, NaN where it is not finite."""
+
+    def __init__(
+        self, variable: xr.DataArray, elements: np.ndarray, ok: np.ndarray, *, axis: bool
+    ) -> None:
+        unit = variable.attrs.get("units")
+        flights = variable.sizes.get("flight", 0)
+        self.unit = None if unit is None else str(unit)
+        self.name = str(variable.name)
+        self.title = f"{self.name}, mean over {flights} flights" if flights else self.name
+        self.mean_over = flights
+        self.values = _numbers(variable, elements)
+        self.finite = np.isfinite(self.values)
+        self.used = self.finite & ok
+        self.axis = axis
+        self.whole = variable.dtype.kind in "biu" and not flights
+        # An axis shows where elements failed, too; of a result the failed have no value.
+        seen = np.sort(self.values[self.finite if axis else self.used])
+        self.empty = not seen.size
+        if self.empty:
+            return
+        self.distinct = np.unique(seen)
+        # Values that were chosen come twice; those of a continuous axis do not.
+        chosen = (axis or self.whole) and 2 * self.distinct.size <= seen.size
+        self.few = self.distinct.size == 1 or (chosen and self.distinct.size <= _GRID)
+        low, high = float(seen[0]), float(seen[-1])
+        # A result by its bulk: single elements would press the others flat.
+        first, last = (low, high) if axis else np.quantile(seen, [0.01, 0.99])
+        declared = axis and variable.attrs.get("scale") == "log"
+        wide = max(abs(first), abs(last)) > _WIDE * min(abs(first), abs(last))
+        self.log = low * high > 0.0 and (declared or (wide and (axis or not self.whole)))
+        if not (axis or self.log):
+            beyond = 0.3 * (last - first)
+            low, high = max(low, first - beyond), min(high, last + beyond)
+        if not high - low > 1e-9 * max(abs(low), abs(high)):
+            half = 0.05 * abs(low) or 0.5
+            low, high = low - half, high + half
+        self.view = low, high
+        """from the least to the largest value drawn"""
+
+    def edges(self, count: int) -> np.ndarray:
+        """Edges of so many even cells, or of one for each of few values, ascending."""
+        if self.few and self.distinct.size > 1:
+            between = 0.5 * (self.distinct[1:] + self.distinct[:-1])
+            first, last = 2 * self.distinct[0] - between[0], 2 * self.distinct[-1] - between[-1]
+            if not (self.log and first * last <= 0.0):
+                return np.array([first, *between, last])
+        return (np.geomspace if self.log else np.linspace)(*self.view, count + 1)
+
+    def scale(
+        self, ax: Axes, which: Which, ends: ArrayLike, ticks: int, letters: int = _LETTERS
+    ) -> None:
+        """Give an axis of a panel its scale, limits, ticks and label."""
+        low, *_, high = map(float, np.asarray(ends))
+        axis = ax.xaxis if which == "x" else ax.yaxis
+        if self.log:
+            # Matplotlib's log scale has no negative numbers; the linear part of this one is unseen.
+            kind = {"value": "log"} if low > 0.0 else {"value": "symlog", "linthresh": -0.5 * high}
+            (ax.set_xscale if which == "x" else ax.set_yscale)(**kind)  # type: ignore[arg-type]
+            axis.set_major_locator(FixedLocator(_log_ticks(low, high, ticks)))
+            axis.set_minor_locator(NullLocator())
+            axis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 3)))
+        elif self.whole and self.distinct.size <= ticks:
+            axis.set_major_locator(FixedLocator([float(v) for v in self.distinct]))
+        else:
+            style.few_ticks(ax, which, ticks, integer=self.whole)
+        (ax.set_xlim if which == "x" else ax.set_ylim)(low, high)
+        axis.set_label_text(style.label(_short(self.name, letters), self.unit))
+
+
+class Table:
+    """What is drawn of a sweep, read once: all of it, or of a large one a lot."""
+
+    def __init__(self, ds: xr.Dataset, named: Iterable[np.ndarray] = ()) -> None:
+        """`named` are elements that are drawn in any case."""
+        self._ds = ds
+        ok = ds["status"].to_numpy() == _OK
+        self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
+        lots = _by_lot(np.flatnonzero(ok), DRAWN), _by_lot(np.flatnonzero(~ok), DRAWN // 2)
+        also = [np.asarray(e, np.int64) for e in named]
+        self.elements = np.unique(np.concatenate([*lots, *also]))
+        """which elements, ascending, (n,)"""
+        self.ok = ok[self.elements]
+        self.results = results(ds)
+        self._columns: dict[str, Column] = {}
+
+    def column(self, name: str) -> Column:
+        """An axis or a result, read when it is first asked for."""
+        if name not in self._columns:
+            axis = name in self._ds.attrs["axes"]
+            self._columns[name] = Column(self._ds[name], self.elements, self.ok, axis=axis)
+        return self._columns[name]
+
+    @property
+    def axes(self) -> list[Column]:
+        """The axes that have a finite value."""
+        return [c for c in map(self.column, self._ds.attrs["axes"]) if not c.empty]
+
+    def failed(self, *columns: Column) -> np.ndarray:
+        """Elements that are not ok where these columns are finite, not too many."""
+        where = np.logical_and.reduce([~self.ok, *(c.finite for c in columns)])
+        return _by_lot(np.flatnonzero(where), _MARKS)
+
+    def head(self, figure: Figure, what: str, *notes: str) -> None:
+        """Title with the number of elements that are ok, and what is drawn below it."""
+        failed = self.size - self.n_ok
+        lot = f"{self.elements.size} drawn, by lot" if self.elements.size < self.size else ""
+        marks = "red marks: not ok" + (f" ({_MARKS} of {failed})" if failed > _MARKS else "")
+        words = "; ".join(filter(None, (lot, *notes, marks if failed else "")))
+        title = f"{_short(what, 60)}: {self.n_ok} of {self.size} elements ok"
+        figure.suptitle(f"{title}\n{textwrap.fill(words, 105)}", x=0.01, ha="left", fontsize=9)
+
+    @property
+    def nothing(self) -> str:
+        """Why there is no number to draw."""
+        return "no finite value" if self.n_ok else "no element is ok"
+
+
+def write_figures(directory: Path, ds: xr.Dataset, worst: Mapping[str, np.ndarray]) -> list[Path]:
+    """Write all figures as PNG and SVG into a directory, which is made; returns the files.
+
+    They are slices-RESULT, maps-RESULT (the first six results), corner and worst; what a file
+    should not be called becomes `_`.
+    """
+    # One table for all figures: each column is read once.
+    table = Table(ds, worst.values())
+    draw: dict[str, Callable[[], Figure | None]] = {}
+    for result, stem in stems(table.results[:RESULTS]).items():
+        draw[f"slices-{stem}"] = functools.partial(slices, table, result)
+        draw[f"maps-{stem}"] = functools.partial(maps, table, result)
+    draw["corner"] = functools.partial(corner, table)
+    draw["worst"] = functools.partial(worst_elements, table, worst)
+    directory.mkdir(parents=True, exist_ok=True)
+    written = []
+    # One after another: a figure that is written is let go before the next is drawn.
+    for name, draw_figure in draw.items():
+        path = directory / name
+        with matplotlib.rc_context({"savefig.dpi": _DPI}):
+            saved = style.save(draw_figure, path)
+        if saved:
+            written += [path.with_suffix(".png"), path.with_suffix(".svg")]
+    return written
+
+
+def stems(names: Sequence[str]) -> dict[str, str]:
+    """A different file name for each name, on file systems that fold case too."""
+    stems: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in names:
+        first = re.sub(r"[^\w-]", "_", name)[:50]
+        every = itertools.chain([first], (f"{first}-{k}" for k in itertools.count(2)))
+        stems[name] = next(stem for stem in every if stem.casefold() not in taken)
+        taken.add(stems[name].casefold())
+    return stems
+
+
+def results(ds: xr.Dataset) -> list[str]:
+    """The results that are drawn: those with a number for each element, or for each and flight."""
+    return [
+        str(n)
+        for n, v in ds.data_vars.items()
+        if {"element"} <= set(v.dims) <= {"element", "flight"}
+        and v.dtype.kind in "biuf"
+        and not str(n).startswith("trajectory_")
+    ]
+
+
+def slices(table: Table, result: str) -> Figure | None:
+    """A result against each axis: dots, and the median with a 5-95 % band in bins of equal count.
+
+    An axis with few values has a bin for each. None where there is no element, no axis, or no
+    number for each element.
+    """
+    axes = table.axes[:_SLICES]
+    if result not in table.results or not axes:
+        return None
+    y = table.column(result)
+    # Four panels are two rows of two, and no row of three with one alone.
+    columns = {1: 1, 2: 2, 4: 2}.get(len(axes), 3)
+    figure, panels = _panels(len(axes), columns, 2.9 if columns == 1 else 2.3)
+    shown = _by_lot(np.flatnonzero(y.used), _DOTS)
+    for k, (ax, x) in enumerate(zip(panels, axes, strict=True)):
+        _dots(ax, x.values[shown], y.values[shown])
+        if (bins := _binned(x, y)) is not None:
+            middle, (low, median, high) = bins
+            band = {"color": style.SKY, "alpha": 0.35, "lw": 0, "zorder": 2, "label": "5-95 %"}
+            ax.fill_between(middle, low, high, **band)
+            marks = {"marker": "o", "ms": 3.5} if x.few else {}
+            ax.plot(middle, median, color=style.BLUE, lw=1.5, zorder=4, label="median", **marks)
+        # What failed has no result to be placed by: it is marked at the foot of the panel.
+        failed = table.failed(x)
+        foot = np.full(failed.size, 0.03)
+        _crosses(ax, x.values[failed], foot, transform=ax.get_xaxis_transform(), marker="|")
+        x.scale(ax, "x", x.edges(1), 5)
+        if y.empty:
+            ax.set_yticks([])
+            ax.text(0.5, 0.5, table.nothing, transform=ax.transAxes, ha="center", color=style.GREY)
+            continue
+        y.scale(ax, "y", _with_margin(y), 6)
+        if k % columns:
+            ax.set_ylabel("")
+            ax.tick_params(axis="y", labelleft=False)
+    low, high = (-np.inf, np.inf) if y.empty else _with_margin(y)
+    beyond = np.count_nonzero((y.values[y.used] < low) | (y.values[y.used] > high))
+    table.head(
+        figure,
+        y.title,
+        "line: median, band: 5-95 %",
+        f"dots: elements, {_DOTS} by lot" if np.count_nonzero(y.used) > _DOTS else "",
+        _not_finite(table, y),
+        f"{beyond} beyond the panel" if beyond else "",
+        _first(len(axes), len(table.axes), "axes"),
+    )
+    return figure
+
+
+def _with_margin(y: Column) -> tuple[float, float]:
+    """A view with some room to either side: the marks of what failed lie there."""
+    low, high = y.view
+    if y.log:
+        wide = (max(abs(low), abs(high)) / min(abs(low), abs(high))) ** 0.07
+        return (low / wide, high * wide) if low > 0.0 else (low * wide, high / wide)
+    return low - 0.07 * (high - low), high + 0.07 * (high - low)
+
+
+def _binned(x: Column, y: Column) -> tuple[np.ndarray, np.ndarray] | None:
+    """Medians of an axis (b,) in bins of equal count, or at each of few values, with quantiles 5,
+    50 and 95 % of a result (3, b); None for fewer than two bins."""
+    order = np.flatnonzero(x.used & y.used)
+    order = order[np.argsort(x.values[order])]
+    along, values = x.values[order], y.values[order]
+    if x.few:
+        starts = np.flatnonzero(np.diff(along, prepend=-np.inf) > 0)
+    else:
+        count = min(_BINS, along.size // _A_BIN)
+        starts = np.linspace(0, along.size, count + 1).astype(int)[:-1]
+        # Equal values stay together: an element's bin shall not hang on the order of the sweep.
+        starts = np.unique(np.searchsorted(along, along[starts]))
+    if starts.size < 2:
+        return None
+    # Quantiles and not mean and sd: a few runs that nearly diverge would move both out of the
+    # panel.
+    parts = [np.quantile(part, [0.05, 0.5, 0.95]) for part in np.split(values, starts[1:])]
+    return np.array([np.median(p) for p in np.split(along, starts[1:])]), np.array(parts).T
+
+
+def maps(table: Table, result: str) -> Figure | None:
+    """The median of a result over each pair of axes. None as for `slices`, and for one axis."""
+    every = list(itertools.combinations(table.axes, 2))
+    if result not in table.results or not every:
+        return None
+    # All pairs of four axes rather than one axis with many.
+    pairs = sorted(every, key=lambda p: max(map(table.axes.index, p)))[:_PAIRS]
+    z = table.column(result)
+    columns = min(len(pairs), 2)
+    figure, panels = _panels(len(pairs), columns, 3.2 if columns == 1 else 2.5)
+    # About four elements a cell: the median of fewer is as rough as they are.
+    k = int(np.clip(np.sqrt(np.count_nonzero(z.used) / 4), 4, _CELLS))
+    grids = [(x.edges(k), y.edges(k)) for x, y in pairs]
+    medians = [_medians(x, y, z, grid) for (x, y), grid in zip(pairs, grids, strict=True)]
+    # One scale for all panels, so that a colour means one value; a few cells far off do not count.
+    values = np.concatenate([m[np.isfinite(m)] for m in medians])
+    low, high = np.quantile(values, [0.01, 0.99]) if values.size else (0.0, 1.0)
+    norm = LogNorm(low, high) if low > 0.0 and high > _WIDE * low else None
+    colours: dict[str, Any] = {"norm": norm} if norm else {"vmin": low, "vmax": high}
+    mesh = None
+    for ax, (x, y), (ex, ey), m in zip(panels, pairs, grids, medians, strict=True):
+        ax.set_facecolor("#F3F3F3")
+        ax.grid(visible=False)
+        failed = table.failed(x, y)
+        _crosses(ax, x.values[failed], y.values[failed])
+        x.scale(ax, "x", ex, 6)
+        y.scale(ax, "y", ey, 6)
+        if values.size:
+            mesh = ax.pcolormesh(ex, ey, m.T, cmap="viridis", rasterized=True, **colours)
+        else:
+            ax.text(0.5, 0.5, table.nothing, transform=ax.transAxes, ha="center", color=style.GREY)
+    if mesh is not None:
+        beyond = values.min() < low or values.max() > high
+        bar = figure.colorbar(mesh, ax=panels, extend="both" if beyond else "neither", shrink=0.8)
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 4)))
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+        bar.set_label(style.label(_short(z.name), z.unit))
+    table.head(
+        figure,
+        z.title,
+        "colour: median of the elements in each cell",
+        _not_finite(table, z),
+        _first(len(pairs), len(every), "pairs of axes"),
+    )
+    return figure
+
+
+def _medians(x: Column, y: Column, z: Column, grid: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The median of z in each cell, (cells of x, cells of y); NaN where there is none."""
+    use = x.used & y.used & z.used
+    if not use.any():
+        return np.full([e.size - 1 for e in grid], np.nan)
+    points = x.values[use], y.values[use], z.values[use]
+    return binned_statistic_2d(*points, "median", bins=grid).statistic  # pyright: ignore
+
+
+def corner(table: Table) -> Figure | None:
+    """Histograms of axes and results, and densities of each two of them. None without an axis."""
+    considered = [table.column(r) for r in table.results[:_VARIABLES]]
+    drawn = [c for c in considered if not c.empty]
+    # Four axes in any case: without them the results are seen, but not what they come from.
+    axes = table.axes[: max(4, _VARIABLES - len(drawn))]
+    if not axes:
+        return None
+    shown = [*axes, *drawn][:_VARIABLES]
+    n = len(shown)
+    figure = style.figure(0.9 + min(6.5, 1.9 * n), constrained=True)
+    grid = figure.subplots(n, n, squeeze=False, sharex="col")
+    # Rice's rule; and about ten elements a cell, or a density is mostly empty.
+    count = np.count_nonzero(table.ok)
+    bars = int(np.clip(2.0 * count ** (1.0 / 3.0), 4, _BARS))
+    dense = int(np.clip(np.sqrt(count / 10), 4, _BARS))
+    for row, column in itertools.product(range(n), range(n)):
+        ax, x, y = grid[row, column], shown[column], shown[row]
+        if column > row:
+            ax.remove()
+            continue
+        x.scale(ax, "x", x.edges(bars), 4, 72 // n)
+        ax.tick_params(axis="x", labelbottom=row == n - 1, labelrotation=40, labelsize=7.0)
+        if row < n - 1:
+            ax.set_xlabel("")
+        ax.grid(visible=False)
+        if row == column:
+            ax.hist(x.values[x.used], bins=list(x.edges(bars)), color=style.BLUE, alpha=0.75)
+            ax.set_yticks([])
+            ax.spines["left"].set_visible(False)
+            continue
+        y.scale(ax, "y", y.edges(bars), 5, 72 // n)
+        ax.tick_params(axis="y", labelleft=column == 0, labelsize=7.0)
+        if column:
+            ax.set_ylabel("")
+        _density(ax, x, y, dense)
+        if x.axis and y.axis:
+            failed = table.failed(x, y)
+            _crosses(ax, x.values[failed], y.values[failed])
+    there = len(table.axes) + len(table.results) - len(considered) + len(drawn)
+    empty = ", ".join(_short(c.name) for c in considered if c.empty)
+    table.head(
+        figure,
+        "Axes and results",
+        *[f"results are means over {c.mean_over} flights" for c in drawn if c.mean_over][:1],
+        f"{table.nothing}: {empty}" if empty else "",
+        _first(n, there, "variables"),
+    )
+    return figure
+
+
+def _density(ax: Axes, x: Column, y: Column, k: int) -> None:
+    """Dots of few elements, or how many are in each cell."""
+    both = x.used & y.used
+    if np.count_nonzero(both) <= _DOTS:
+        _dots(ax, x.values[both], y.values[both])
+        return
+    grid = x.edges(k), y.edges(k)
+    count = np.histogram2d(x.values[both], y.values[both], bins=grid)[0]
+    # The root, or a few full cells would leave all others white; and lighter than its darkest, so
+    # that the marks of what failed can be seen.
+    norm = PowerNorm(0.5, 0.0, 1.3 * max(1.0, float(count.max())))
+    count[count == 0] = np.nan
+    ax.pcolormesh(*grid, count.T, cmap="Blues", norm=norm, rasterized=True)
+
+
+def worst_elements(table: Table, by_result: Mapping[str, np.ndarray]) -> Figure | None:
+    """Where the worst elements of each result lie: upright axes side by side, a line for each.
+
+    `by_result` has those of each result, worst first. None where it has none.
+    """
+    axes = table.axes[:_UPRIGHT]
+    chosen = [
+        (table.column(name), np.asarray(elements)[: len(_DASHES)])
+        for name, elements in by_result.items()
+        if name in table.results and len(elements)
+    ][: len(_COLOURS)]
+    if not axes or not chosen:
+        return None
+    entries = sum(e.size for _, e in chosen)
+    figure, [ax] = _panels(1, 1, 3.2 + 0.175 * -(-entries // 2))
+    # Each axis by its own scale, from 0 to 1: they have no unit in common.
+    even = np.linspace(0.0, 1.0, 201)
+    places = np.stack(
+        [np.interp(c.values, (np.geomspace if c.log else np.linspace)(*c.view, 201), even)
+         for c in axes]
+    )  # fmt: skip
+    x = np.arange(len(axes), dtype=float)
+    lot = _by_lot(np.flatnonzero(table.ok), _LINES)
+    # One collection: hundreds of artists of their own are slow to draw.
+    lines = [np.column_stack([x, p]) for p in places[:, lot].T]
+    ax.add_collection(LineCollection(lines, colors=style.PALE, linewidths=0.6, alpha=0.5))
+    failed = table.failed()
+    _crosses(ax, np.repeat(x, failed.size), places[:, failed].ravel())
+    for k, (column, elements) in enumerate(chosen):
+        unit = "" if pretty(column.unit) == "–" else f" {pretty(column.unit)}"
+        for dashes, e in zip(_DASHES, elements, strict=False):
+            here = int(np.searchsorted(table.elements, e))
+            value = number(float(column.values[here]))
+            # Thinner for each further result: where lines coincide the one below still shows.
+            look = {"color": _COLOURS[k], "ls": dashes, "lw": 2.6 - 0.3 * k, "ms": 5.0 - 0.5 * k}
+            text = f"{_short(column.name)}: element {e}, {value}{unit}"
+            ax.plot(x, places[:, here], marker="o", label=text, zorder=4 + k, **look)
+    size, digits = (8.0, 3) if len(axes) < 8 else (7.0, 2)
+    names = [_short(c.name, 80 // len(axes)) for c in axes]
+    units = ["" if c.unit is None else f"\n[{pretty(c.unit)}]" for c in axes]
+    ax.set_xticks(x, [n + u for n, u in zip(names, units, strict=True)], size=size)
+    ax.set_xlim(-0.3, len(axes) - 0.7)
+    ax.set_ylim(-0.09, 1.09)
+    ax.set_yticks([])
+    ax.grid(visible=False)
+    ax.spines[["left", "bottom"]].set_visible(False)
+    for k, c in enumerate(axes):
+        ax.vlines(k, 0.0, 1.0, color="#444444", lw=0.8, zorder=2)
+        for value, y, va in ((c.view[0], -0.03, "top"), (c.view[1], 1.03, "bottom")):
+            end = number(float(f"{value:.{digits}g}"), digits)
+            ax.text(k, y, end, size=size, ha="center", va=va, color=style.GREY)
+    figure.legend(loc="outside lower left", ncols=2, handlelength=2.6)
+    table.head(
+        figure,
+        "Worst elements",
+        "grey: elements that are ok" + (f", {_LINES} by lot" if table.n_ok > _LINES else ""),
+        *[f"values are means over {c.mean_over} flights" for c, _ in chosen if c.mean_over][:1],
+        _first(len(axes), len(table.axes), "axes"),
+    )
+    return figure
+
+
+def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Panels in rows, each of a height [inch]."""
+    rows = -(-count // columns)
+    figure = style.figure(0.6 + rows * height, constrained=True)
+    every = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in every[count:]:
+        ax.remove()
+    return figure, list(every[:count])
+
+
+def _dots(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """Elements, the fainter the more there are."""
+    # Many are pixels in an SVG, or a browser takes seconds to draw them.
+    size, alpha = (4.5, 0.8) if x.size <= 50 else (3.0, 0.6) if x.size <= 300 else (2.0, 0.45)
+    look = {"ms": size, "mew": 0, "alpha": alpha, "color": style.PALE, "zorder": 1}
+    ax.plot(x, y, "o", rasterized=x.size > 50, label="_elements", **look)
+
+
+def _crosses(ax: Axes, x: np.ndarray, y: np.ndarray, **looks: Any) -> None:
+    """Marks of elements that are not ok."""
+    if x.size:
+        look = {"ls": "", "marker": "x", "mew": 0.7, "ms": 4.0, "alpha": 0.7, "zorder": 3, **looks}
+        colour = {"color": style.VERMILLION, "rasterized": x.size > 50, "clip_on": False}
+        ax.plot(x, y, label="_not ok", **look, **colour)
+
+
+def _first(shown: int, of: int, what: str) -> str:
+    return f"the first {shown} of {of} {what}" if shown < of else ""
+
+
+def _not_finite(table: Table, y: Column) -> str:
+    count = int(np.count_nonzero(table.ok)) - int(np.count_nonzero(y.used))
+    return f"{count} not finite" if count and not y.empty else ""
+
+
+def _short(text: str, most: int = _LETTERS) -> str:
+    """Text of at most so many letters, without its middle if need be."""
+    most = max(most, 5)
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[len(text) - most // 2 + 1 :]}"
+
+
+def _log_ticks(low: float, high: float, most: int) -> list[float]:
+    """1, 2, 5 of each decade, or 1 of each or of each second one ...: at most so many."""
+    near, far = sorted((abs(low), abs(high)))
+    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(far)) + 1)
+    ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
+    ticks = ticks[(ticks >= near) & (ticks <= far)]
+    if ticks.size < 2:  # less than a decade
+        ticks = np.linspace(near, far, 5)[1:-1]
+    elif ticks.size > most:
+        ticks = decades[(decades >= near) & (decades <= far)]
+        ticks = ticks[:: -(-ticks.size // most)]
+    return np.sort(np.sign(high) * ticks).tolist()
+
+
+def _by_lot(elements: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the elements, drawn by lot."""
+    if elements.size <= most:
+        return elements
+    # Not every k-th: of a grid that would show a few values of an axis alone. The seed is always
+    # the same, so that a figure that is drawn again is the same.
+    return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
+
+
+def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
+    """A number (n,) for each of some elements, ascending: the mean over flights, NaN where it is
+    not finite. Numbers that no picture can hold are taken as infinite, or as zero."""
+    parts = []
+    for which, part in chunks_of(variable):
+        first, last = np.searchsorted(elements, [which.start, which.stop])
+        parts.append(part[elements[first:last] - which.start].astype(np.float64))
+    values = np.concatenate(parts) if parts else np.empty(0)
+    if values.ndim > 1:
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = values.mean(axis=1)
+    # Matplotlib multiplies and divides them, which near the ends of float64 makes infinities.
+    sizes = np.abs(values)
+    return np.where(sizes < 1e100, np.where(sizes > 1e-100, values, 0.0), np.nan)

@@ -1,0 +1,714 @@
+"""Tables of the page and of the terminal: rows of text under heads."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.attitude_responses import Handling
+from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
+from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
+from heli_jax.finding import sentences
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.origins import in_words
+from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.identifiability.verdict import Z95, Combination
+from heli_jax.identification.method_comparison import MethodComparison, MethodResult
+from heli_jax.identification.model_selection import Choice
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Fit
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
+from heli_jax.identification.validation.metrics import diverges
+from heli_jax.numbers import (
+    NOTHING,
+    explained_text,
+    measured,
+    number,
+    p_value,
+    page_sentence,
+    percent,
+    relative,
+    vaf_percent,
+    with_sd,
+)
+from heli_jax.report.card import Gate, shown
+from heli_jax.report.style import pretty
+from heli_jax.vehicle import Constant
+
+NOT_DETERMINED = "not determined"
+
+
+class Table(NamedTuple):
+    """Heads and rows of text; the first column names the row."""
+
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def pairs(content: Mapping[str, object], unit: str = "") -> Table:
+    """Names and values."""
+    return Table(
+        ("", ""),
+        [(n, f"{v:.2f}{unit}" if isinstance(v, float) else str(v)) for n, v in content.items()],
+    )
+
+
+_SHARE = 0.005
+"""of the posterior variance: less is 0 % in the table, or 0.00"""
+
+
+def parameters(fit: Fit) -> Table:
+    """The free parameters; where the data do not determine one, that is said in place of it."""
+    head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
+    stopped = fit.status == "not-converged"
+    rows = [_estimate(n, e, stopped=stopped) for n, e in fit.estimates.items()]
+    if fit.coloured:
+        # What the sd would be if residuals were white, so that the price of their autocorrelation
+        # can be seen.
+        rows = [
+            (*row, NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0])
+            for row, e in zip(rows, fit.estimates.values(), strict=True)
+        ]
+        return Table((*head, "prior share", "at bound", "sd if white"), rows)
+    return Table((*head, "prior share", "at bound"), rows)
+
+
+def prior_note(problem: Problem, fit: Fit) -> str:
+    """Where the prior share of parameters without a prior comes from; empty where there is none."""
+    # A prior share without a prior would look like a mistake of the table.
+    names = [
+        n
+        for n, e in fit.estimates.items()
+        if problem.free[n].prior is None and e.prior_share >= _SHARE
+    ]
+    if not names:
+        return ""
+    others = [n for n, free in problem.free.items() if free.prior is not None]
+    of = f"the prior of {' and '.join(others)} and " if others else ""
+    return (
+        f"{', '.join(names)}: the prior share is that of {of}the weak priors of biases, initial "
+        "states and input offsets (ten times the signal)."
+    )
+
+
+def where_it_stopped(e: Estimate) -> str:
+    """The cell of an estimate of a fit that did not converge: a number that is no result."""
+    return f"{number(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
+
+
+def _estimate(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
+    cells = (where_it_stopped(e), *[NOTHING] * 3) if stopped else _cells(e)
+    share, bound = percent(e.prior_share, 0), "yes" if e.at_bound else "no"
+    return (name, *cells, pretty(e.unit), number(e.start, 5), share, bound)
+
+
+def _cells(e: Estimate | Combination) -> tuple[str, str, str, str]:
+    """Value, sd, sd over value and interval of what is determined."""
+    # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
+    # Nor is there one beside an interval without an end, which says that nothing is known.
+    if e.sd is None or not math.isfinite(e.sd):
+        return NOT_DETERMINED, NOTHING, NOTHING, NOTHING
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    interval = "not trusted" if e.lower95 is None else f"{low} to {high}"
+    return value, sd, relative(e.sd, e.value), interval
+
+
+def _signed(value: float | None, digits: int) -> str:
+    # With a minus sign, not a hyphen, as everywhere on the page.
+    return NOTHING if value is None else f"{value:+.{digits}f}".replace("-", "−")
+
+
+class Nuisances(NamedTuple):
+    """Gains, time shifts and biases; initial states apart, for there may be many."""
+
+    shown: Table
+    folded: Table
+
+
+def nuisances(fit: Fit) -> Nuisances:
+    """What was estimated beside the parameters."""
+    head = ("unknown", "estimate", "sd", "95 % interval", "unit")
+    rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
+    # With windows there is one for each window and state, which would bury the gains and biases.
+    folded = [row for n, row in rows.items() if "/initial " in n]
+    return Nuisances(
+        Table(head, [row for n, row in rows.items() if "/initial " not in n]), Table(head, folded)
+    )
+
+
+def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
+    known = e if e.lower95 is not None and e.upper95 is not None else e._replace(sd=None)
+    value, sd, _, interval = _cells(known)
+    return (name, value, sd, interval, pretty(e.unit))
+
+
+def combinations(fit: Fit) -> Table:
+    """What the data do determine where they do not determine every parameter."""
+    # Where no optimum was reached nothing is determined.
+    every = () if fit.status == "not-converged" else fit.verdict.combinations
+    rows = [(c.name, *_cells(c)) for c in every]
+    return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
+
+
+def intervals(comparison: Intervals, fit: Fit) -> Table:
+    """95 % intervals by parameter and method."""
+    methods = ("gaussian", "profile", "bootstrap", "nuts")
+    present = [m for m in methods if any(m in by for by in comparison.by_parameter.values())]
+    rows = []
+    for name, by_method in comparison.by_parameter.items():
+        cells = []
+        for m in present:
+            # All to the digits of the Gaussian sd, so that the ends can be compared by eye.
+            ends = by_method.get(m, (math.nan, math.nan))
+            low, high, _ = measured(fit.estimates[name].sd, *ends)
+            cells.append(f"{low} to {high}" if m in by_method else NOTHING)
+        rows.append((name, *cells, pretty(fit.estimates[name].unit)))
+    heads = {"gaussian": "Gaussian", "nuts": "NUTS"}
+    return Table(("parameter", *(heads.get(m, m) for m in present), "unit"), rows)
+
+
+def sampling(posterior: Posterior) -> Table:
+    """Whether the chains of NUTS agree: R-hat and effective draws by parameter, divergent steps."""
+    rows = [
+        (name, f"{c.rhat:.3f}", f"{c.effective:.0f}", NOTHING)
+        for name, c in posterior.convergence.items()
+    ]
+    chains, draws = next(iter(posterior.draws.values())).shape
+    worst = (f"{posterior.rhat:.3f}", f"{posterior.effective:.0f}")
+    total = f"{posterior.divergent} of {chains * draws}"
+    rows.append((f"worst of {chains} chains of {draws} draws", *worst, total))
+    rows.append(("expected", f"below {RHAT}", f"above {EFFECTIVE}", "0"))
+    return Table(("parameter", "R-hat", "effective draws", "divergent steps"), rows)
+
+
+def verdict(fit: Fit) -> Table:
+    """The verdict's numbers at the start values and at the estimates."""
+    n = len(fit.verdict.names)
+    columns = [
+        (
+            f"{v.rank} of {n}",
+            f"{v.rank_without_priors} of {n}",
+            number(v.condition, 3),
+            ", ".join(number(float(s), 3) for s in v.singular_values),
+            # Five digits: beyond 0.99 it is the last ones that count.
+            "; ".join(f"{p.first}, {p.second}: {_signed(p.correlation, 5)}" for p in v.pairs)
+            or "none",
+            # Components of up to 0.005 would be printed as 0.00: the direction does not have them.
+            "; ".join(
+                ", ".join(f"{n} {_signed(x, 2)}" for n, x in d.items() if abs(x) > 0.005)
+                for d in v.null_directions
+            )
+            or "none",
+        )
+        for v in (fit.verdict_before, fit.verdict)
+    ]
+    names = ("rank", "rank without priors", "condition number", "singular values",
+             "strong pairs (correlation beyond 0.99)",
+             "directions that are not identifiable (log parameters)")  # fmt: skip
+    return Table(
+        ("", "at the start values", "at the estimates"), list(zip(names, *columns, strict=True))
+    )
+
+
+def starts(fit: Fit) -> Table:
+    """Where every start led."""
+    names = list(fit.starts[0].start) if fit.starts else []
+    missing = {*fit.verdict.undetermined, *fit.verdict.without_effect}
+    rows = [
+        (
+            str(i + 1),
+            *(number(s.start[n], 4) for n in names),
+            *(NOT_DETERMINED if n in missing else number(s.end[n], 6) for n in names),
+            number(s.cost, 7),
+            str(s.steps),
+            f"optimum {s.optimum}" if s.converged else "failed",
+        )
+        for i, s in enumerate(fit.starts)
+    ]
+    # Starts beside ends: whether equal costs come from equal parameters is what several starts are
+    # for.
+    ends = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
+    return Table(("", *ends, "cost", "steps", "led to"), rows)
+
+
+def agreement(
+    fit: Fit, baseline: Baseline | None, logged: Mapping[str, tuple[str, float]] | None = None
+) -> Table:
+    """The same metrics for fit, held-out flights and RLS, output by output."""
+    head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
+    rows, units = [], logged or {}
+    sources = (
+        ("fit, simulated", fit.metrics),
+        ("fit, one step ahead", fit.one_step),
+        ("held out, simulated", fit.validation),
+        (_IN_ONE_PIECE, fit.validation_free_run),
+        ("held out, one step ahead", fit.one_step_validation),
+        # With its flight, since it saw that one alone and the fit all.
+        *([(f"RLS ({b.flight})", {b.output: b.metrics})] if (b := baseline) else ()),
+    )
+    # An output may have been measured in the flights held out alone.
+    for output in dict.fromkeys([*fit.metrics, *fit.validation]):
+        for of, metrics in sources:
+            if (m := metrics.get(output)) is None:
+                continue
+            unit, factor = units.get(output, ("", math.nan))
+            cells = (
+                *(vaf_percent(share) for share in (m.vaf, m.nrmse_fit_percent / 100)),
+                number(m.rmse),
+                number(m.tic, 3),
+                *([f"{number(m.rmse * factor)} {unit}".strip()] if units else ()),
+            )
+            if of == _IN_ONE_PIECE and diverges(m):
+                # Its numbers grow with the length of the record: they would say nothing of the
+                # model.
+                cells = ("diverges", *[NOTHING] * (len(cells) - 1))
+            rows.append((output, of, *cells))
+    return Table((*head, "RMSE as logged") if units else head, rows)
+
+
+_IN_ONE_PIECE = "held out, in one piece"
+
+
+def responses(agreement: ResponseAgreement | None) -> Table | None:
+    """The model's frequency responses against the measured ones, where these were fitted."""
+    if agreement is None:
+        return None
+    usual = f"J (usual: < {USUAL_J:g})"
+    head = ("response", "Hz", "lines", "coherence", "chi-squared", usual, "model")
+    rows = [
+        (
+            f"{p.input} to {p.output}",
+            f"{number(p.low, 2)} to {number(p.high, 2)}",
+            f"{p.lines}/{p.of}",
+            number(p.coherence, 2),
+            number(p.chi_squared, 3),
+            number(p.J, 3) if math.isfinite(p.J) else NOTHING,
+            "in windows" if p.simulated else "in windows, ends free",
+        )
+        for p in agreement.pairs
+        if p.lines
+    ]
+    between = f"{number(agreement.lower95, 3)} to {number(agreement.upper95, 3)}"
+    rows.append(("all together", "", "", "", number(agreement.chi_squared, 3), "", ""))
+    rows.append(("expected", "", "", "", between, "", ""))
+    return Table(head, rows)
+
+
+def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
+    """By flight held out what it says in frequency; None where nothing was asked."""
+    if held is None or not held.flights:
+        return None
+    # Of responses no share is asked for, and a column of dashes says nothing.
+    shares = any(f.responses is None for f in held.flights)
+    rows = []
+    for f in held.flights:
+        p = NOTHING
+        if f.estimates_p_value is not None:
+            words = f"{'differ' if f.differs else 'agree'} (p {p_value(f.estimates_p_value)})"
+            p = page_sentence(words)
+        parts = (f"{n} {explained_text(v)}" for n, v in f.explained.items())
+        between = f"{number(f.lower95, 3)} to {number(f.upper95, 3)}"
+        explained = (", ".join(parts) or NOTHING,) if shares else ()
+        rows.append((f.flight, number(f.chi_squared, 3), between, p, *explained))
+    head = ("flight, held out", "chi-squared", "expected", "its own estimates")
+    return Table((*head, "explained") if shares else head, rows)
+
+
+def held_out_bands(held: HeldOutFrequency | None) -> Table | None:
+    """By output and band the errors of the flights held out; None where there are none."""
+    if held is None or not held.bands:
+        return None
+    rows = [
+        (
+            b.output,
+            f"{number(b.low, 2)} to {number(b.high, 2)}",
+            number(b.chi_squared, 3),
+            f"{number(b.lower95, 3)} to {number(b.upper95, 3)}",
+        )
+        for b in held.bands
+    ]
+    return Table(("output, held out", "Hz", "chi-squared", "expected"), rows)
+
+
+def choice(selection: Choice) -> Table:
+    """The models compared, best AIC first."""
+    # Differences from the best: the criteria themselves grow with the record and mean nothing.
+    best_aic = min(c.aic for c in selection.candidates)
+    best_bic = min(c.bic for c in selection.candidates)
+    rows = [
+        (
+            c.name,
+            f"{c.log_likelihood:.1f}".replace("-", "−"),
+            str(c.unknowns),
+            f"{c.aic - best_aic:.1f}",
+            f"{c.bic - best_bic:.1f}",
+            "yes" if c.white else "no",
+            c.status,
+        )
+        for c in selection.candidates
+    ]
+    head = ("model", "log-likelihood", "unknowns", "AIC above", "BIC above", "white", "status")
+    return Table(head, rows)
+
+
+def acceptance(lines: tuple[Gate, ...]) -> Table:
+    """The acceptance card: what, of what, value, gate, passed or failed, remark."""
+    words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
+    rows = [
+        (g.what, g.of, page_sentence(shown(g)), g.gate or NOTHING, words[g.passed], g.remark)
+        for g in lines
+    ]
+    return Table(("", "of", "value", "gate", "", "remark"), rows)
+
+
+def residuals(fit: Fit, problem: Problem) -> Table:
+    """Noise and whiteness of every flight and output."""
+    # strict=False: behind the signals of the fitted flights come those held out, without noise.
+    stated = {
+        f"{s.flight}/{name}": sd
+        for s, f in zip(fit.signals, problem.training, strict=False)
+        for name, sd in f.sd.items()
+    }
+    rows = []
+    for name, w in fit.whiteness.items():
+        output = name.rsplit("/", 1)[-1]  # a flight's name may hold slashes as well
+        unit = pretty(naming.unit(problem.model.Outputs, output))
+        sd = number(fit.noise.get(name), 3), number(stated.get(name), 3)
+        rows.append(
+            (
+                name,
+                *sd,
+                unit,
+                "yes" if w.white else "no",
+                number(w.p_value, 2),
+                percent(w.outside, 1),
+                _signed(w.lag1, 3),
+            )
+        )
+    head = ("flight/output", "residual sd", "stated sd", "unit", "white", "p-value", "lags outside")
+    return Table((*head, "at one sample"), rows)
+
+
+def baseline_ratios(fit: Fit, baseline: Baseline) -> Table:
+    """a/Ixx and the like: as the RLS has them and as the fit has them."""
+    rows = []
+    for name, value in baseline.combinations.items():
+        # A ratio may be determined where neither of its two is: those come with an sd of their own.
+        of = next((c for c in fit.verdict.combinations if c.name == name), None) or _ratio(
+            fit, name
+        )
+        cells = (NOT_DETERMINED, NOTHING)
+        if of is not None and of.sd is not None:
+            off = percent(value / of.value - 1.0, 1) if of.value else NOTHING
+            cells = (with_sd(of.value, of.sd) if of.sd > 0 else number(of.value, 6), off)
+        rows.append((name, number(value), *cells))
+    return Table(("ratio", "RLS", "fit", "RLS against fit"), rows)
+
+
+def _ratio(fit: Fit, name: str) -> Estimate | None:
+    """`x/y` by the estimates; None where it is not determined or not of the model."""
+    over, _, under = name.partition("/")
+    v, powers = fit.verdict, {over: 1.0, under: -1.0}
+    params = naming.asdict(fit.params)
+    if not powers.keys() <= params.keys() or powers.keys() & {*v.undetermined, *v.without_effect}:
+        return None
+    return product(powers, fit.estimates, params, v.names, v.correlation)
+
+
+def product(
+    powers: Mapping[str, float],
+    estimates: Mapping[str, Estimate],
+    constants: Mapping[str, float],
+    names: Sequence[str],
+    correlation: Any,
+) -> Estimate | None:
+    """A product of powers of estimates and constants.
+
+    Args:
+        powers: by estimate or constant.
+        estimates: those of a fit.
+        constants: the numbers that it took as known.
+        names: the order of `correlation`.
+        correlation: between the estimates, (q, q).
+
+    Returns:
+        `sd` is None where an estimate is not determined; None where a part is missing, and of a
+        number below zero, whose power may not exist.
+    """
+    free = [n for n in powers if n in estimates]
+    if not free or any(n not in estimates and n not in constants for n in powers):
+        return None
+    if any(estimates[n].sd is None for n in free):
+        return combination(math.nan, None, None, None)
+    values = {n: float(estimates[n].value if n in free else constants[n]) for n in powers}
+    if not all(v > 0.0 for v in values.values()):
+        return None
+    among = np.eye(1)
+    if len(free) > 1:
+        if not set(free) <= set(names):
+            return None
+        at = [list(names).index(n) for n in free]
+        among = np.asarray(correlation, float)[np.ix_(at, at)]
+    # Of logarithms, in which a product is a sum. Both parts may be vague where a ratio is sharp:
+    # its sd takes their correlation.
+    logs = np.array([powers[n] * (estimates[n].sd or 0.0) / values[n] for n in free])
+    sd = math.sqrt(max(float(logs @ among @ logs), 0.0))
+    value = math.prod(values[n] ** power for n, power in powers.items())
+    ends = value * math.exp(-Z95 * sd), value * math.exp(Z95 * sd)
+    return combination(value, value * sd, *ends)
+
+
+def combination(
+    value: float, sd: float | None, lower: float | None, upper: float | None
+) -> Estimate:
+    """A product of powers as an estimate; its unit has no name."""
+    return Estimate(value, sd, lower, upper, "SI", math.nan, 0.0, False)
+
+
+def baseline_facts(b: Baseline) -> Table:
+    """What the recursive least squares found, in full."""
+    # The slowest first, and conjugates side by side.
+    poles = [_complex(p) for p in sorted(b.poles, key=lambda p: (-abs(p), p.imag))]
+    rows = [
+        ("from, to", f"{b.input} to {b.output}, {b.flight}"),
+        ("order, forgetting", f"{b.order}, {b.forgetting:g}"),
+        ("coefficients −a", _polynomial(b.theta[: b.order])),
+        ("coefficients b", _polynomial(b.theta[b.order :])),
+        ("poles of Hd(z)", ";  ".join(poles)),
+    ]
+    if b.continuous_num is not None and b.continuous_den is not None:
+        kind = "exact inverse of the hold" if b.exact else "not exact"
+        rows += [
+            (f"H(s), numerator ({kind})", _polynomial(b.continuous_num)),
+            (f"H(s), denominator ({kind})", _polynomial(b.continuous_den)),
+        ]
+    else:
+        rows.append(("H(s)", "none"))
+    return Table(("", "highest power first"), rows)
+
+
+def _polynomial(c: np.ndarray) -> str:
+    return ",  ".join(number(float(x), 6) for x in c)
+
+
+def _complex(p: complex) -> str:
+    size = f"size {abs(p):.4f}"
+    if abs(p.imag) < 1e-12:
+        return f"{number(p.real, 5)} ({size})"
+    sign = "+" if p.imag > 0 else "−"
+    return f"{number(p.real, 5)} {sign} {number(abs(p.imag), 5)}i ({size})"
+
+
+type Start = EquationErrorStart | FrequencyErrorStart
+
+
+def start_method(start: Start) -> str:
+    """What found the starts, in words."""
+    return "equation error" if isinstance(start, EquationErrorStart) else "frequency error"
+
+
+def first_guess(start: Start) -> Table:
+    """Where each free parameter begins, and by what."""
+    rows = []
+    for name, v in start.values.items():
+        shown = with_sd(v.value, v.sd) if v.sd else number(v.value, 4)
+        ratio = NOTHING
+        if start.selection is not None and name in start.selection.f_ratios:
+            ratio = number(start.selection.f_ratios[name], 3)
+        rows.append((name, shown, v.unit, v.origin, ratio))
+    return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
+
+
+def selection_steps(start: Start) -> Table:
+    """The steps of a stepwise selection of terms; no rows where there was none."""
+    steps = () if start.selection is None else start.selection.steps
+    rows = [
+        (
+            str(i + 1),
+            f"{s.parameter} {'in' if s.entered else 'out'}",
+            number(s.f_ratio, 3),
+            percent(s.r_squared),
+        )
+        for i, s in enumerate(steps)
+    ]
+    return Table(("step", "term", "F-ratio", "explained"), rows)
+
+
+def methods(comparison: MethodComparison) -> Table:
+    """Estimates with 95 % intervals by parameter and method, differences in joint sd."""
+    main, *others = comparison.results
+    head = ["", main.label]
+    verdicts, times = ["verdict", main.word], ["time", _seconds(main)]
+    for other in others:
+        head += [other.label, "difference [joint sd]"]
+        verdicts += [other.word, ""]
+        times += [_seconds(other), ""]
+    rows = []
+    for name in comparison.names:
+        cells = [name, _by_method(comparison.estimate(main, name))]
+        for other in others:
+            d = comparison.difference(other, name)
+            cells += [_by_method(comparison.estimate(other, name)), _signed(d, 1)]
+        rows.append(tuple(cells))
+    return Table(tuple(head), [*rows, tuple(verdicts), tuple(times)])
+
+
+def _by_method(e: Estimate | None) -> str:
+    """`0.02403 (0.02395 to 0.02411)`"""
+    if e is None:
+        return NOTHING
+    value, _, _, interval = _cells(e)
+    return value if e.sd is None else f"{value} ({interval})"
+
+
+def _seconds(result: MethodResult) -> str:
+    return f"{result.seconds:.1f} s" if result.fit is not None else NOTHING
+
+
+_WORDS = {
+    "bandwidth": "bandwidth",
+    "phase_bandwidth": "phase bandwidth",
+    "gain_bandwidth": "gain bandwidth",
+    "w180": "ω₁₈₀",
+    "phase_delay": "phase delay",
+    "phase_delay_line": "phase delay by the line",
+    "crossover": "crossover",
+    "phase_margin": "phase margin",
+    "gain_margin": "gain margin",
+}
+_NO_RESULT = "the parameters that it hangs on are not determined, or no optimum was reached."
+_HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
+"""what the terminal shows"""
+_AS_READ = {"s": ("ms", 1e3)}
+"""by SI unit the one that is shown, and how many make it: delays are milliseconds"""
+
+
+def handling(entries: Sequence[Handling]) -> Table:
+    """A row for each number of each response, with the columns that were asked for."""
+    sources = _sources(entries)
+    rows = []
+    for entry in entries:
+        for name in NUMBERS[entry.pair.kind]:
+            cells = (_cell(getattr(entry, s), name) for s in sources)
+            rows.append((entry.pair.words, _WORDS[name], *cells, _unit(name)[0]))
+    return Table(("response", "", *sources, "unit"), rows)
+
+
+def _sources(entries: Sequence[Handling]) -> tuple[str, ...]:
+    return tuple(s for s in ("model", "data") if any(getattr(e, s) is not None for e in entries))
+
+
+def _cell(of: HandlingQualities | str | None, name: str) -> str:
+    value = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
+    if value is None or not value.known:
+        return NOT_DETERMINED
+    # Pilots' criteria count in rad/s, rotors and filters in Hz.
+    hz = f", {number(value.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
+    return _shown(value, _unit(name)[1]) + hz
+
+
+def _unit(name: str) -> tuple[str, float]:
+    return _AS_READ.get(UNITS[name], (UNITS[name], 1.0))
+
+
+def _shown(n: Number, times: float) -> str:
+    value, low, high, _ = measured(
+        times * n.sd, *(times * v for v in (n.value, n.lower95, n.upper95))
+    )
+    return f"{value} ({low} to {high})"
+
+
+def handling_sentences(entries: Sequence[Handling]) -> list[str]:
+    """Why numbers are missing, and what is to be heeded."""
+    said = []
+    for entry in entries:
+        for source in _sources(entries):
+            of = getattr(entry, source)
+            sentences = (of,) if isinstance(of, str) else () if of is None else of.sentences
+            if isinstance(of, HandlingQualities) and not all(n.known for n in of.numbers.values()):
+                sentences = (*sentences, _NO_RESULT)
+            said += [f"{entry.pair.words}, {source}: {s}" for s in sentences]
+    return said
+
+
+def handling_lines(entries: Sequence[Handling]) -> list[str]:
+    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5 to 5.3), 0.812 Hz`"""
+    sources = _sources(entries)
+    lines = []
+    for entry in entries:
+        parts = []
+        for name in _HEADLINES:
+            if name in NUMBERS[entry.pair.kind]:
+                cells = ", ".join(f"{s} {_cell(getattr(entry, s), name)}" for s in sources)
+                parts.append(f"{_WORDS[name]} [{_unit(name)[0]}] {cells}")
+        lines.append(f"{entry.pair.words}: {'; '.join(parts)}")
+    return lines
+
+
+class Origin(NamedTuple):
+    """Where one flight came from."""
+
+    flight: str
+    facts: Table
+    notes: tuple[str, ...]
+
+
+def origins(fit: Fit, problem: Problem) -> list[Origin]:
+    """The flights, in order: the fitted ones first."""
+    # The order of fit.signals, which is not that of the configuration.
+    flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
+    listed = []
+    for signals, flight in zip(fit.signals, flights, strict=True):
+        rows = [
+            ("used for", "validation alone" if flight.hold_out else "the fit"),
+            (
+                "samples",
+                f"{flight.n_samples} at {1 / flight.dt:g} Hz, {flight.duration:.6g} s",
+            ),
+        ]
+        if flight.source:
+            start, end = flight.window
+            rows.append(("window", f"{start:.6g} s to {end:.6g} s from the log's beginning"))
+            # An autopilot's clock rarely begins at zero: by this a moment is found in the raw log.
+            first = f"{flight.source.first_time:.15g} s of the log's own clock"
+            rows.append(("log's beginning", first))
+        if flight.known:
+            values = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
+            rows.append(("differs in", values))
+        rows += [(f"{n} between samples", words) for n, words in _holds(flight).items()]
+        source = flight.source
+        if source:
+            listed_signals = (*source.inputs.items(), *source.outputs.items())
+            rows += [(f"{n} in the log", in_words(signal)) for n, signal in listed_signals]
+        rows.append(("file", source.path if source else "given in memory, no file"))
+        if source:
+            rows.append(("sha256", source.sha256))
+        notes = tuple(sentences(source.notes)) if source else ()
+        listed.append(Origin(signals.flight, Table(("", ""), rows), notes))
+    return listed
+
+
+def _holds(flight: Flight) -> dict[str, str]:
+    """By input what it is taken to do between samples, and why."""
+    # Only what was read off the log has a reason; the rest was stated in the configuration.
+    return {
+        n: f"{hold} ({flight.hold_reason.get(n, 'as stated')})" for n, hold in flight.hold.items()
+    }
+
+
+def constants(problem: Problem, vehicle_constants: Mapping[str, Constant]) -> Table:
+    """The vehicle as it was given: value in SI, unit, meaning, source."""
+    rows = []
+    for name, c in vehicle_constants.items():
+        # The value is SI, as the model's unit is; the one in the file may be another.
+        unit = naming.unit(problem.model.Params, name) or c.unit
+        role = "estimated, this is the file's value" if name in problem.free else "fixed"
+        meaning = naming.meaning(problem.model.Params, name)
+        rows.append((name, number(c.value, 8), pretty(unit), role, meaning, c.source))
+    return Table(("constant", "value", "unit", "in this fit", "meaning", "source"), rows)
