@@ -95,10 +95,16 @@ def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
     # '[deg]' in a unit or a signal's name is markup to rich and would vanish, ':m:' an emoji.
     # Printed here: rich ends the program where nobody reads any more.
     text = io.StringIO()
-    plain = {"highlight": False, "markup": False, "emoji": False}
-    terminal = sys.stdout.isatty()
-    Console(file=text, force_terminal=terminal, width=width + _BETWEEN, **plain).print(table)
-    print(text.getvalue(), end="")
+    console = Console(
+        file=text,
+        force_terminal=sys.stdout.isatty(),
+        width=width + _BETWEEN,
+        highlight=False,
+        markup=False,
+        emoji=False,
+    )
+    console.print(table)
+    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
 
 
 def say(text: str) -> None:

@@ -8,9 +8,6 @@ from pydantic import Field, model_validator
 from heli_jax.config.section import Section
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 

@@ -304,8 +304,9 @@ class FitConfig(Section):
         """`instrument` as a `Problem` has it: () for none, None where nothing is stated."""
         if self.instrument == "none":
             return ()
-        names = self.instrument
-        return (names,) if isinstance(names, str) else names and tuple(names)
+        if self.instrument is None:
+            return None
+        return (self.instrument,) if isinstance(self.instrument, str) else tuple(self.instrument)
 
     @model_validator(mode="after")
     def _another_start(self) -> "FitConfig":

@@ -214,7 +214,7 @@ def _window(problem: Problem, span: _Span, sd: np.ndarray, excluded: str) -> Win
 
 def _simulated(
     problem: Problem, at: Solution, e: Evaluation, samples: int
-) -> tuple[Sensitivity, list[tuple[_Span, np.ndarray]], tuple[str, ...]]:
+) -> tuple[Sensitivity, list[tuple[_Span, np.ndarray]], tuple[Finding, ...]]:
     """The rows of all windows, each simulated from an initial state of its own, and what is to be
     said of these."""
     cell = (
