@@ -1,7 +1,6 @@
 """`heli-jax info` and `heli-jax convert` on logs of every kind."""
 
 import json
-import resource
 import subprocess
 import sys
 
@@ -179,18 +178,14 @@ def test_hostile_names_do_no_harm(tmp_path, capsys):
 @pytest.mark.parametrize(
     "name", ["rotorflight/LOG246.TXT", "ulog/sample_log_small.ulg", "dataflash/test.BIN"]
 )
-def test_info_is_quick_and_without_jax(name):
+def test_info_goes_without_jax(name):
     program = (
-        "import sys, time\nfrom heli_jax.cli import main\n"
+        "import sys\nfrom heli_jax.cli import main\n"
         f"main(['info', {str(DATA / name)!r}])\n"
         "assert not {'jax', 'pandas', 'scipy', 'matplotlib'} & {*sys.modules}\n"
     )
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert run.returncode == 0, run.stderr
-    took = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    assert took < 1.5  # 0.7 on a machine of its own
 
 
 def test_topics_are_told_apart_in_a_conversion_of_all(tmp_path):
