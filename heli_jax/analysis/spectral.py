@@ -26,13 +26,10 @@ The report's spectra and coherences (`spectra`, `partial_coherence`) are Welch's
 """
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.window_errors import Z95, student95
@@ -224,47 +221,6 @@ class Responses(NamedTuple):
     """(k,) independent ones"""
     ends: np.ndarray | None = None
     """(k, m, m) what of each input in the window's slope counts as each input [1/s]"""
-
-
-def chirp_z(
-    x: Float[np.ndarray | Array, "... N"], dt: float, omega: Float[np.ndarray, " k"]
-) -> Complex[Array, "... k"]:
-    """The sums over n of x[n] exp(-i omega n dt), by Bluestein's (1970) convolution.
-
-    Args:
-        dt: between two samples [s].
-        omega: (k,) [rad/s], equally spaced.
-
-    Raises:
-        ValueError: they are not equally spaced.
-    """
-    k = omega.size
-    N = x.shape[-1]
-    spacing = (omega[-1] - omega[0]) / max(k - 1, 1)
-    if np.max(np.abs(omega - omega[0] - spacing * np.arange(k))) > 1e-9 * np.max(np.abs(omega)):
-        raise ValueError("omega: expected equally spaced frequencies")
-    # In extended precision: the squares of indices turn the angle millions of times.
-    j, step = np.arange(max(N, k)).astype(np.longdouble), np.longdouble(spacing) * dt
-    turn = np.longdouble(2.0) * np.arccos(np.longdouble(-1.0))
-    half = np.exp(1j * np.fmod(0.5 * step * j * j, turn).astype(float))
-    lead = np.exp(-1j * np.fmod(np.longdouble(omega[0]) * dt * j[:N], turn).astype(float))
-    rows = jnp.asarray(x).reshape(-1, N)
-    return _bluestein(rows, jnp.asarray(half), jnp.asarray(lead / half[:N]), k).reshape(
-        *x.shape[:-1], k
-    )
-
-
-@partial(jax.jit, static_argnames="k")
-def _bluestein(
-    x: Float[Array, "c N"], half: Complex[Array, " j"], lead: Complex[Array, " N"], k: int
-) -> Complex[Array, "c k"]:
-    """n j = (n^2 + j^2 - (j - n)^2) / 2 makes a convolution of the transform."""
-    N = x.shape[1]
-    length = 1 << (N + k - 2).bit_length()
-    b = jnp.zeros(length, half.dtype).at[:k].set(half[:k])
-    b = b.at[length - N + 1 :].set(half[N - 1 : 0 : -1])
-    transformed = jnp.fft.fft(x.astype(lead.dtype) * lead[None], length) * jnp.fft.fft(b)[None]
-    return jnp.fft.ifft(transformed)[:, :k] / half[None, :k]
 
 
 def cross_spectra(

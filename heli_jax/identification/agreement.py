@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.dynamics.disturbance import lacks_disturbance
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -154,9 +154,12 @@ def coloured_residuals(
             )
         ]
     if converged:
-        better = layout.model.noise_intensity is None and bool(disturbable(layout.model))
         words += " The intervals allow for the residuals' autocorrelation"
-        words += ", which filter-error would use for a better estimate." if better else "."
+        words += (
+            ", which filter-error would use for a better estimate."
+            if lacks_disturbance(layout.model)
+            else "."
+        )
     return [note(COLOURED, words, *not_white, value=worst.lag1)]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.dynamics.disturbance import lacks_disturbance
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, sentences
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -237,9 +237,7 @@ class Fit:
     @property
     def disturbable(self) -> bool:
         """Whether filter error could be tried: its model has an axis to disturb and none yet."""
-        # A disturbance on one axis already: its model has all that filter error asks for.
-        model = self.reached.layout.model
-        return model.noise_intensity is None and bool(disturbable(model))
+        return lacks_disturbance(self.reached.layout.model)
 
     # `unknowns` counts noise, disturbance and initial states too: models that differ in these are
     # compared by differences of the criteria, in which the constants of the likelihood cancel.

@@ -6,7 +6,6 @@ import scipy.signal
 
 from heli_jax.analysis.spectral import (
     TooFewAveragesError,
-    chirp_z,
     combined,
     cross_spectra,
     responses,
@@ -40,15 +39,6 @@ def test_spectra_and_coherence_are_those_of_scipy(noise):
         np.testing.assert_allclose(spectra.S[:, a, b], theirs, atol=1e-12 * np.max(np.abs(theirs)))
     theirs = scipy.signal.coherence(noise[0], noise[1], **same)[1][4:60]
     np.testing.assert_allclose(responses(spectra, [0], [1]).coherence[:, 0, 0], theirs, atol=1e-10)
-
-
-def test_the_chirp_z_transform_is_the_sum_it_says(noise):
-    x = noise[:, :1500]
-    omega = np.linspace(0.3, 40.0, 97)
-    direct = x @ np.exp(-1j * np.outer(np.arange(1500), omega * DT))
-    np.testing.assert_allclose(np.asarray(chirp_z(x, DT, omega)), direct, rtol=1e-10)
-    with pytest.raises(ValueError, match="equally spaced"):
-        chirp_z(x, DT, np.array([1.0, 2.0, 4.0]))
 
 
 def test_partial_coherence_is_that_of_what_the_others_leave():
