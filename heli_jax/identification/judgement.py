@@ -149,11 +149,8 @@ def judge(
         numbers = numbers_of(errors)
     misfits: list[Finding] = []
     named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
-    if arrived and explains and not (ahead or instruments or any(f.present for f in feedback)):
-        in_colour = errors.coloured and not layout.estimator.noise_spectrum
-        flights = labels(problem.training)
-        misfits += late_stick(problem, at, end.e, named)
-        misfits += unmodelled(at, end.e, coloured=in_colour, flights=flights)
+    if arrived and explains and not instruments:
+        misfits += _misfits(end, errors, named, in_loop=ahead or any(f.present for f in feedback))
     held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the vehicle either.
@@ -167,6 +164,24 @@ def judge(
         *adequacy.findings,
     )
     return Judgement(errors, numbers, adequacy, loop, responses, findings)
+
+
+def _misfits(
+    end: End,
+    errors: StandardErrors,
+    estimates: Mapping[str, tuple[float, float | None]],
+    *,
+    in_loop: bool,
+) -> list[Finding]:
+    """What the residuals tell of what the model lacks: of `in_loop` at what time inputs act."""
+    problem, at, e = end.problem, end.at, end.e
+    timing, lacking = late_stick(problem, at, e, estimates), ()
+    if not in_loop:
+        in_colour = errors.coloured and not at.layout.estimator.noise_spectrum
+        lacking = unmodelled(at, e, coloured=in_colour, flights=labels(problem.training))
+    # A lag that is missing shows in both, and in the residual more closely.
+    told = {f.code for f in lacking}
+    return [*(f for f in timing if f.code not in told), *lacking]
 
 
 def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:

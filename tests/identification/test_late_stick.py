@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Nuisance, Problem, check, fit
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.flights.holds import decide
 from tests.identification.lag import LAG, Params, response
 
@@ -76,3 +77,55 @@ def test_check_says_what_half_a_sample_of_the_stick_does():
     assert finding.severity == "doubt"
     # exp(Lp t) is as much off by 10 ms as Lp is by a tenth or two.
     assert 0.1 < finding.value < 0.3
+
+
+def in_a_loop(*, late=0, delayed=0, seed=1):
+    """Filter error on a rate that gusts move, with a stick that takes some of it back.
+
+    Args:
+        late: samples by which the stick stands too late in its log.
+        delayed: samples after which the machine answers.
+        seed: of stick, gusts and noise.
+    """
+    rng, dt, n = np.random.default_rng(seed), LOGGED, 1000
+    steps = np.repeat(rng.uniform(-0.15, 0.15, n // 25), 25)
+    # Exact for an input, and a gust, that are held over a sample.
+    grow, tau, gust, rate = np.exp(-4.0 * dt), 0.5, 0.0, 0.0
+    stick, p = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        p[k] = rate
+        stick[k] = steps[k] - 0.15 * rate
+        acts = stick[k - delayed] if k >= delayed else 0.0
+        rate = grow * rate + (1.0 - grow) / 4.0 * (20.0 * acts + gust)
+        part = np.exp(-dt / tau)
+        gust = part * gust + 0.5 * np.sqrt(1.0 - part**2) * rng.standard_normal()
+    p += 0.02 * rng.standard_normal(n)
+    logged = np.concatenate([np.zeros(late), stick[: n - late]])
+    model = with_disturbance(LAG, "p")
+    vehicle = model.Params(Lp=-2.0, Ld=10.0, sigma_w=1.0, tau_w=1.0)
+    flight = Flight(dt, {"d": logged}, {"p": p})
+    free = {"Lp": Free(-2.0), "Ld": Free(10.0)}
+    return fit(Problem(model, vehicle, [flight], free, method="filter-error"))
+
+
+@pytest.mark.parametrize(
+    ("late", "delayed", "code"),
+    [(3, 0, "timing.late-input"), (0, 3, "dynamics.residual-follows-input")],
+)
+def test_in_a_closed_loop_an_input_at_another_time_takes_the_intervals(late, delayed, code):
+    found = in_a_loop(late=late, delayed=delayed)
+    [finding] = [f for f in found.findings if f.code == code]
+    assert finding.value == pytest.approx(3 * LOGGED)
+    # True are -4 and 20.
+    assert abs(found.estimates["Ld"].value - 20.0) > 3.0
+    assert finding.shifts["Ld"] > 0
+    assert found.distrusts["Ld"].code == code
+    assert found.exit_code == 3
+
+
+def test_in_a_closed_loop_a_sound_record_stays_sound():
+    found = in_a_loop()
+    assert found.exit_code == 0
+    for name, true in (("Lp", -4.0), ("Ld", 20.0)):
+        estimate = found.estimates[name]
+        assert abs(estimate.value - true) < 3.0 * estimate.sd

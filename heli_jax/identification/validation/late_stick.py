@@ -1,13 +1,19 @@
-"""Whether the inputs look later than they acted, by less than the motion itself would show.
+"""Whether the inputs stand in the log, or act in the model, at another time than they acted.
 
 A logger that reads a stick at 50 Hz stamps a step at the sample after it: half a sample late on
 average. `late_inputs` sees an input that moves after its answer; a few ms hide in the estimates,
 which take them up as a faster machine. So the derivative of the residuals by a shift of the inputs
 is asked for (a score test, Rao, 1948): what is left of it beside the sensitivities says how late
 they are, and what it has in common with them by how much that moves the estimates.
+
+Whole samples show by the likelihood itself: with each input earlier or later it falls, unless the
+record is late or the model lacks a lag. That holds in a closed loop too. An input that follows the
+response knows the errors of later samples, but takes them back: used too early it foretells them
+with the wrong sign.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -24,9 +30,12 @@ from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.late_inputs import LATE
 from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
 from heli_jax.identification.validation.signal_quality import facts_of
+from heli_jax.identification.validation.unmodelled import LAG
 
 _CLEAR = 5.0
-"""sds from zero, from which on a shift is spoken of"""
+"""sds from zero, from which on a shift is spoken of; of twice the log-likelihood the square"""
+_FARTHEST = 0.5
+"""[s] that an input is moved at most"""
 _LARGE = 0.1
 """of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
 _NULL = 1e-8
@@ -57,6 +66,14 @@ def late_stick(
     """
     if "time_shift" in estimates:
         return _freed(problem, *estimates["time_shift"])
+    samples = _displaced(problem, at, e)
+    # What is late by one sample may be so by less, which the derivative tells.
+    within = _within_a_sample(problem, at, e) if not samples or samples.first[1] == -1 else []
+    return within or ([_of_samples(at, e, samples)] if samples else [])
+
+
+def _within_a_sample(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
+    """By the derivative of the residuals, of inputs as a log has them."""
     slope = _by_shift(problem, at)
     if slope is None:
         return []
@@ -69,25 +86,142 @@ def late_stick(
         return []  # a free delay stands for it already
     # The residuals are s times the lateness, and fall by as much with a shift of that size.
     seconds = float(left @ r) / power
-    own = left * (r - left * seconds)
-    count = max(1, round(_BLOCK / float(at.data.flights[0].dt)))
-    sums = np.add.reduceat(own, np.arange(0, own.size, count))
-    # Rows that are not white tell less than as many that are.
-    sd = max(1.0 / np.sqrt(power), float(np.linalg.norm(sums)) / power)
+    sd = np.sqrt(_correlated(at, left, r) / power)
     if not seconds > _CLEAR * sd:
         return []
+    brief = _looks_late(names, seconds)
     moved = _moved(at, e, pseudoinverse(J) @ s * seconds)
+    return [_late(at, e, names, seconds, f"{brief} (sd {1e3 * sd:.2g} ms)", moved)]
+
+
+def _looks_late(names: Sequence[str], seconds: float) -> str:
     verb = "look" if len(names) > 1 else "looks"
-    brief = f"{' and '.join(names)} {verb} {1e3 * seconds:.2g} ms late"
-    each = [f"{n} by about {100 * part:+.2g} %" for n, part in _largest(moved)]
+    return f"{' and '.join(names)} {verb} {1e3 * seconds:.2g} ms late"
+
+
+def _late(
+    at: Solution,
+    e: Evaluation,
+    names: tuple[str, ...],
+    seconds: float,
+    told: str,
+    moved: Mapping[str, float],
+) -> Finding:
+    """That the response comes earlier than the inputs of these names have it."""
     words = (
-        f"{brief} (sd {1e3 * sd:.2g} ms): the response comes earlier than the model makes it. "
-        f"nuisance.time_shift: true would move {', '.join(each)}."
+        f"{told}: the response comes earlier than the model makes it. "
+        f"nuisance.time_shift: true would move {_by_percent(moved)}."
     )
+    brief, criterion = _looks_late(names, seconds), f"seconds, {_CLEAR:g} sd"
+    return Finding(LATE, "doubt", words, seconds, criterion, names, _in_units(at, e, moved), brief)
+
+
+def _by_percent(moved: Mapping[str, float]) -> str:
+    return ", ".join(f"{n} by about {100 * part:+.2g} %" for n, part in _largest(moved))
+
+
+def _in_units(at: Solution, e: Evaluation, moved: Mapping[str, float]) -> dict[str, float]:
     values = dict(zip(at.layout.of_interest, np.asarray(e.named).tolist(), strict=True))
-    shifts = {n: part * values[n] for n, part in moved.items()}
-    criterion = f"seconds, {_CLEAR:g} sd"
-    return [Finding(LATE, "doubt", words, seconds, criterion, names, shifts, brief)]
+    return {n: part * values[n] for n, part in moved.items()}
+
+
+def _correlated(at: Solution, left: np.ndarray, r: np.ndarray) -> float:
+    """By how much more the sum of left times r varies than white rows let it; 1 at least.
+
+    Args:
+        at: says how long a sample is.
+        left: (n,) what the rows are regressed on.
+        r: (n,) the rows.
+    """
+    power = float(left @ left)
+    own = left * (r - left * (float(left @ r) / power))
+    count = max(1, round(_BLOCK / float(at.data.flights[0].dt)))
+    # Rows that are not white tell less than as many that are.
+    sums = np.add.reduceat(own, np.arange(0, own.size, count))
+    return max(1.0, float(sums @ sums) / power)
+
+
+class _Samples(NamedTuple):
+    """The inputs that fit better at another time."""
+
+    count: dict[str, int]
+    """samples by which each has to come later, below zero earlier"""
+    gain: float
+    """of twice the log-likelihood"""
+    there: Data
+    """with all of them there"""
+
+    @property
+    def first(self) -> tuple[str, int]:
+        """The input that is farthest from its time."""
+        return max(self.count.items(), key=lambda item: abs(item[1]))
+
+
+def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None:
+    """The inputs with which the record is likelier some samples earlier or later."""
+    layout, free = at.layout, set(problem.free)
+    if not _in_time(at) or free & set(problem.model.delay_parameters):
+        return None
+    before, dt = _left(e), float(at.data.flights[0].dt)
+    farthest, count, most = max(1, round(_FARTHEST / dt)), {}, 0.0
+
+    def gained(data: Data) -> float:
+        """Of twice the log-likelihood where the unknowns follow, and rows are as white as these."""
+        there = evaluate(layout, data, at.noise, at.z)
+        if not (np.all(np.isfinite(there.r)) and np.all(np.isfinite(there.J))):
+            return -np.inf
+        left = _left(there)
+        change = left - before
+        gain = float(before @ before - left @ left)
+        return gain / _correlated(at, change, before) if gain > 0 else gain
+
+    for name in naming.names(layout.model.Inputs):
+        if not any(np.ptp(f.inputs[name]) > 0 for f in problem.training):
+            continue
+        for sign in (-1, 1):
+            k, best = 0, 0.0
+            while abs(k) < farthest:
+                gain = gained(_shifted(at.data, (name,), (k + sign) * dt))
+                if not gain > best:
+                    break
+                k, best = k + sign, gain
+            if best > _CLEAR**2:
+                count[name], most = k, max(most, best)
+    there = at.data
+    for name, k in count.items():
+        there = _shifted(there, (name,), k * dt)
+    return _Samples(count, most, there) if count else None
+
+
+def _left(e: Evaluation) -> Float[np.ndarray, " n"]:
+    """The rows without what a step of the unknowns takes up."""
+    Q, r = _basis(np.asarray(e.J)), np.asarray(e.r)
+    return r - Q @ (Q.T @ r)
+
+
+def _of_samples(at: Solution, e: Evaluation, samples: _Samples) -> Finding:
+    """What is said of inputs at another time, with one step of the unknowns to what it makes."""
+    _, k = samples.first
+    names = tuple(n for n, other in samples.count.items() if other * k > 0)
+    seconds = abs(k) * float(at.data.flights[0].dt)
+    there = evaluate(at.layout, samples.there, at.noise, at.z)
+    step = _step(there) - _step(e)
+    moved = _moved(at, e, step)
+    gain = f"twice the log-likelihood gains {samples.gain:.3g}"
+    if k < 0:
+        return _late(at, e, names, seconds, f"{_looks_late(names, seconds)} ({gain})", moved)
+    brief = f"the response to {' and '.join(names)} comes {1e3 * seconds:.2g} ms later"
+    words = (
+        f"The response to {' and '.join(names)} comes about {1e3 * seconds:.2g} ms later than the "
+        f"model makes it ({gain}): a delay or a lag (a servo, a filter) is missing. It would move "
+        f"{_by_percent(moved)}."
+    )
+    shifts = _in_units(at, e, moved)
+    return Finding(LAG, "doubt", words, seconds, "seconds", names, shifts, brief)
+
+
+def _step(e: Evaluation) -> Float[np.ndarray, " q"]:
+    return -pseudoinverse(np.asarray(e.J)) @ np.asarray(e.r)
 
 
 def _freed(problem: Problem, value: float, sd: float | None) -> list[Finding]:
@@ -170,7 +304,7 @@ def _by_shift(
     """The inputs that move, and the derivative (n,) of the rows by how much later they come [1/s];
     None where a shift is free, or makes no sense."""
     layout, flights = at.layout, problem.training
-    if is_kinematic(layout.model) or layout.shift or layout.estimator.noise_spectrum:
+    if not _in_time(at):
         return None
     moving = tuple(
         n
@@ -190,18 +324,24 @@ def _by_shift(
     return (moving, s) if np.all(np.isfinite(s)) and np.any(s) else None
 
 
+def _in_time(at: Solution) -> bool:
+    """Whether the rows are of samples in time that inputs move, and no shift stands for them."""
+    layout = at.layout
+    spectral = layout.estimator.noise_spectrum
+    return not (is_kinematic(layout.model) or layout.shift or spectral)
+
+
 def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
-    """The inputs of these names later by so much, or earlier; half a sample at most."""
+    """The inputs of these names later by so much, or earlier; between samples their mean."""
     flights = []
     for flight in data.flights:
-        part = abs(seconds) / float(flight.dt)
         inputs = {}
         for n, samples in naming.asdict(flight.inputs).items():
             # By NumPy: each step of it would be a program of JAX's to load.
             u = np.asarray(samples)
-            first, last = (u[:1], u[:-1]) if seconds > 0 else (u[1:], u[-1:])
-            beside = np.concatenate([first, last])
-            inputs[n] = (1.0 - part) * u + part * beside if n in names else u
+            t = np.arange(u.size, dtype=u.dtype)
+            moved = np.interp(t - seconds / float(flight.dt), t, u).astype(u.dtype)
+            inputs[n] = moved if n in names else u
         flights.append(flight._replace(inputs=type(flight.inputs)(**inputs)))
     return data._replace(flights=jax.device_put(tuple(flights)))
 

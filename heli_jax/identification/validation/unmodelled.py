@@ -45,6 +45,8 @@ from heli_jax.identification.validation.score_test import (
 )
 from heli_jax.numbers import p_value
 
+LAG = "dynamics.residual-follows-input"
+"""the code of what answers an input later than the model, or beside it"""
 LEVEL, IN_COLOUR = 0.01, 1e-3
 """of all outputs and questions together; and where residuals in time are autocorrelated, as in
 strong gusts: what whitens them is then too short to leave nothing"""
@@ -262,7 +264,7 @@ def _said(
         )
     else:
         drive = moving[strong.drive]
-        code, subjects = "dynamics.residual-follows-input", (name, drive)
+        code, subjects = LAG, (name, drive)
         brief = f"the residual of {name} still follows {drive}{where}"
         what = "a mode or a lag" if strong.damping < 1.0 else "dynamics"
         remedy = f"the model lacks {what}, or this is a poor optimum (try fit.starts)"
