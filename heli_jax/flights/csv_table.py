@@ -360,11 +360,13 @@ def _unit(word: str) -> str | None:
 def _require_names(path: str, head: _Head) -> None:
     """Refuse a first line that holds a sample, and rows that commas cut at their decimal signs."""
     if any(map(is_date, head.names)) or all(map(_NUMBER.fullmatch, head.names)):
-        example = head.delimiter.join(
-            ["time", *(f"column{i}" for i in range(2, len(head.names) + 1))][:6]
-        )
+        names = ["time", *(f"column{i}" for i in range(2, len(head.names) + 1))][:6]
+        # A tab would be shown as an escape, which nobody types.
+        tabs = head.delimiter == "\t"
+        example = shown((" " if tabs else head.delimiter).join(names))
         problem = "got numbers or times, expected the names of the columns"
-        remedy = f"write a line of names above, such as {shown(example)}"
+        between = " with tabs between" if tabs else ""
+        remedy = f"write a line of names above, such as {example}{between}"
         raise wrong(path, f"{problem}; {remedy}", f"line {head.number}")
 
 

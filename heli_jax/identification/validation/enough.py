@@ -13,7 +13,7 @@ from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.identification.validation.excited_band import NOTHING, NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.feedback import feedback_notes, untested, why_untested
-from heli_jax.identification.validation.follows_response import LEVEL, STEPS, Feedback
+from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 from heli_jax.identification.validation.input_units import doubtful_inputs
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import LATE, late_inputs
@@ -128,10 +128,12 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
     aside = untested(problem)
     if not feedback:
         why = why_untested(problem)
+        if why is None:
+            return aside
         # Steps that somebody commanded follow nothing; of the rest nothing is known.
-        severity = "note" if why == STEPS else "doubt"
-        words = f"whether an input follows the response was not tested: {why}."
-        return [Finding("loop.not-tested", severity, words)] if why else aside
+        severity = "note" if why.programmed else "doubt"
+        words = f"whether an input follows the response was not tested: {why.reason}."
+        return [Finding("loop.not-tested", severity, words)]
     least = min(feedback, key=lambda f: f.p_value)
     criterion = f"p value of the surest input, {LEVEL:g}"
     present = feedback_notes(problem, feedback)

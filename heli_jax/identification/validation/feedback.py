@@ -18,6 +18,7 @@ from heli_jax.identification.validation.follows_response import (
     RATE,
     SEEN,
     Feedback,
+    Untested,
     decimated,
     feedback,
     rates_of,
@@ -28,17 +29,21 @@ from heli_jax.numbers import percent
 FEEDBACK = "loop.feedback"
 
 
-def why_untested(problem: Problem) -> str:
-    """Why nothing was tested of any flight, in words; `STEPS` where inputs move in no other way."""
+def why_untested(problem: Problem) -> Untested | None:
+    """Why nothing was tested of any flight; None where something was.
+
+    Args:
+        problem: whose flights are tested.
+    """
     reasons = {
         label: tested
         for label, f in zip(labels(problem.training), problem.training, strict=True)
-        if isinstance(tested := tested_at(f, {}, rates_of(f)[0]), str)
+        if isinstance(tested := tested_at(f, {}, rates_of(f)[0]), Untested)
     }
     kinds = list(dict.fromkeys(reasons.values()))
     if len(kinds) < 2:
-        return "".join(kinds)
-    return "; ".join(f"{label}: {reason}" for label, reason in reasons.items())
+        return kinds[0] if kinds else None
+    return Untested("; ".join(f"{label}: {one.reason}" for label, one in reasons.items()))
 
 
 def feedback_of(

@@ -30,8 +30,6 @@ from heli_jax.identification.validation.arx_residuals import Past, arx_residuals
 from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
 from heli_jax.numbers import percent
 
-STEPS = "inputs move as programmed ones do, in jumps, between rests or without anything unforeseen"
-"""the reason why nothing is tested where no input moves freely"""
 LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""
 RATE = 50.0
@@ -96,7 +94,7 @@ def feedback(
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
     tested = [tested_at(flight, earlier or {}, rate) for rate in rates_of(flight)]
-    each = [one for one in tested if not isinstance(one, str)]
+    each = [one for one in tested if isinstance(one, Tested)]
     label, found = flight.name or "flight 1", {}
     for one in each:
         for name in dict.fromkeys(n for view in one.views for n in view.free):
@@ -170,8 +168,17 @@ class Tested(NamedTuple):
     dt: float
 
 
-def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | str:
-    """What of a flight is correlated, or in words why nothing is.
+class Untested(NamedTuple):
+    """Why nothing of a flight is correlated."""
+
+    reason: str
+    """in words"""
+    programmed: bool = False
+    """whether no input moves freely: those that somebody commanded follow nothing"""
+
+
+def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
+    """What of a flight is correlated, or why nothing is.
 
     Args:
         flight: inputs and outputs as measured.
@@ -184,16 +191,21 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     inputs, outputs, parts, dt = decimated(flight, steps, rate)
     if not outputs:
         most = percent(1 - SEEN, 0)
-        return f"every output stays where it is or lacks more than {most} of its samples"
+        return Untested(f"every output stays where it is or lacks more than {most} of its samples")
     n = next(iter(outputs.values())).size
     if n < _LEAST:
-        return f"the record is too short ({n * dt:.3g} s, expected {_LEAST * dt:.3g} s at least)"
+        expected = f"expected {_LEAST * dt:.3g} s at least"
+        return Untested(f"the record is too short ({n * dt:.3g} s, {expected})")
     # Steps are slopes at a lower rate.
     quick = decimated(flight, steps, RATE).inputs
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        return STEPS
+        return Untested(
+            "inputs move as programmed ones do, in jumps, between rests or without anything "
+            "unforeseen",
+            programmed=True,
+        )
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
@@ -206,7 +218,7 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     past = arx_residuals(y, np.concatenate([y, u], axis=1))
     views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
     if not views:
-        return "too few samples stand in a row without a missing one"
+        return Untested("too few samples stand in a row without a missing one")
     return Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt)
 
 
