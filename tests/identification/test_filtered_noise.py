@@ -88,6 +88,7 @@ def test_white_noise_before_the_filters_has_its_sd_behind_them(roll, filters, ze
     assert low_pass.hz == pytest.approx(10.0, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_noise_before_a_slow_filter_is_no_gust_and_no_faster_rotor(roll):
     # Taken for white behind the filter: Lb 129, tau_f 0.045, sd 0.005.
     found = fit(problem(roll, record(2, 10.0, 5e-4), 10.0))
