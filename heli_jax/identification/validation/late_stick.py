@@ -164,6 +164,9 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
         return None
     before, dt = _left(e), float(at.data.flights[0].dt)
     farthest, count, most = max(1, round(_FARTHEST / dt)), {}, 0.0
+    # Innovations forget within a few samples: between now and the right time none need be likelier.
+    doubled = [2**k for k in range(farthest.bit_length())]
+    begun = doubled if e.innovations else doubled[:1]
 
     def gained(data: Data) -> float:
         """Of twice the log-likelihood where the unknowns follow, and rows are as white as these."""
@@ -179,12 +182,15 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
         if not any(np.ptp(f.inputs[name]) > 0 for f in problem.training):
             continue
         for sign in (-1, 1):
-            k, best = 0, 0.0
-            while abs(k) < farthest:
-                gain = gained(_shifted(at.data, (name,), (k + sign) * dt))
-                if not gain > best:
-                    break
-                k, best = k + sign, gain
+            gains = {k: gained(_shifted(at.data, (name,), sign * k * dt)) for k in begun}
+            k = max(gains, key=lambda one: gains[one])
+            best, k = gains[k], sign * k
+            for step in (sign, -sign):
+                while best > 0 and 0 < sign * (k + step) <= farthest:
+                    gain = gained(_shifted(at.data, (name,), (k + step) * dt))
+                    if not gain > best:
+                        break
+                    k, best = k + step, gain
             if best > _CLEAR**2:
                 count[name], most = k, max(most, best)
     there = at.data
