@@ -98,8 +98,6 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     where = f"{experiment.path}: flights[{i}]"
     _check(model, f, where)
     time, path = f.signals.time, experiment.path.parent / f.log
-    if not path.exists():
-        raise InputError(f"{where}.log: no file {path}")
     # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
     # window is otherwise told before minutes of reading.
     asked = f.signals.preset is not None or f.signals.ccpm is not None

@@ -150,7 +150,8 @@ def judge(
     misfits: list[Finding] = []
     named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
     if arrived and explains and not instruments:
-        misfits += _misfits(end, errors, named, in_loop=ahead or any(f.present for f in feedback))
+        simulated = not (ahead or any(f.present for f in feedback))
+        misfits += _misfits(end, errors, named, simulated=simulated)
     held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the vehicle either.
@@ -171,12 +172,13 @@ def _misfits(
     errors: StandardErrors,
     estimates: Mapping[str, tuple[float, float | None]],
     *,
-    in_loop: bool,
+    simulated: bool,
 ) -> list[Finding]:
-    """What the residuals tell of what the model lacks: of `in_loop` at what time inputs act."""
+    """Return what the rows tell of the inputs' timing and, where the simulation's residuals may be
+    asked (`simulated`), of dynamics that the model lacks."""
     problem, at, e = end.problem, end.at, end.e
     timing, lacking = late_stick(problem, at, e, estimates), ()
-    if not in_loop:
+    if simulated:
         in_colour = errors.coloured and not at.layout.estimator.noise_spectrum
         lacking = unmodelled(at, e, coloured=in_colour, flights=labels(problem.training))
     # A lag that is missing shows in both, and in the residual more closely.

@@ -178,7 +178,7 @@ class Untested(NamedTuple):
 
 
 def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
-    """What of a flight is correlated, or why nothing is.
+    """Return the signals of a flight that are correlated, or the reason why none are.
 
     Args:
         flight: inputs and outputs as measured.

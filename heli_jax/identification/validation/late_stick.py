@@ -1,4 +1,4 @@
-"""Whether the inputs stand in the log, or act in the model, at another time than they acted.
+"""Inputs that stand in the log, or act in the model, at another time than they acted.
 
 A logger that reads a stick at 50 Hz stamps a step at the sample after it: half a sample late on
 average. `late_inputs` sees an input that moves after its answer; a few ms hide in the estimates,
@@ -38,8 +38,6 @@ _FARTHEST = 0.5
 """[s] that an input is moved at most"""
 _LARGE = 0.1
 """of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
-_NULL = 1e-8
-"""directions of the scaled sensitivities below this part of the largest are left out"""
 _LEFT = 1e-3
 """part of the derivative by the shift that has to be left beside the sensitivities"""
 _BLOCK = 1.0
@@ -67,7 +65,7 @@ def late_stick(
     if "time_shift" in estimates:
         return _freed(problem, *estimates["time_shift"])
     samples = _displaced(problem, at, e)
-    # What is late by one sample may be so by less, which the derivative tells.
+    # An input that is late by one sample may be late by less, which the derivative tells.
     within = _within_a_sample(problem, at, e) if not samples or samples.first[1] == -1 else []
     return within or ([_of_samples(at, e, samples)] if samples else [])
 
@@ -79,8 +77,7 @@ def _within_a_sample(problem: Problem, at: Solution, e: Evaluation) -> list[Find
         return []
     names, s = slope
     J, r = np.asarray(e.J), np.asarray(e.r)
-    Q = _basis(J)
-    left = s - Q @ (Q.T @ s)
+    left = _beside(J, s)
     power = float(left @ left)
     if not power > _LEFT**2 * float(s @ s):
         return []  # a free delay stands for it already
@@ -107,7 +104,7 @@ def _late(
     told: str,
     moved: Mapping[str, float],
 ) -> Finding:
-    """That the response comes earlier than the inputs of these names have it."""
+    """Return the finding that the response comes earlier than these inputs have it."""
     words = (
         f"{told}: the response comes earlier than the model makes it. "
         f"nuisance.time_shift: true would move {_by_percent(moved)}."
@@ -162,7 +159,7 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
     layout, free = at.layout, set(problem.free)
     if not _in_time(at) or free & set(problem.model.delay_parameters):
         return None
-    before, dt = _left(e), float(at.data.flights[0].dt)
+    before, dt = _beside(e.J, e.r), float(at.data.flights[0].dt)
     farthest, count, most = max(1, round(_FARTHEST / dt)), {}, 0.0
     # Innovations forget within a few samples: between now and the right time none need be likelier.
     doubled = [2**k for k in range(farthest.bit_length())]
@@ -173,7 +170,7 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
         there = evaluate(layout, data, at.noise, at.z)
         if not (np.all(np.isfinite(there.r)) and np.all(np.isfinite(there.J))):
             return -np.inf
-        left = _left(there)
+        left = _beside(there.J, there.r)
         change = left - before
         gain = float(before @ before - left @ left)
         return gain / _correlated(at, change, before) if gain > 0 else gain
@@ -199,14 +196,13 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
     return _Samples(count, most, there) if count else None
 
 
-def _left(e: Evaluation) -> Float[np.ndarray, " n"]:
-    """The rows without what a step of the unknowns takes up."""
-    Q, r = _basis(np.asarray(e.J)), np.asarray(e.r)
-    return r - Q @ (Q.T @ r)
+def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), takes up."""
+    return v - J @ (pseudoinverse(J) @ v)
 
 
 def _of_samples(at: Solution, e: Evaluation, samples: _Samples) -> Finding:
-    """What is said of inputs at another time, with one step of the unknowns to what it makes."""
+    """Return the finding of inputs at another time; one step of the unknowns makes its shifts."""
     _, k = samples.first
     names = tuple(n for n, other in samples.count.items() if other * k > 0)
     seconds = abs(k) * float(at.data.flights[0].dt)
@@ -331,7 +327,7 @@ def _by_shift(
 
 
 def _in_time(at: Solution) -> bool:
-    """Whether the rows are of samples in time that inputs move, and no shift stands for them."""
+    """True if rows are samples in time that inputs move, and no free shift moves the inputs."""
     layout = at.layout
     spectral = layout.estimator.noise_spectrum
     return not (is_kinematic(layout.model) or layout.shift or spectral)
@@ -360,10 +356,3 @@ def _moved(at: Solution, e: Evaluation, step: np.ndarray) -> dict[str, float]:
         for k, name in enumerate(at.layout.of_interest)
         if name in at.layout.free and name not in at.layout.disturbance and values[k]
     }
-
-
-def _basis(J: np.ndarray) -> Float[np.ndarray, "n k"]:
-    """Orthonormal columns that span those of J (n, q)."""
-    sizes = np.linalg.norm(J, axis=0)
-    U, values, _ = np.linalg.svd(J / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
-    return U[:, values > _NULL * values[0]]
