@@ -168,13 +168,14 @@ def strongest(
     filters = _filters(records, bank, plain)
     back = np.exp(-1j * angles)
     responses = _responses(filters, back)
-    asked = _asked(
+    asked, answers = _asked(
         responses,
         _complex(known),
+        _complex(white),
         np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
         [_pair(X[:, i], back) for i in drives],
     )
-    gains = _gains(asked, _complex(white))
+    gains = _gains(asked, answers)
     k = int(np.argmax(gains))
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
@@ -190,7 +191,10 @@ def strongest(
         phases = np.cos(turns) + 1j * np.sin(turns)
         anew = _without(basis, _real(_complex(white).astype(phases.dtype) * phases))
         anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-        return _gains(asked, _complex(anew)).max(axis=(0, 1))
+        # Column by column: there are many residuals.
+        tried = _complex(anew)
+        answers = [_products(asked.filters, c, tried) for c in (asked.beside, *asked.drives)]
+        return _gains(asked, answers).max(axis=(0, 1))
 
     others = of_chance(turns[:, :_FIRST])
     if _by_chance(gain, others) < _CLEARLY:
@@ -264,55 +268,78 @@ class _Asked(NamedTuple):
 def _asked(
     filters: Complex[np.ndarray, "F K"],
     known: Complex[np.ndarray, "K q"],
+    residual: Complex[np.ndarray, "K 1"],
     beside: Complex[np.ndarray, "K b"],
     drives: list[Complex[np.ndarray, "K 2"]],
-) -> _Asked:
-    """Precompute the products that do not depend on the residual.
+) -> tuple[_Asked, list[Float[np.ndarray, "F c 1"]]]:
+    """Precompute the products that do not depend on the residual, and those with this residual.
 
     By products of columns, since the filters all act on the same ones: a basis for each filter and
-    drive would take ten times as long.
+    drive would take ten times as long. All in one product each, which reads the filters once.
 
     Args:
         filters: by line.
         known: an orthonormal basis of the sensitivities; residuals have nothing of it.
+        residual: whose products come second, of the columns beside first, then of each drive.
         beside: columns whose answer through the same filter is taken off first.
         drives: each with itself one sample later.
     """
     G = np.concatenate([np.real(filters), np.imag(filters)], axis=1)
     power = G[:, : len(known)] ** 2 + G[:, len(known) :] ** 2
-
-    def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Products (F, a, b) of two columns that are filtered both."""
-        each = np.real(np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-        return (power @ each).reshape(len(power), a.shape[1], b.shape[1])
-
-    of_beside, whole = _products(G, beside, known), both(beside, beside)
-    over = _inverse(whole - of_beside @ _turned(of_beside), whole)
-    cross, own, b = [], [], beside.shape[1]
-    for d in drives:
-        of_drive, products = _products(G, d, known), both(np.concatenate([beside, d], axis=1), d)
-        cross.append(products[:, :b] - of_beside @ _turned(of_drive))
+    b, groups = beside.shape[1], [beside, *drives]
+    ends = np.cumsum([c.shape[1] for c in groups])[:-1]
+    with_known = _products(
+        G, np.concatenate(groups, axis=1), np.concatenate([known, residual], axis=1)
+    )
+    of_known = np.split(with_known[:, :, :-1], ends, axis=1)
+    # Products of two columns that are filtered both.
+    pairs = [(beside, beside), *((np.concatenate([beside, d], axis=1), d) for d in drives)]
+    each = [np.real(_pairs(u, v)) for u, v in pairs]
+    parts = np.split(power @ np.concatenate(each).T, np.cumsum([len(u) for u in each])[:-1], axis=1)
+    whole, *of_drives = (
+        part.reshape(len(G), -1, v.shape[1]) for part, (_, v) in zip(parts, pairs, strict=True)
+    )
+    over = _inverse(whole - of_known[0] @ _turned(of_known[0]), whole)
+    cross, own = [], []
+    for of_drive, products in zip(of_known[1:], of_drives, strict=True):
+        cross.append(products[:, :b] - of_known[0] @ _turned(of_drive))
         whole = products[:, b:]
         left = whole - of_drive @ _turned(of_drive) - _turned(cross[-1]) @ over @ cross[-1]
         own.append(_inverse(left, whole))
-    return _Asked(G, beside, over, drives, cross, own)
+    answers = np.split(with_known[:, :, -1:], ends, axis=1)
+    return _Asked(G, beside, over, drives, cross, own), answers
 
 
 def _products(
     G: Float[np.ndarray, "F K2"], a: Complex[np.ndarray, "K a"], b: Complex[np.ndarray, "K b"]
 ) -> Float[np.ndarray, "F a b"]:
     """Real parts of the products of filtered columns a with columns b, in the precision of b."""
-    a, G = a.astype(b.dtype, copy=False), G.astype(np.real(b).dtype, copy=False)
-    each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-    return (G @ _real(each)).reshape(len(G), a.shape[1], b.shape[1])
+    G, each = G.astype(np.real(b).dtype, copy=False), _pairs(a.astype(b.dtype, copy=False), b)
+    each = np.concatenate([np.real(each), np.imag(each)], axis=1)
+    return (G @ each.T).reshape(len(G), a.shape[1], b.shape[1])
 
 
-def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray, "F d r"]:
-    """Gains: the part of each residual's squares that a drive through a filter explains."""
-    right = asked.over @ _products(asked.filters, asked.beside, tried)
-    out = []
-    for d, cross, own in zip(asked.drives, asked.cross, asked.own, strict=True):
-        b = _products(asked.filters, d, tried) - _turned(cross) @ right
+def _pairs(
+    a: Complex[np.ndarray, "K a"], b: Complex[np.ndarray, "K b"]
+) -> Complex[np.ndarray, "ab K"]:
+    """The product at each line of each column of a, conjugate, with each of b."""
+    # Lines last: NumPy is quick along its last axis alone.
+    a, b = np.ascontiguousarray(a.T), np.ascontiguousarray(b.T)
+    return (np.conj(a)[:, None] * b).reshape(-1, a.shape[1])
+
+
+def _gains(
+    asked: _Asked, answers: Sequence[Float[np.ndarray, "F c r"]]
+) -> Float[np.ndarray, "F d r"]:
+    """Gains: the part of each residual's squares that a drive through a filter explains.
+
+    Args:
+        asked: the products of the columns.
+        answers: those with the residuals, of the columns beside first, then of each drive.
+    """
+    right, out = asked.over @ answers[0], []
+    for b, cross, own in zip(answers[1:], asked.cross, asked.own, strict=True):
+        b = b - _turned(cross) @ right
         out.append(np.sum(b * (own @ b), axis=1))
     return np.stack(out, axis=1)
 
