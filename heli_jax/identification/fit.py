@@ -70,7 +70,6 @@ from heli_jax.identification.validation.expected_accuracy import (
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.input_units import doubtful_inputs, scaled_by
-from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
@@ -294,22 +293,13 @@ def fit(
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
-    late = _late_inputs(problem, guess.layout)
-    about_record = (*late, *cautions(problem), *record_doubts(problem))
+    about_record = (*cautions(problem), *record_doubts(problem))
     optimum = optimum._replace(notes=(*about_record, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
         run = OptimizationRun(before, points, optima, seed, timing)
         estimate = assemble(problem, search, optimum, run)
         return concluded(_with_doubtful_signals(problem, guess, estimate))
-
-
-def _late_inputs(problem: Problem, layout: Layout) -> list[Finding]:
-    """Return the inputs that are logged late where no delay and no shift is free to say so."""
-    if layout.shift or set(problem.model.delay_parameters) & set(problem.free):
-        return []
-    flights = list(zip(labels(problem.training), problem.training, strict=True))
-    return late_inputs(flights, feedback_of(problem))
 
 
 def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:

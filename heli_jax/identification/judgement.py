@@ -1,6 +1,6 @@
 """What is concluded of an optimum: whether the model explains its records, and who moved them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from heli_jax.identification.fit_notes import Numbers, absent_names
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors
-from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
@@ -49,6 +49,7 @@ from heli_jax.identification.validation.excitation_test import (
 from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of, untested
 from heli_jax.identification.validation.follows_response import Feedback
+from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import late_stick
 from heli_jax.identification.validation.logging_rate import loop_between_samples
 from heli_jax.identification.validation.metrics import Whiteness, metrics
@@ -152,6 +153,8 @@ def judge(
     if arrived and explains and not instruments:
         simulated = not (ahead or any(f.present for f in feedback))
         misfits += _misfits(end, errors, named, simulated=simulated)
+    if layout.estimator.noise_spectrum or not (arrived and explains):
+        misfits += _late_inputs(problem, layout, feedback)
     held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the vehicle either.
@@ -184,6 +187,13 @@ def _misfits(
     # A lag that is missing shows in both, and in the residual more closely.
     told = {f.code for f in lacking}
     return [*(f for f in timing if f.code not in told), *lacking]
+
+
+def _late_inputs(problem: Problem, layout: Layout, feedback: Sequence[Feedback]) -> list[Finding]:
+    """Return the inputs that an output precedes, where no likelihood tells how late they are."""
+    if layout.shift or set(problem.model.delay_parameters) & set(problem.free):
+        return []
+    return late_inputs(list(zip(labels(problem.training), problem.training, strict=True)), feedback)
 
 
 def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:

@@ -25,6 +25,8 @@ SAME = 3.84
 """squares by which a point may be worse and still be as good: the 95 % point of chi-squared"""
 _FACTOR = 1.5
 """by which each unknown is moved, up and down; those tied to it move as far, or change sign"""
+_LITTLE = 0.01 * SAME
+"""squares that are not worth a further step"""
 _STEPS = 5
 """of Gauss and Newton"""
 _RIDGE = 1.0 / 3.0
@@ -83,6 +85,8 @@ class Valley(NamedTuple):
         for _ in range(_STEPS):
             r, J = self._rows(now, priors)
             r = r - base
+            if _squares(r) < _LITTLE:
+                break  # there is no more to gain
             step = np.zeros(layout.size)
             ridge = _RIDGE * np.eye(int(moving.sum()))
             left = np.concatenate([-r, np.zeros(len(ridge))])
@@ -95,7 +99,7 @@ class Valley(NamedTuple):
             if not gained > 0:
                 break
             now = then
-            if gained < 0.01 * SAME:
+            if gained < _LITTLE:
                 break
         excess = _squares(self._rows(now, priors)[0] - base) - _squares(here - base)
         values = {n: float(v) for n, v in zip(names, now.named, strict=True)}
