@@ -118,12 +118,7 @@ def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
 
 def _print_outcome(fit: Fit) -> None:
     """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
-    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
-    if fit.status == "not-converged":
-        # What "the data determine" is a property of an optimum.
-        text = "the optimiser stopped before an optimum, and these numbers are no result."
-    converged = "converged, not identifiable" if fit.status == "not-identifiable" else fit.status
-    tell(f"{converged}: {text} adequate: {fit.adequate_in_words}")
+    tell(": ".join(fit.outcome))
     for line in fit.notes:
         tell(f"! {line}")
 

@@ -209,8 +209,8 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
     in_frequency = estimator_of(config.method).noise_spectrum
     if config.intervals.bootstrap and config.nuisance.time_shift and not in_frequency:
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, expected "
-            "one of the two"
+            f"{path}: fit.intervals.bootstrap: not available with fit.nuisance.time_shift, "
+            "expected one of the two"
         )
 
 

@@ -156,16 +156,18 @@ def judge(
     if layout.estimator.noise_spectrum or not (arrived and explains):
         misfits += _late_inputs(problem, layout, feedback)
     held = held and all(f.code != WRONG_OPTIMUM for f in adequacy.findings)
+    against = adequacy.findings
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the vehicle either.
         moved, held = {}, False
+        against = tuple(f._replace(distrusts=tuple(layout.free)) for f in against)
     loop = Loop(feedback, instruments, held)
     findings = (
         *closed_loop,
         *feedback_trust(moved, loop),
         *weak_note(weak),
         *misfits,
-        *adequacy.findings,
+        *against,
     )
     return Judgement(errors, numbers, adequacy, loop, responses, findings)
 

@@ -146,8 +146,11 @@ def _of_verdicts(fit: Fit) -> list[Gate]:
         named = ", ".join(f"{n} {percent(s, 0)}" for n, s in shares.items())
         determined = f"determined, by priors: {named}"
     adequate = f"no: {'; '.join(fit.denials)}" if fit.denials else fit.adequate_in_words
+    untrusted = fit.untrusted
+    trusted = f"not trusted: {', '.join(untrusted)}" if untrusted else "trusted"
     lines = (
         ("identifiability", "all parameters", "determined", fit.verdict.identifiable, determined),
+        ("trust", "all parameters", "trusted", not untrusted, trusted),
         ("adequacy", "the model", "not no", fit.adequate, adequate),
     )
     return [

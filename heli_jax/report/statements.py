@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.identification.agreement import COLOURED
-from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
-from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
@@ -32,54 +30,7 @@ def headline(fit: Fit) -> Headline:
     """
     code = fit.exit_code
     level = "good" if code == 0 else "bad" if code == 4 or fit.not_identifiable else "warning"
-    word, text = _determined(fit)
-    return Headline(level, word, f"{text}; adequate: {fit.adequate_in_words}")
-
-
-def further_sentences(fit: Fit) -> list[str]:
-    """The sentences of the verdict without what the headline has said already."""
-    # What the data determine is a property of an optimum.
-    if fit.status == "not-converged":
-        return []
-    v = fit.verdict
-    # One alone, of parameters that the data determine well, is what the headline says.
-    alone = len(v.sentences) == 1 and not (v.resting or fit.not_identifiable or _doubts(fit))
-    return [] if alone else list(v.sentences)
-
-
-def _determined(fit: Fit) -> tuple[str, str]:
-    """The status in words: what the data determine, and whether that may be believed."""
-    v, names = fit.verdict, tuple(fit.estimates)
-    # Before all else: what is said at a point that is no optimum holds for that point alone.
-    if fit.status == "not-converged":
-        text = "the optimiser stopped before an optimum; the numbers below are where it stopped"
-        return "not converged", text
-    if fit.status == "not-identifiable":
-        missing = [n for n in v.names if n in v.undetermined or n in v.without_effect]
-        text = f"the data do not determine {listed(missing or list(v.names))}"
-        return "converged, not identifiable", text
-    # The sentence must not credit the data with what a prior contributed.
-    who = "the data and the priors together" if v.resting else "the data"
-    text = f"{who} determine {listed(names)}"
-    doubtful = _doubts(fit)
-    return "converged", f"{text}, but {listed(doubtful)}" if doubtful else text
-
-
-def _doubts(fit: Fit) -> list[str]:
-    """What a reader has to know of estimates that are determined."""
-    v = fit.verdict
-    doubts = [f"{listed(v.roughly)} only roughly"] if v.roughly else []
-    if v.through_zero:
-        doubts.append(f"zero is in the interval of {listed(v.through_zero)}")
-    if fit.overconfident:
-        doubts.append("the intervals are too narrow")
-    if fit.untrusted:
-        doubts.append(f"{listed(fit.untrusted)} not trusted")
-    if v.condition > ILL_CONDITIONED or v.pairs:
-        doubts.append("they are hardly separated")
-    if any(e.at_bound for e in fit.estimates.values()):
-        doubts.append("an estimate is at its bound")
-    return doubts
+    return Headline(level, *fit.outcome)
 
 
 def whiteness_note(fit: Fit) -> str:

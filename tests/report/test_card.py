@@ -15,7 +15,7 @@ def test_a_sound_fit_passes(sound):
     assert failed(lines) == ()
     asked = {g.what for g in lines}
     assert {
-        "identifiability", "adequacy",
+        "identifiability", "trust", "adequacy",
         "Cramér-Rao", "insensitivity", "condition number", "largest correlation", "VAF",
         "NRMSE fit", "Theil coefficient", "Theil bias part", "Theil variance part",
         "Theil covariance part", "whiteness of residuals, p-value", "coherence",

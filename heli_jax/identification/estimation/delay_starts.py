@@ -34,6 +34,8 @@ _DAMPING = 1e-3
 """of the Gauss-Newton step, in columns of norm 1"""
 _FACTOR = 2.0
 """of a logarithm: the farthest that one step takes it"""
+_PARTS = (1.0, 0.25, 0.06)
+"""of the step, of which the first that leads down is taken"""
 _DEEP = 0.5
 """of the depth of the deepest valley, from which on another one is a start too"""
 _VALLEYS = 3
@@ -147,9 +149,11 @@ def _solved(
     step = -np.linalg.solve(A.T @ A + _DAMPING * np.eye(z.size), A.T @ r) / norms
     logarithm = (np.arange(z.size) < layout.first_nuisance) & ~without_size(layout)
     step = np.where(logarithm, np.clip(step, -_FACTOR, _FACTOR), step)
-    r, _ = evaluate(z + step)
-    stepped = _Tried(float(r @ r) if np.isfinite(r).all() else np.inf, z + step)
-    return min(begun, stepped, key=lambda tried: tried.cost)
+    for part in _PARTS:
+        r, _ = evaluate(z + part * step)
+        if np.isfinite(r).all() and r @ r < begun.cost:
+            return _Tried(float(r @ r), z + part * step)
+    return begun
 
 
 def _valleys(tried: list[_Tried]) -> list[_Tried]:

@@ -33,7 +33,7 @@ class WithoutWeakPriors(NamedTuple):
     labels: tuple[str, ...]
     """(k,) as the fit names them, as 'flight 1/bias p'"""
     switched_off: dict[str, np.ndarray]
-    """by the nuisance's switch, as 'nuisance.bias', the sensitivity (any, q) without it"""
+    """by the nuisance's switch, as 'fit.nuisance.bias', the sensitivity (any, q) without it"""
 
 
 def projected(J: np.ndarray, nuisances: np.ndarray, smallest: float | None = None) -> np.ndarray:

@@ -206,7 +206,7 @@ def _without_weak_priors(
     # Before those stand the parameters of the disturbance and the noise's factors, of no kind.
     kinds = np.array([""] * (N.shape[1] - len(named)) + [nuisance.kind for nuisance in named])
     switched_off = {
-        f"nuisance.{kind}": projected(S, N[:, seen & (kinds != kind)], smallest)
+        f"fit.nuisance.{kind}": projected(S, N[:, seen & (kinds != kind)], smallest)
         for kind in dict.fromkeys(nuisance.kind for nuisance in named)
         if can_be_off(problem, kind)
     }

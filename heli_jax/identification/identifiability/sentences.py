@@ -33,7 +33,7 @@ class Inseparable(NamedTuple):
     nuisances: tuple[str, ...] = ()
     """what they are exchanged with where weak priors alone hold them, as 'the bias of p'"""
     switches: tuple[str, ...] = ()
-    """nuisances that would determine them if they were switched off, as 'nuisance.bias'"""
+    """nuisances that would determine them if they were switched off, as 'fit.nuisance.bias'"""
 
 
 class Weakest(NamedTuple):
@@ -251,8 +251,8 @@ def _without_effect(name: str) -> str:
 def _switch(name: str) -> str:
     """What switches an unknown off that is no parameter; empty for parameters."""
     if name.startswith("gain "):
-        return "nuisance.input_gain"
-    return "nuisance.time_shift" if name == "time_shift" else ""
+        return "fit.nuisance.input_gain"
+    return "fit.nuisance.time_shift" if name == "time_shift" else ""
 
 
 def _not_determined(group: Inseparable, facts: Facts) -> str:

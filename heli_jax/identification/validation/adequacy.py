@@ -46,7 +46,6 @@ NEARLY_WHITE = 0.1
 WORSE = -0.1
 """VAF below which not even a white residual is taken for noise alone: in a short record of noise
 chance makes it a few hundredths negative"""
-CHANCE = "what is said to be determined is so at an optimum of chance"
 EXPECTED = 9.0
 """power of the simulation's error over that which the disturbance lets expect: its square root is
 three standard deviations where the disturbance is so slow that the record holds one swing of it"""
@@ -261,7 +260,7 @@ def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
         max(o.vaf for o in outputs),
         "VAF",
         tuple(o.output for o in outputs),
-        brief=CHANCE,
+        brief="noise alone is explained as well",
         denies=True,
     )
     outputs = tuple(output._replace(adequate=False) for output in outputs)

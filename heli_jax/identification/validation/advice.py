@@ -125,7 +125,8 @@ def _sign_or_lag(
     if abs(lag) > 0 and correlation > -AGAINST and not problem.nuisance.time_shift:
         late = "later" if lag > 0 else "earlier"
         # A shift is shared by all outputs, and windows leave no room for one.
-        remedy = "" if apart or problem.window is not None else ", or set nuisance.time_shift: true"
+        shift = ", or set fit.nuisance.time_shift: true"
+        remedy = "" if apart or problem.window is not None else shift
         return False, [
             f"The simulated {name} agrees better {abs(lag):.3g} s {late}: check the time "
             f"stamps{remedy}."
@@ -143,8 +144,8 @@ def _windows(problem: Problem, diverged: bool, unstable: bool) -> list[str]:
     if not (diverged or unstable) or estimator_of(problem.method).process_noise:
         return []
     why = "diverges" if diverged else "is of an unstable model, in which any error grows"
-    needs = "" if problem.nuisance.initial_state else ", nuisance.initial_state on"
-    needs += ", nuisance.time_shift off" if problem.nuisance.time_shift else ""
+    needs = "" if problem.nuisance.initial_state else ", fit.nuisance.initial_state on"
+    needs += ", fit.nuisance.time_shift off" if problem.nuisance.time_shift else ""
     return [
         f"The simulation {why}: simulate in windows with initial states of their own "
         f"(multiple shooting; fit.shooting: {{window: 2.0}}{needs})."

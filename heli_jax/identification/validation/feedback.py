@@ -191,4 +191,4 @@ def _how_told(problem: Problem, late: Sequence[str]) -> str:
     own = dict(problem.model.delays)
     if problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late):
         return "a fit that arrives tells, by its delay"
-    return "free a delay: nuisance.time_shift, or delays of the model"
+    return "free a delay: fit.nuisance.time_shift, or delays of the model"

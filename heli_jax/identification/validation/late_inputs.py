@@ -141,7 +141,7 @@ def _finding(label: str, name: str, share: float, lead: float, output: str) -> F
     words = (
         f"{label}: {output} moves {lead:.2g} s or more before {name} does (what {name} does later "
         f"explains {percent(share, 0)} of what the past leaves of {output}): {name} is logged late "
-        "(free a delay: nuisance.time_shift, or delays of the model) or follows the response "
+        "(free a delay: fit.nuisance.time_shift, or delays of the model) or follows the response "
         "(feedback)."
     )
     criterion = f"part of what the past leaves that the later input explains, {_CLEAR:g}"

@@ -107,7 +107,7 @@ def _late(
     """Return the finding that the response comes earlier than these inputs have it."""
     words = (
         f"{told}: the response comes earlier than the model makes it. "
-        f"nuisance.time_shift: true would move {_by_percent(moved)}."
+        f"fit.nuisance.time_shift: true would move {_by_percent(moved)}."
     )
     brief, criterion = _looks_late(names, seconds), f"seconds, {_CLEAR:g} sd"
     return Finding(LATE, "doubt", words, seconds, criterion, names, _in_units(at, e, moved), brief)
@@ -268,7 +268,7 @@ def slow_sticks(
         f"{', '.join(periods)} moves in steps and was sampled at {1 / longest:.3g} Hz: a step "
         f"stands at the sample after it, up to {1e3 * longest:.2g} ms late. Half of that moves "
         f"{', '.join(each)}, beside which intervals say little: log it faster; "
-        "nuisance.time_shift: true makes up for the mean of it."
+        "fit.nuisance.time_shift: true makes up for the mean of it."
     )
     criterion = f"part of a parameter that half a sample of the stick moves, {_LARGE:g}"
     return [Finding("timing.slow-stick", "doubt", words, most, criterion)]

@@ -58,6 +58,10 @@ def _cell_text(r: float) -> str:
     return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
 
 
+_DRAWN = 1e100
+"""cost up to which a start is drawn at its own height"""
+
+
 def waterfall(starts: tuple[StartRow, ...]) -> Panels:
     """The cost that each start reached, best first; () where there is one start or none."""
     if len(starts) < 2:
@@ -65,7 +69,8 @@ def waterfall(starts: tuple[StartRow, ...]) -> Panels:
     [ax] = panels(2.8, [1.0])
     rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
     cost, x = np.array([s.cost for s in rows]), np.arange(1, len(rows) + 1)
-    finite, ok = np.isfinite(cost), np.array([s.converged for s in rows])
+    # A cost that is next to infinite leaves an axis no room.
+    finite, ok = cost < _DRAWN, np.array([s.converged for s in rows])
     low, top = (cost[finite].min(), cost[finite].max()) if finite.any() else (1.0, 1.0)
     logarithmic = low > 0 and top > 30 * low
     # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
@@ -92,7 +97,7 @@ def waterfall(starts: tuple[StartRow, ...]) -> Panels:
     title = f"{best} of {len(rows)} starts reached the best optimum"
     ax.set_title(f"{title}, {failed} failed" if failed else title, loc="left")
     if not finite.all():
-        subtitle(ax, "starts that ended without a finite cost are drawn on top")
+        subtitle(ax, f"starts that ended without a cost below {_DRAWN:g} are drawn on top")
     legend_above(ax, raised=not finite.all())
     return (ax,)
 
