@@ -38,7 +38,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     feedback_trust,
     held_upright,
-    known_no_gusts,
+    knows_no_gusts,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import (
@@ -47,7 +47,12 @@ from heli_jax.identification.validation.excitation_test import (
     unless_unrelated,
 )
 from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
-from heli_jax.identification.validation.feedback import feedback_notes, feedback_of, untested
+from heli_jax.identification.validation.feedback import (
+    FEEDBACK,
+    feedback_notes,
+    feedback_of,
+    untested,
+)
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.late_stick import late_stick
@@ -59,6 +64,8 @@ from heli_jax.identification.validation.weak_instrument import weak_by_instrumen
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
 
 
+_HELD = 1.0
+"""a mode that grows by e to this over a record shows that its vehicle is held"""
 _IN_A_LOOP = "the inputs follow the response, and the residuals are not white"
 
 
@@ -141,7 +148,7 @@ def judge(
     weak = weak_by_instrument(problem, at, J) if arrived else ()
     responses = layout.estimator.response_agreement(layout, at.data, at.noise, at.z)
     instruments = _instruments(end, responses)
-    params = params_of(problem, {k: numbers.of_interest[k] for k in layout.free})
+    params = _params(end, numbers)
     adequacy, ahead = _adequacy(end, params, responses)
     verdict = unless_explains_nothing(errors.verdict, adequacy)
     explains = verdict is errors.verdict
@@ -249,15 +256,32 @@ def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], list[Fi
     feedback = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
     white = all(w.white for w in end.white.values())
     findings = feedback_notes(problem, feedback, white)
-    if end.arrived and not end.all_white and known_no_gusts(problem, feedback):
+    if end.arrived and not end.all_white and knows_no_gusts(problem):
         # Nothing shows which of them: a disturbance in the inputs moves all.
-        findings = [
-            f._replace(severity="doubt", brief=_IN_A_LOOP, distrusts=tuple(estimates))
-            for f in findings
-        ]
+        if any(one.present for one in feedback):
+            findings = [
+                f._replace(severity="doubt", brief=_IN_A_LOOP, distrusts=tuple(estimates))
+                for f in findings
+            ]
+        elif is_unstable(problem, _params(end, numbers), _HELD):
+            findings.append(_held(tuple(estimates)))
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     fast = [f._replace(distrusts=tuple(estimates)) for f in loop_between_samples(flights, feedback)]
     return feedback, [*fast, *findings, *untested(problem)]
+
+
+def _held(names: tuple[str, ...]) -> Finding:
+    """The finding that the inputs must follow the response, whatever a test of them says."""
+    words = (
+        "The model has a mode that grows, and the record does not: the inputs hold the vehicle, so "
+        "that they follow its response. The residuals are not white, and output error is biased "
+        "where gusts act in a loop: method: filter-error with a disturbance is advised."
+    )
+    return Finding(FEEDBACK, "doubt", words, brief=_IN_A_LOOP, distrusts=names)
+
+
+def _params(end: End, numbers: Numbers) -> Any:
+    return params_of(end.problem, {k: numbers.of_interest[k] for k in end.at.layout.free})
 
 
 def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:

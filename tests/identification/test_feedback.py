@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Problem, linear_model
+from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.follows_response import feedback
 from heli_jax.naming import asdict
+from tests.identification.lag import LAG
+from tests.identification.lag import Params as LagParams
 from tests.identification.test_equation_error import ROLL, Params
 
 DT, LATE = 0.02, 5
@@ -237,3 +239,24 @@ def shared_line(loop, shared):
 def test_a_line_in_stick_and_gyro_is_no_feedback(loop, shared):
     (found,) = feedback(shared_line(loop, shared))
     assert found.present == bool(loop)
+
+
+@pytest.mark.parametrize("gust", [0.0, 0.1])
+def test_an_unstable_vehicle_is_held_whatever_a_test_of_its_inputs_says(gust):
+    rng, n = np.random.default_rng(2), 500
+    test, grow = 0.3 * np.repeat(rng.choice([-1.0, 1.0], n // 10), 10), np.exp(0.4 * DT)
+    p, d, w = np.zeros(n), np.zeros(n), 0.0
+    for k in range(n):
+        d[k] = test[k] - 0.1 * p[k]
+        if k + 1 < n:
+            p[k + 1] = grow * p[k] + (grow - 1.0) / 0.4 * (20.0 * d[k] + w)
+        part = np.exp(-DT / 0.5)
+        w = part * w + gust * np.sqrt(1.0 - part**2) * rng.standard_normal()
+    measured = p + 0.003 * rng.standard_normal(n)
+    flight = Flight(dt=DT, inputs={"d": d}, outputs={"p": measured})
+    free = {"Lp": Free(0.3), "Ld": Free(15.0)}
+    found = fit(Problem(LAG, LagParams(0.3, 15.0), [flight], free, method="output-error"))
+    told = [f for f in found.findings if f.code == "loop.feedback" and f.severity == "doubt"]
+    assert (len(told), found.exit_code) == ((1, 3) if gust else (0, 0))
+    assert not told or told[0].value is None
+    assert set(found.untrusted) == ({"Lp", "Ld"} if gust else set())

@@ -25,6 +25,9 @@ U = 0.1 * np.sign(np.sin(2.3 * T) + 0.5 * np.sin(5.1 * T)) + 0.02 * np.sin(11.0 
 P = 0.4 * np.sin(1.7 * T) + 0.2 * np.cos(4.3 * T)
 
 
+ROLL_AXES = linear_model("roll-flybarless").model.axes
+
+
 class Motor(NamedTuple):
     tau: float
 
@@ -172,3 +175,14 @@ def test_the_shaft_of_a_motor_may_turn(load):
     # No attitude and no rate of a fuselage: of how fast it may turn nothing is known.
     motor = dataclasses.replace(models.roll_on_stand, axes=(), Params=Motor)
     assert misread(SimpleNamespace(training=(renamed,), model=motor)) == []
+    # Nor is the angle of a pendulum that goes over the top an attitude, whatever it is called.
+    turning = {"phi": Signal("phi", "rad", "rad")}
+    flight = Flight(
+        dt=DT, inputs={"lat": U}, outputs={"phi": 6.0 * T}, source=Source("a", "", outputs=turning)
+    )
+    swing = dataclasses.replace(motor, axes=ROLL_AXES, linear=False)
+    assert misread(SimpleNamespace(training=(flight,), model=swing)) == []
+    helicopter = dataclasses.replace(swing, Params=models.roll_on_stand.Params)
+    assert [f.code for f in misread(SimpleNamespace(training=(flight,), model=helicopter))] == [
+        "units.in-doubt"
+    ]

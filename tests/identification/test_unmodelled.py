@@ -77,6 +77,16 @@ def with_dry_friction(u):
     return out
 
 
+def with_drag(u):
+    """p that is braked by its square as well, by steps of 1 ms."""
+    p, out = 0.0, np.zeros(N)
+    for k, x in enumerate(u):
+        out[k] = p
+        for _ in range(20):
+            p += 0.001 * (-4.0 * p - 3.0 * abs(p) * p + 20.0 * x)
+    return out
+
+
 def slowing_down(u):
     """p of a rotor that loses a fifth of its moment steadily."""
     return right(u * np.linspace(1.1, 0.9, N))
@@ -123,6 +133,7 @@ CHANGES = "dynamics.changes-over-record"
         (through_play, "output-error", 0.02, AMPLITUDE, None),
         (to_one_side, "output-error", 0.02, AMPLITUDE, None),
         (with_dry_friction, "output-error", 0.02, AMPLITUDE, None),
+        (with_drag, "output-error", 0.02, AMPLITUDE, True),
         (slowing_down, "output-error", 0.02, CHANGES, True),
     ],
 )

@@ -214,14 +214,14 @@ def _diverges(name: str, records: tuple[Record, ...]) -> bool:
     return False
 
 
-def is_unstable(problem: Problem, params: Any) -> bool:
-    """Whether a mode of the linearised model grows noticeably over the longest window; `params` is
-    a record of the model's Params, SI."""
+def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
+    """Whether a mode of the linearised model grows by e to `growth` over the longest window;
+    `params` is a record of the model's Params, SI."""
     # An eigenvalue just right of the axis is a slow drift, of which the record shows nothing.
     longest = max(f.duration for f in problem.training)
     longest = longest if problem.window is None else min(longest, problem.window)
     for flight in problem.training:
         linearised = modes_of_flight(problem.model, params, flight, problem.substeps)
-        if linearised is not None and np.max(np.real(linearised[0])) * longest > _GROWTH:
+        if linearised is not None and np.max(np.real(linearised[0])) * longest > growth:
             return True
     return False

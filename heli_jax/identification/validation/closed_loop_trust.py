@@ -254,16 +254,15 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
     )
 
 
-def known_no_gusts(problem: Problem, feedback: Sequence[Feedback]) -> bool:
-    """Whether inputs follow the response in a fit in time that knows no gusts.
+def knows_no_gusts(problem: Problem) -> bool:
+    """Whether a fit is one in time without gusts in its model.
 
     Args:
         problem: says the method.
-        feedback: of `feedback_of`.
     """
     estimator = estimator_of(problem.method)
     in_time = not (estimator.by_instrument or estimator.fits_responses)
-    return in_time and not estimator.process_noise and any(one.present for one in feedback)
+    return in_time and not estimator.process_noise
 
 
 class _Lines(NamedTuple):

@@ -134,8 +134,10 @@ def degrees_for_radians(model: Model, label: str, flight: Flight) -> Iterator[Fi
             continue
         seen = np.abs(values[np.isfinite(values)])
         unit = "deg" if signal.unit == "rad" else "deg/s"
-        # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage.
-        judged = _of_fuselage(model, str(name)) or signal.contradicted == unit
+        # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage; so
+        # may the angle of a nonlinear model of one's own, such as a pendulum.
+        turns = unit == "deg" and not (model.linear or of_helicopter(model.Params))
+        judged = (_of_fuselage(model, str(name)) and not turns) or signal.contradicted == unit
         if not seen.size or not judged:
             continue
         size, linear = float(np.percentile(seen, _MOST)), model.linear

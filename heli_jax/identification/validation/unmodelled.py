@@ -52,6 +52,8 @@ LEVEL, IN_COLOUR = 0.01, 1e-3
 strong gusts: what whitens them is then too short to leave nothing"""
 _ROUNDS = 6
 """steps at most to where a whitened residual is least"""
+_VARIES = 0.1
+"""of the mean, by which an amplitude has to vary to tell what goes with it"""
 _ENOUGH = 1.0
 """of twice the log-likelihood, by which a further step says nothing else"""
 
@@ -283,8 +285,8 @@ def _said(
 def _by_amplitude(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> np.ndarray:
-    """By unknown of interest (k,) its change over one standard deviation of the amplitude of an
-    input or of the output, whichever explains more.
+    """By unknown of interest (k,) its change from the record's mean amplitude to none, that of an
+    input, of the output or of its rate, whichever explains most.
 
     The residual is regressed on the sensitivities, and on these times the amplitude. It is not
     whitened: the answer that depends on amplitude is as slow as the response itself.
@@ -292,21 +294,23 @@ def _by_amplitude(
     k, samples = len(at.layout.of_interest), of_one_clock(at, e, name)
     left = np.concatenate([np.asarray(e.raw[i][name])[own.rows] for i, own in samples])
     rows = np.concatenate([J[i, name][own.rows] for i, own in samples])
+    inputs = [at.data.flights[i].inputs for i, _ in samples]
+    outputs = [np.asarray(e.simulated[i][name]) for i, _ in samples]
+    signals = [[np.asarray(getattr(u, drive)) for u in inputs] for drive in moving_inputs(at)]
+    signals += [outputs, [np.gradient(y) for y in outputs]]
     best, least = np.zeros(k), np.inf
-    for drive in (*moving_inputs(at), None):
-        signals = [
-            np.asarray(e.simulated[i][name] if drive is None else getattr(f.inputs, drive))[
-                own.rows
-            ]
-            for (i, own), f in ((pair, at.data.flights[pair[0]]) for pair in samples)
-        ]
-        amplitude = np.abs(np.concatenate(signals))
-        amplitude = (amplitude - amplitude.mean()) / max(float(np.std(amplitude)), 1e-300)
-        columns = np.concatenate([rows, rows[:, :k] * amplitude[:, None]], axis=1)
+    for signal in signals:
+        amplitude = np.abs(
+            np.concatenate([x[own.rows] for x, (_, own) in zip(signal, samples, strict=True)])
+        )
+        mean, sd = float(amplitude.mean()), float(np.std(amplitude))
+        if not sd > _VARIES * mean:
+            continue
+        columns = np.concatenate([rows, rows[:, :k] * (amplitude - mean)[:, None] / sd], axis=1)
         change = -pseudoinverse(columns) @ left
         squares = float(np.sum((left + columns @ change) ** 2))
         if squares < least:
-            best, least = change[rows.shape[1] :], squares
+            best, least = -change[rows.shape[1] :] * mean / sd, squares
     return best
 
 
