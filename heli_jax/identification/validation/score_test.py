@@ -138,6 +138,38 @@ def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
     return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])
 
 
+class Residual(NamedTuple):
+    """The residual of all records together, real parts above imaginary ones."""
+
+    e: Float[np.ndarray, " K2"]
+    J: Float[np.ndarray, "K2 q"]
+    known: Float[np.ndarray, "K2 r"]
+    """orthonormal columns that span those of J"""
+    white: Float[np.ndarray, "K2 1"]
+    """what these leave of e"""
+    angles: Float[np.ndarray, " K"]
+
+    @property
+    def freedom(self) -> int:
+        """How many numbers the unknowns leave."""
+        return self.e.size - self.known.shape[1]
+
+
+def residual_of(records: Sequence[Lines]) -> Residual:
+    """The residual of one output, of which `strongest` asks.
+
+    Args:
+        records: those of the output.
+    """
+    e, J, angles = (
+        np.concatenate(each)
+        for each in zip(*[(r.e, r.J, r.angles) for r in _lowest(records)], strict=True)
+    )
+    rows, v = _real(J), _real(e[:, None])
+    known = _span(rows)
+    return Residual(v[:, 0], rows, known, _without(known, v), angles)
+
+
 def strongest(
     records: Sequence[Lines],
     drives: Sequence[int],
@@ -146,6 +178,7 @@ def strongest(
     beside: Sequence[int] = (),
     plain: bool = False,
     least: float = 0.0,
+    residual: Residual | None = None,
 ) -> Strongest:
     """The strongest answer of the residual to a drive through a filter of a bank.
 
@@ -156,21 +189,16 @@ def strongest(
         beside: columns whose answer through the same filter is taken off first.
         plain: whether the drives are tried without any filter as well.
         least: gain up to which nothing but the gain is asked, as where another answer has as much.
+        residual: that of these records, where it is at hand.
     """
-    most = _LINES // len(records)
-    records = [
-        Lines(r.e[:most], r.J[:most], r.drives[:most], r.angles[:most], r.size) for r in records
-    ]
-    e, J, X, angles = (np.concatenate([record[i] for record in records]) for i in range(4))
-    known = _span(_real(J))
-    white = _without(known, _real(e[:, None]))
-    freedom = 2 * e.size - known.shape[1]
+    of, records = residual or residual_of(records), _lowest(records)
+    white, freedom = of.white, of.freedom
+    X = np.concatenate([record.drives for record in records])
     filters = _filters(records, bank, plain)
-    back = np.exp(-1j * angles)
-    responses = _responses(filters, back)
+    back = np.exp(-1j * of.angles)
     asked, answers = _asked(
-        responses,
-        _complex(known),
+        *_responses(filters, back),
+        _complex(of.known),
         _complex(white),
         np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
         [_pair(X[:, i], back) for i in drives],
@@ -180,12 +208,12 @@ def strongest(
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > max(_AT_LEAST, least):
-        nothing = np.zeros(J.shape[1])
+        nothing = np.zeros(of.J.shape[1])
         return Strongest(gain, 1.0, drive, *one, nothing, nothing, 0.0)
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
-    turns = np.random.default_rng(0).random((e.size, _SURROGATES))
-    turns, basis = (2.0 * np.pi * turns).astype(np.float32), known.astype(np.float32)
+    turns = np.random.default_rng(0).random((len(X), _SURROGATES))
+    turns, basis = (2.0 * np.pi * turns).astype(np.float32), of.known.astype(np.float32)
 
     def of_chance(turns: np.ndarray) -> np.ndarray:
         phases = np.cos(turns) + 1j * np.sin(turns)
@@ -200,9 +228,15 @@ def strongest(
     if _by_chance(gain, others) < _CLEARLY:
         others = np.concatenate([others, of_chance(turns[:, _FIRST:])])
     chance = _by_chance(gain, others)
-    G = responses[k // len(drives), :, None]
+    G = _complex(asked.filters[k // len(drives), :, None])
     columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
-    return Strongest(gain, chance, drive, *one, *_steps(_real(J), columns, _real(e[:, None])))
+    return Strongest(gain, chance, drive, *one, *_steps(of.J, columns, of.e[:, None]))
+
+
+def _lowest(records: Sequence[Lines]) -> list[Lines]:
+    """The records without the lines that are too many, of each the highest."""
+    most = _LINES // len(records)
+    return [Lines(*(v[:most] for v in record[:4]), record.size) for record in records]
 
 
 def pulled_away(records: Sequence[Lines], k: int) -> float:
@@ -213,9 +247,7 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
         records: those of one output; of their drives nothing is asked.
         k: how many of the unknowns, the first, are parameters.
     """
-    most = _LINES // len(records)
-    e = np.concatenate([record.e[:most] for record in records])
-    J = np.concatenate([record.J[:most] for record in records])
+    e, J = (np.concatenate([record[i] for record in _lowest(records)]) for i in range(2))
     nuisances = _span(_real(J[:, k:])) if J.shape[1] > k else np.zeros((2 * e.size, 0))
     whole = _real(J[:, :k])
     own = _without(nuisances, whole)
@@ -266,7 +298,8 @@ class _Asked(NamedTuple):
 
 
 def _asked(
-    filters: Complex[np.ndarray, "F K"],
+    G: Float[np.ndarray, "F K2"],
+    power: Float[np.ndarray, "F K"],
     known: Complex[np.ndarray, "K q"],
     residual: Complex[np.ndarray, "K 1"],
     beside: Complex[np.ndarray, "K b"],
@@ -278,14 +311,13 @@ def _asked(
     drive would take ten times as long. All in one product each, which reads the filters once.
 
     Args:
-        filters: by line.
+        G: responses of the filters by line, real and imaginary parts side by side.
+        power: their squared sizes.
         known: an orthonormal basis of the sensitivities; residuals have nothing of it.
         residual: whose products come second, of the columns beside first, then of each drive.
         beside: columns whose answer through the same filter is taken off first.
         drives: each with itself one sample later.
     """
-    G = np.concatenate([np.real(filters), np.imag(filters)], axis=1)
-    power = G[:, : len(known)] ** 2 + G[:, len(known) :] ** 2
     b, groups = beside.shape[1], [beside, *drives]
     ends = np.cumsum([c.shape[1] for c in groups])[:-1]
     with_known = _products(
@@ -389,16 +421,26 @@ def _filters(
 
 
 def _responses(
-    filters: Sequence[tuple[float, float]], back: np.ndarray
-) -> Complex[np.ndarray, "F K"]:
-    """Frequency responses of the filters at the lines; `back` is a delay by one sample."""
+    filters: Sequence[tuple[float, float]], back: Complex[np.ndarray, " K"]
+) -> tuple[Float[np.ndarray, "F K2"], Float[np.ndarray, "F K"]]:
+    """Frequency responses of the filters at the lines, real and imaginary parts side by side, and
+    their squared sizes.
+
+    Args:
+        filters: dampings and frequencies [rad a sample].
+        back: of a delay by one sample.
+    """
     w, damping = (np.array([one[i] for one in filters]) for i in (1, 0))
     plain = ~np.isfinite(damping)
     damping = np.where(plain, 1.0, damping)
     size = np.where(plain, 0.0, np.exp(-damping * w))
     twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+    over = np.stack([np.ones(len(w)), -twice, size**2], axis=1)
     powers = np.stack([np.ones_like(back), back, back**2])
-    return 1.0 / (np.stack([np.ones(len(w)), -twice, size**2], axis=1) @ powers)
+    # By real numbers: NumPy divides complex ones slowly.
+    real, imaginary = over @ np.real(powers), over @ np.imag(powers)
+    power = 1.0 / (real**2 + imaginary**2)
+    return np.concatenate([real * power, -imaginary * power], axis=1), power
 
 
 def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray, "K 2"]]:

@@ -40,6 +40,7 @@ from heli_jax.identification.validation.score_test import (
     Strongest,
     lines_of,
     pulled_away,
+    residual_of,
     step_to_least,
     strongest,
 )
@@ -197,18 +198,20 @@ def _of_output(
     lines, k = [one for _, one in those], len(at.layout.of_interest)
     m, columns = len(moving), lines[0].drives.shape[1]
     constant = columns - over_time[flights[0]].shape[1]
-    linear = strongest(lines, range(m), NARROW)
+    residual = residual_of(lines)
+    linear = strongest(lines, range(m), NARROW, residual=residual)
     # Of three answers the best one, of equal ones the first: chance is asked of no other.
     curved = strongest(
-        lines, range(m, constant), BROAD, beside=range(m), plain=True, least=linear.statistic
-    )
+        lines, range(m, constant), BROAD,
+        beside=range(m), plain=True, least=linear.statistic, residual=residual,
+    )  # fmt: skip
     most = max(linear.statistic, curved.statistic)
     changes = list(range(constant, columns))
     if len(lines) > 1:
         lines = of_single_flights(lines, k)
         # First: what differs from flight to flight is a change halfway as well.
         changes = [*range(columns, lines[0].drives.shape[1]), *changes]
-    changed = strongest(lines, changes, (), plain=True, least=most)
+    changed = strongest(lines, changes, (), plain=True, least=most, residual=residual)
     # Two numbers a line, each of the variance size**2.
     deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
     # Each takes up a part of the others.
