@@ -35,6 +35,7 @@ def made(tmp_path):
     return made
 
 
+@pytest.mark.slow
 def test_start_wind_pilot_and_ground(made):
     found = made(
         start={"forward_speed": 4.0, "climb": -1.0, "heading": 0.5},

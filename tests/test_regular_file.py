@@ -158,6 +158,7 @@ def test_a_terminal_is_no_configuration(tmp_path):
     assert all("got a device" in said for _, said in found)
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_only_in_a_directory_of_files(tmp_path, configuration):
     sweep = {
         "design": "grid", "inputs": "simulate", "axes": {"Ixx": {"values": [0.03, 0.04]}},

@@ -142,6 +142,7 @@ D: {az: {col: Zc}, up: {col: -Zc}}
 """
 
 
+@pytest.mark.slow
 def test_an_output_that_is_the_pushed_derivative_has_the_push(tmp_path):
     """az is w' and up is -w'; lift lacks the control and w is a state: they have the motion alone.
 

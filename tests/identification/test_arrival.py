@@ -43,6 +43,7 @@ def _stays(layout, data, noise, z0, max_steps=200, **_):
     return multistart.Optimum(z0, cost, np.asarray(9), np.asarray(True))
 
 
+@pytest.mark.slow
 def test_a_search_that_has_not_moved_did_not_converge(monkeypatch):
     flight = record(n=200, noise=2e-3)
     problem = Problem(ROLL, Params(-4.0, 25.0, 0.0), [flight], {"Lp": Free(-2.0), "Lda": Free(9.0)})

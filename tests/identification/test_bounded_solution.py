@@ -51,6 +51,7 @@ def test_a_state_that_no_output_shows_adds_nothing():
     assert not solution[1].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [("U", "D"), Machine._fields[:-1]])
 def test_slopes_of_the_bounded_solution_are_those_of_forward_differentiation(moving):
     rng = np.random.default_rng(7)

@@ -152,6 +152,7 @@ def test_a_fast_swing_is_no_white_noise():
     assert white_part(slow) == noise_guess(slow)
 
 
+@pytest.mark.slow
 def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate():
     rng = np.random.default_rng(3)
     drift = scipy.signal.lfilter([0.05], [1.0, -0.95], rng.standard_normal(N))

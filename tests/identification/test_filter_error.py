@@ -122,6 +122,7 @@ def test_missing_samples_cost_information_and_no_more(disturbed):
     assert np.isfinite(found.metrics["roll"].vaf)
 
 
+@pytest.mark.slow
 def test_noise_that_cannot_be_is_told(disturbed):
     _, problem, _ = disturbed
     [flight] = problem.flights
@@ -164,6 +165,7 @@ def test_a_flight_held_out_is_predicted_and_not_fitted(bench30, disturbed):
     assert whiteness(held.error("roll")).white
 
 
+@pytest.mark.slow
 def test_swapped_columns_are_told(bench30):
     """Where stick and angle are exchanged, an unstable model that the filter holds fits best."""
     model, _, start, flight = made(bench30, 3)

@@ -57,6 +57,7 @@ def information(u, z):
     return np.array([[a @ solve @ b + 0.5 * np.sum(A * B.T) for b, B in slopes] for a, A in slopes])
 
 
+@pytest.mark.slow
 def test_the_rows_hold_fishers_information(bench30):
     model = with_disturbance(models.roll_on_stand, "roll")
     truth = np.log([BENCH["Ixx"], SIGMA])

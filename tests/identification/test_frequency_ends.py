@@ -27,6 +27,7 @@ def heave(*flights: Flight):
     return fit(Problem(model.model, vehicle, flights, free, method="frequency-error"))
 
 
+@pytest.mark.slow
 def test_a_push_that_drifts_over_the_record_moves_no_estimate():
     calm = heave(record(0, np.zeros(N)))
     drifting = heave(record(0, np.linspace(0.0, 3.0, N)))

@@ -134,6 +134,7 @@ def test_squared_errors_alone_are_a_note(found):
     assert of(found, "same").findings == []
 
 
+@pytest.mark.slow
 def test_by_responses_a_flight_without_the_instrument_of_the_fit_is_not_judged():
     """Its responses are those of feedback, and passed for another machine (p below 1e-6)."""
     roll, dt, n = linear_model("roll-flybarless"), 0.02, 3000

@@ -66,6 +66,7 @@ def test_windows_of_a_part_count_from_the_beginning_of_its_log():
     assert (window.start, window.end) == pytest.approx((14.0, 15.98))
 
 
+@pytest.mark.slow
 def test_no_part_says_more_than_the_whole(ranked):
     whole = problem(excited(800, 1200))
     sd = np.sqrt(np.diag(check(whole).verdict.covariance))

@@ -2,6 +2,7 @@
 whose covariance is written out as a matrix."""
 
 import numpy as np
+import pytest
 import scipy.optimize
 
 from heli_jax.dynamics.model import Model
@@ -45,6 +46,7 @@ def by_matrices(left, *, restricted):
     return float(np.exp(best.x[0]))
 
 
+@pytest.mark.slow
 def test_what_a_bias_takes_up_of_the_noise_is_given_back():
     flight, left = record(3)
     free = {"bias": Free(0.0, sign="any"), "walk": Free(WALK, sign="keep")}

@@ -117,6 +117,7 @@ def test_two_modes_that_change_places_answer_alike(flight):
     assert back == pytest.approx(values, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_none_answers_alike_outside_the_bounds_or_with_a_known_inflow(flight):
     assert asked(flight, {**FREE, "Zw": Free(-0.55, -3.0, -0.1)}) == []
     # The modes cannot change places without another share of the inflow.

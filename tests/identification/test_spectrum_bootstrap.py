@@ -64,6 +64,7 @@ def test_the_stage_counts_records_and_no_steps_of_their_searches(fitted_by_lines
     assert ("bootstrap", 3) in heard.ended
 
 
+@pytest.mark.slow
 def test_responses_are_drawn_of_the_residual_at_all_lines(by_lines):
     options = ResponseOptions(window=10.0)
     responses = fit(replace(by_lines, method="frequency-response", frequency=options))

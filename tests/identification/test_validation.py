@@ -80,6 +80,7 @@ def test_the_initial_state_of_a_flight_held_out_is_found(flights):
     assert not [f for f in found.findings if f.code.startswith("held-out.")]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_simulated_is_said_and_not_raised(flights):
     training, held = flights
     wild = dataclasses.replace(held, known={"c": -400.0})

@@ -83,6 +83,7 @@ def oracle(estimates, columns):
     return J, np.sqrt(np.diag(np.linalg.pinv(J.T @ J, rcond=1e-12))) * SD
 
 
+@pytest.mark.slow
 def test_a_constant_term_is_exchangeable_with_bias_and_initial_state():
     found = fit(problem(BOUNDED))
     J, sd = oracle(found.estimates, [0, 1, 2, 3, 4])

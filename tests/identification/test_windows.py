@@ -22,6 +22,7 @@ def problem(flights=1, **how):
     return Problem(models.roll_on_stand, vehicle(BENCH), made, FREE, **how)
 
 
+@pytest.mark.slow
 def test_the_jacobian_by_colours_is_the_jacobian():
     one = problem(2, window=1.0, nuisance=Nuisance(bias=False, input_gain=True))
     # Two outputs, and not in the order of their names.

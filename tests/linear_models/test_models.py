@@ -138,6 +138,7 @@ def roll_by_hand(Lb, tau_f, Bd, Blat, tau_s=0.3415, Dlat=0.2731):
     return A, np.array([[0.0], [0.0], [Blat / tau_f], [Dlat / tau_s]])
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_derivatives_of_a_record_by_scipy():
     """From starts a factor of two away, and Blat from the wrong sign."""
     truth = {"Lb": 140.0, "tau_f": 0.06, "Bd": 0.6, "Blat": 0.12}

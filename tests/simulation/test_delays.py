@@ -140,6 +140,7 @@ def test_two_delays_of_a_linear_model(run, hold, delays):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", HOLDS)
 def test_two_delays_of_a_model_that_is_not_linear(run, hold):
     u, delays = sticks(1), (0.17, 0.012)
@@ -148,6 +149,7 @@ def test_two_delays_of_a_model_that_is_not_linear(run, hold):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-7)
 
 
+@pytest.mark.slow
 def test_in_blocks_and_reduced_it_is_the_same_run(run):
     u, delays, hold = sticks(2), (0.03, 0.11), "mixed"
     stepwise = run(LINEAR, u, delays, HOLDS[hold])

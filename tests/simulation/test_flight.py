@@ -58,6 +58,7 @@ def fleet():
     )
 
 
+@pytest.mark.slow
 def test_free_fall_is_a_parabola(xcell, fleet):
     """Without a rotor that the air could turn, and without drag."""
     model = models.helicopter("consistent")

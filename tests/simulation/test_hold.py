@@ -151,6 +151,7 @@ def test_a_linear_and_a_held_input_with_a_delay(delay, block):
     np.testing.assert_allclose(found.outputs.az - found.states.w, feed, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "delay"), [("rk4", 0.017), ("tsit5", None), ("adaptive", 0.017)]
 )

@@ -173,6 +173,7 @@ def test_forward_reverse_and_finite_differences_agree(slopes):
     np.testing.assert_allclose(forward, wanted, rtol=1e-6, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_checkpointed_reverse_mode_through_rk4(slopes):
     weights, logs, wanted = slopes
     how = {"solver": "rk4", "substeps": 16, "adjoint": dfx.RecursiveCheckpointAdjoint()}
@@ -204,6 +205,7 @@ def test_many_equal_one_by_one_and_the_broken_break_alone(fleet):
         close(np.asarray(many.states.phi[k]), recurrence(v, U, X0)[:, 0], 1e-9)
 
 
+@pytest.mark.slow
 def test_adaptive_steps_in_a_batch_with_a_broken_machine(fleet):
     machines, batch = fleet
     batch = jax.tree.map(lambda x: x[:3] if jnp.ndim(x) else x, batch)

@@ -71,6 +71,7 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(out), "--resume"]) == 0
 
 
+@pytest.mark.slow
 def test_designs_of_a_configuration(write, tmp_path, capsys):
     table = {"inertia": [0.02, 0.03, np.nan], "lift": [5.0, 5.5, 6.0]}
     pq.write_table(pa.table(table), tmp_path / "some.parquet")

@@ -236,7 +236,9 @@ def strongest(
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
     """The records without the lines that are too many, of each the highest."""
     most = _LINES // len(records)
-    return [Lines(*(v[:most] for v in record[:4]), record.size) for record in records]
+    return [
+        Lines(r.e[:most], r.J[:most], r.drives[:most], r.angles[:most], r.size) for r in records
+    ]
 
 
 def pulled_away(records: Sequence[Lines], k: int) -> float:
