@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Of which command, argparse has forgotten by then.
             message = f"unrecognized arguments: {' '.join(unknown)}"
             _refuse(f"heli-jax {options.command}", message)
-        options.interrupts = seen
+        options.interrupts, code = seen, DONE
         try:
             options.say = terminal.say_notes if options.quiet else terminal.say
             with terminal.progress_shown(options.quiet):
@@ -224,10 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             terminal.say(seen.words())
             return 128 + seen.seen[0] if seen.seen else INTERRUPTED
         except BrokenPipeError:
-            # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
-            # once more at the end, and complain.
+            # `heli-jax simulate ... | head` is no failure, and a verdict stays what it was. Python
+            # would flush its standard output once more at the end, and complain.
             _discard_output()
-            return DONE
+            return code
         except Exception as e:
             # Whatever it says: an interrupt of which a library has made an error of its own.
             if seen.seen:

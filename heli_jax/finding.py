@@ -16,6 +16,8 @@ UNIT_IN_DOUBT = "units.in-doubt"
 """code of a signal that may be in another unit than it is read in"""
 LEFT_OUT = "channels.left-out"
 """code of what of a log is not read"""
+_FARTHEST = 10.0
+"""times an estimate that one step of a test moves it; farther it tells no size"""
 _HALF_INTERVAL = 1.96
 """standard deviations from an estimate to the end of its 95 % interval; a misfit that moves it
 further leaves an interval without the truth in it"""
@@ -95,7 +97,7 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
     """By parameter the finding that takes its interval away, the largest shift first.
 
     Args:
-        estimates: by parameter, with `sd` [SI]; None where it is not identifiable.
+        estimates: by parameter, with `value` and `sd` [SI]; None where it is not identifiable.
     """
     out: dict[str, Distrust] = {}
     for name, estimate in estimates.items():
@@ -105,7 +107,9 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
         moved.sort(key=lambda f: -abs(f.shifts[name]))
         unsized = [f for f in findings if name in f.distrusts]
         if moved:
-            out[name] = Distrust(moved[0].code, float(moved[0].shifts[name]), moved[0].brief)
+            shift = float(moved[0].shifts[name])
+            sized = abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
+            out[name] = Distrust(moved[0].code, shift if sized else None, moved[0].brief)
         elif unsized:
             out[name] = Distrust(unsized[0].code, None, unsized[0].brief)
     return out

@@ -139,7 +139,9 @@ def test_exit_codes(status, adequate, trusted, code):
 
 
 def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
-    estimates = {n: SimpleNamespace(sd=sd) for n, sd in (("a", 1.0), ("b", 1.0), ("c", None))}
+    estimates = {
+        n: SimpleNamespace(value=2.0, sd=sd) for n, sd in (("a", 1.0), ("b", 1.0), ("c", None))
+    }
     small = Finding("x.small", "doubt", "", shifts={"a": -1.95, "b": 0.1, "c": 50.0})
     large = Finding("x.large", "note", "", shifts={"a": -1.97, "b": 0.1}, brief="why")
     assert distrusted([small], estimates) == {}
@@ -147,6 +149,9 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
     # By an amount that is not known.
     unsized = Finding("x.all", "doubt", "", distrusts=("b", "c"), brief="all")
     assert distrusted([unsized], estimates) == {"b": Distrust("x.all", None, "all")}
+    # A step of many times the estimate tells no size.
+    absurd = large._replace(shifts={"a": -3e4})
+    assert distrusted([absurd], estimates)["a"] == Distrust("x.large", None, "why")
     # What takes none away is a note; what denies the model stays what it is.
     denies = small._replace(denies=True)
     assert [f.severity for f in weighed([small, large, unsized, denies], estimates)] == [
