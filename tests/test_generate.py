@@ -60,6 +60,7 @@ def test_start_wind_pilot_and_ground(made):
     assert run.times.size == c["time"].size == run.states.z.size
 
 
+@pytest.mark.slow
 def test_what_leaves_the_range_is_told(made):
     found = made(
         inputs={

@@ -146,6 +146,7 @@ def test_special_files_in_every_place_end_in_a_sentence(tmp_path, monkeypatch, c
     assert os.path.exists(pipe)
 
 
+@pytest.mark.slow
 def test_a_terminal_is_no_configuration(tmp_path):
     master, slave = os.openpty()
     try:

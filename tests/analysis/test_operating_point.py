@@ -61,6 +61,7 @@ def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering)
         assert H(np.array([w]))[0] == pytest.approx(hovering(w), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_record_of_forward_flight_is_linearised_there(xcell):
     model, t = models.helicopter("consistent"), np.arange(N) * DT
     psi = 0.5

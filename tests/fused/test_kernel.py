@@ -354,6 +354,7 @@ def test_a_loop_without_end_in_a_branch_that_nobody_takes(of):
 
 
 # Sweeps in single precision are compared in tests/sweeps/test_fused.py.
+@pytest.mark.slow
 def test_records_loops_and_small_arrays():
     def step(stays, u, x, k):
         a, b = stays

@@ -38,6 +38,7 @@ def test_only_what_moves_a_fast_mode_is_blamed_for_it():
     assert fast_modes(problem(record, **every), {**ALIAS, "k": 36.0}, SD) == []
 
 
+@pytest.mark.slow
 def test_an_aliased_optimum_is_neither_determined_nor_adequate():
     record = flight()
     asked = problem(record, k=Free(K, lower=0.9 * K, upper=1.1 * K), b=Free(ALIAS["b"]))

@@ -169,7 +169,13 @@ def test_in_blocks_and_reduced_it_is_the_same_run(run):
     assert float(reduced(p)) == pytest.approx(np.sum(stepwise[0] * stepwise[1]), rel=1e-10)
 
 
-@pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
+@pytest.mark.parametrize(
+    "machine",
+    [
+        pytest.param(LINEAR, id="linear"),
+        pytest.param(NONLINEAR, id="nonlinear", marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_by_each_delay(machine):
     u = Inputs(*jnp.asarray(sticks(3)))
 

@@ -203,7 +203,12 @@ def landed(g_and_h, states=None):
 
 
 @pytest.mark.parametrize(
-    ("mode", "states"), [(jax.jacrev, None), (jax.jacfwd, fallen), (jax.jacrev, fallen)]
+    ("mode", "states"),
+    [
+        pytest.param(jax.jacrev, None, marks=pytest.mark.slow),
+        (jax.jacfwd, fallen),
+        (jax.jacrev, fallen),
+    ],
 )
 def test_the_moment_of_an_event_has_the_derivatives_of_a_free_fall(mode, states):
     g, drop = 9.80665, 1.7

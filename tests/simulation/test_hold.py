@@ -177,7 +177,7 @@ def test_a_mixed_input_is_held_until_it_jumps(solver, block, delay):
     np.testing.assert_allclose(found.inputs.de, de, atol=1e-12)
 
 
-@pytest.mark.parametrize("solver", ["exact", "rk4"])
+@pytest.mark.parametrize("solver", ["exact", pytest.param("rk4", marks=pytest.mark.slow)])
 def test_derivatives_by_delay_and_parameter(solver):
     go = compiled(solver, True, substeps=8)
 

@@ -313,6 +313,7 @@ def test_wrong_arguments(bench30, model, inputs, how):
         simulate(model, params, models.roll.Inputs(inputs), **{"dt": DT, **how})
 
 
+@pytest.mark.slow
 def test_noise_of_a_nonlinear_model_is_that_of_its_linearisation(bench30):
     """On a linear model it is the exact one, draw by draw."""
     model = with_disturbance(STAND, "roll")
