@@ -140,7 +140,8 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         yield f"! {clock.problem}"
     else:
         uniform = "uniform" if clock.uniform else "not uniform"
-        name = f"{clock.column} [{clock.unit}]"
+        unit = f" [{clock.unit}]"
+        name = clock.column if clock.column.endswith(unit) else f"{clock.column}{unit}"
         if clock.counted is not None:
             by = f" (by {clock.said})" if clock.said else ""
             name = f"{'rows' if clock.column == ROWS else clock.column}{by}"

@@ -305,8 +305,7 @@ _MEANT = {
     "stayed where it was is {constant: 0}",
     "unit": "that of the channel's numbers in the log",
     "rate": "samples a second, in Hz",
-    "scale": "how much of the stated unit one unit of the log's own numbers is: the input's full "
-    "travel in that unit over its full travel in the log",
+    "scale": "the input's full travel in the stated unit over its full travel in the log's numbers",
     "start": "a value of the parameter to begin from, right to a factor of three or so",
 }
 """by the last word of a key what `heli-jax new` could not know"""

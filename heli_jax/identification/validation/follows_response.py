@@ -202,8 +202,7 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
         return Untested(
-            "inputs move as programmed ones do, in jumps, between rests or without anything "
-            "unforeseen",
+            "inputs move as programmed ones do (in jumps, between rests, or as foreseen)",
             programmed=True,
         )
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}

@@ -102,21 +102,18 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
     )
     criterion = f"sd with it over that with the same record again; {_WORTH:g}"
     ratio = plan.after / plan.again if np.isfinite(plan.after) and plan.again > 0 else 1.0
-    begun = (
-        f"what to fly next for {plan.parameter} ({_sd(plan.before)} in white noise, the "
-        "widest then): "
-    )
+    now = f"{plan.parameter}, the widest, has {_sd(plan.before)} in white noise: fly "
     if not np.isfinite(plan.after):
-        words = f"{begun}none of the manoeuvres that were compared determines it."
+        words = f"none of the manoeuvres that were compared determines {plan.parameter}."
     elif ratio < _WORTH:
         words = (
-            f"{begun}{flown}, would leave {_sd(plan.after)}; the same record again "
+            f"{now}{flown}, which leaves {_sd(plan.after)}; the same record again leaves "
             f"{_sd(plan.again)}."
         )
     else:
         words = (
-            f"{begun}the same again, which would leave {_sd(plan.again)}; of the manoeuvres "
-            f"compared none does better ({flown}: {_sd(plan.after)})."
+            f"{now}the same again, which leaves {_sd(plan.again)}; no other manoeuvre that was "
+            f"compared does better ({flown}: {_sd(plan.after)})."
         )
     if plan.left_out:
         words += f" Not compared: {', '.join(plan.left_out)}, which the record does not move."
