@@ -14,6 +14,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
@@ -93,6 +94,30 @@ def replace(record: Record, **changes: Any) -> Record:
     """A new record of the same class with some fields changed."""
     # Not dataclasses.replace, nor _replace: a model's classes may be either, or neither.
     return type(record)(**{**asdict(record), **changes})
+
+
+class Varied:
+    """A record with some fields that change often: its class, which may convert and check them, is
+    asked once."""
+
+    def __init__(self, record: Record, fields: Sequence[str]) -> None:
+        """Of the names of these fields."""
+        self._record, self._dtype = record, jnp.result_type(float)
+        marks = {n: jnp.asarray(0.0, self._dtype) for n in fields}
+        self._leaves, self._structure = jax.tree.flatten(replace(record, **marks))
+        at = {n: [i for i, v in enumerate(self._leaves) if v is mark] for n, mark in marks.items()}
+        # A class that makes something else of what it is given is asked each time.
+        self._at = {n: i[0] for n, i in at.items()} if all(len(i) == 1 for i in at.values()) else {}
+
+    def having(self, values: Mapping[str, float]) -> Record:
+        """The record with these values; they are concrete, and of all fields that change."""
+        numbers = {n: np.asarray(v, self._dtype) for n, v in values.items()}
+        if not self._at:
+            return replace(self._record, **{n: jnp.asarray(v) for n, v in numbers.items()})
+        leaves = list(self._leaves)
+        for n, v in numbers.items():
+            leaves[self._at[n]] = v
+        return jax.tree.unflatten(self._structure, leaves)
 
 
 def ravel(

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from heli_jax.analysis.linear import modes
 from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
+from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.simulate import simulate
 from heli_jax.vehicle import of_helicopter
 
@@ -120,7 +120,7 @@ def _mean(
     return OperatingPoint(start, mean, "the initial state and the record's mean inputs")
 
 
-@eqx.filter_jit
+@jitted
 def _mean_state(model: Model, params: Any, inputs: Any, dt: Float[Array, ""], substeps: int) -> Any:
     run = simulate(model, params, inputs, dt=dt, substeps=substeps)
     return jax.tree.map(lambda x: jnp.mean(x), run.states)

@@ -8,7 +8,6 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,6 +16,7 @@ from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model, field_and_output, zeros
 from heli_jax.naming import Record
+from heli_jax.numerics.jitted import jitted
 
 
 class StateSpace(NamedTuple):
@@ -29,7 +29,7 @@ class StateSpace(NamedTuple):
 
 
 @explained
-@eqx.filter_jit
+@jitted
 def jacobians(
     model: Model, params: Record, state: Record | None = None, inputs: Record | None = None
 ) -> StateSpace:

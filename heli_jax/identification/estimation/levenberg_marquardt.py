@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +33,7 @@ from heli_jax.identification.estimation.scaling import (
 )
 from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.numerics.jitted import jitted
 
 
 class Optimum(NamedTuple):
@@ -121,7 +121,7 @@ class _End(NamedTuple):
     last: ResidualAndJacobian
 
 
-@eqx.filter_jit
+@jitted
 def _optimise_in_one_program(
     layout: Layout,
     data: Data,

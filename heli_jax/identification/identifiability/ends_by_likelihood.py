@@ -239,7 +239,7 @@ class Profile(NamedTuple):
         target = min(max(target, low + 1e-6 * width), high - 1e-6 * width)
         data, kind = self.at.data, self.at.layout.kinds[self.i]
         limits = (data.sign[self.i], data.low[self.i], data.high[self.i])
-        z = float(transforms.to_coordinate(kind, jnp.asarray(target), *limits))
+        z = float(transforms.to_coordinate(kind, target, *limits))
         return abs(z - float(self.at.z[self.i]))
 
     def _at_limit(self, side: int) -> End | None:

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -118,7 +117,7 @@ class _Family:
             **{n: jnp.asarray(v, jnp.result_type(float)) for n, v in flight.known.items()},
         )
         late = problem.model.delay_parameters
-        self._record = _Record(self.params, names)
+        self._record = naming.Varied(self.params, names)
         # A logarithm keeps the sign; of what is zero, and of delays, which may be, so many samples.
         self.log = np.array([values[n] != 0.0 and n not in late for n in names])
         self.size = np.array([flight.dt if n in late else 1.0 for n in names])
@@ -184,30 +183,6 @@ class _Family:
     def responses(self, z: np.ndarray) -> np.ndarray:
         """(k, p, m) of the measured outputs."""
         return _responses_of(self.problem, self._at(z), self.about, self.omega)[:, self.rows]
-
-
-class _Record:
-    """A record with some fields that change often: its class, which may convert and check them, is
-    asked once."""
-
-    def __init__(self, record: Any, names: Sequence[str]) -> None:
-        """Of a model's Params and the names of the fields."""
-        self.record = record
-        marks = {n: jnp.asarray(0.0, jnp.result_type(float)) for n in names}
-        self.leaves, self.structure = jax.tree.flatten(naming.replace(record, **marks))
-        at = {n: [i for i, v in enumerate(self.leaves) if v is mark] for n, mark in marks.items()}
-        # A class that makes something else of what it is given is asked each time.
-        self.at = {n: i[0] for n, i in at.items()} if all(len(i) == 1 for i in at.values()) else {}
-
-    def having(self, values: dict[str, float]) -> Any:
-        """The record with these values."""
-        numbers = {n: np.asarray(v, jnp.result_type(float)) for n, v in values.items()}
-        if not self.at:
-            return naming.replace(self.record, **{n: jnp.asarray(v) for n, v in numbers.items()})
-        leaves = list(self.leaves)
-        for n, v in numbers.items():
-            leaves[self.at[n]] = v
-        return jax.tree.unflatten(self.structure, leaves)
 
 
 def _starts(family: _Family) -> list[np.ndarray]:

@@ -170,8 +170,7 @@ class Valley(NamedTuple):
             return None
         # From NumPy: to index an array of JAX's is a program of its own to load.
         limits = tuple(np.asarray(of)[i] for of in (data.sign, data.low, data.high))
-        with np.errstate(all="ignore"):
-            z = float(transforms.to_coordinate(layout.kinds[i], jnp.asarray(value), *limits))
+        z = float(transforms.to_coordinate(layout.kinds[i], value, *limits))
         return z if math.isfinite(z) else None
 
     def _at(self, z: np.ndarray) -> Evaluation:

@@ -139,7 +139,7 @@ def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real
 
 
 def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
-    """The coordinate of a value inside the bounds: the inverse of `to_value`.
+    """The coordinate of a value inside the bounds: the inverse of `to_value`, of numbers alone.
 
     Args:
         transform: one of `KINDS`.
@@ -147,19 +147,22 @@ def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) ->
         sign: as in `to_value`.
         low, high: bounds, in the parameter's unit, infinite where there is none.
     """
+    # By NumPy: each step by itself would be a program of JAX's to load.
+    x, sign, low, high = (np.asarray(v) for v in (x, sign, low, high))
     # A value on a bound has an infinite coordinate: callers move it inside first.
-    if transform == "log":
-        return jnp.log(sign * x)
-    if transform == "linear":
-        return x / sign
-    if transform == "above":
-        return jnp.log(x - low)
-    if transform == "below":
-        return jnp.log(high - x)
-    if transform == "logit":
-        share = (x - low) / (high - low)
-    else:
-        a, b = jnp.log(jnp.abs(low)), jnp.log(jnp.abs(high))
-        share = (jnp.log(jnp.abs(x)) - a) / (b - a)
-    # log1p keeps the digits of a share near zero, where 1 - share rounds to 1.
-    return jnp.log(share) - jnp.log1p(-share)
+    with np.errstate(all="ignore"):
+        if transform == "log":
+            return np.log(sign * x)
+        if transform == "linear":
+            return x / sign
+        if transform == "above":
+            return np.log(x - low)
+        if transform == "below":
+            return np.log(high - x)
+        if transform == "logit":
+            share = (x - low) / (high - low)
+        else:
+            a, b = np.log(np.abs(low)), np.log(np.abs(high))
+            share = (np.log(np.abs(x)) - a) / (b - a)
+        # log1p keeps the digits of a share near zero, where 1 - share rounds to 1.
+        return np.log(share) - np.log1p(-share)

@@ -78,6 +78,7 @@ class Modes(NamedTuple):
     """(n, n) a mode a column"""
     left: np.ndarray
     """(n, n) a mode a row"""
+    A: np.ndarray
     B: np.ndarray
     C: np.ndarray
 
@@ -127,7 +128,7 @@ def modes_about(problem: Problem, params: Any, at: OperatingPoint) -> Modes | No
         return None
     eigenvalues, right = np.linalg.eig(A)
     # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
-    return Modes(eigenvalues, right, np.linalg.pinv(right), B, C)
+    return Modes(eigenvalues, right, np.linalg.pinv(right), A, B, C)
 
 
 def fast_modes(
@@ -177,7 +178,7 @@ def _of_flight(
     past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _NEAR * nyquist]
     if not past:
         return None
-    slopes = {n: _relative_slopes(problem, params, at, n, modes) for n in moving}
+    slopes = _relative_slopes(problem, params, at, moving, modes)
     # A filter or a servo whose constants are given is simulated as it is, and has no alias.
     past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
     if not past:
@@ -244,24 +245,16 @@ def _known_otherwise(problem: Problem, name: str) -> bool:
 
 
 def _relative_slopes(
-    problem: Problem, params: Any, at: OperatingPoint, name: str, modes: Modes
-) -> np.ndarray:
-    """Of every eigenvalue (n,) complex its change over its size, for a relative change of one
-    parameter: first-order perturbation of a simple eigenvalue."""
-    value = float(getattr(params, name))
-    step = _STEP * (abs(value) or 1.0)
-    ends = [
-        np.asarray(
-            linearize(
-                problem.model,
-                naming.replace(params, **{name: jnp.asarray(v)}),
-                at.state,
-                at.inputs,
-            ).matrices.A,
-            np.float64,
-        )
-        for v in (value - step, value + step)
-    ]
-    slope = (ends[1] - ends[0]) / (2.0 * _STEP)
-    changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
-    return changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)
+    problem: Problem, params: Any, at: OperatingPoint, names: Sequence[str], modes: Modes
+) -> dict[str, np.ndarray]:
+    """By parameter of every eigenvalue (n,) complex its change over its size, for a relative change
+    of that parameter: first-order perturbation of a simple eigenvalue."""
+    values, slopes = {n: float(getattr(params, n)) for n in names}, {}
+    varied = naming.Varied(params, names)
+    for name, value in values.items():
+        there = varied.having(values | {name: value + _STEP * (abs(value) or 1.0)})
+        A = linearize(problem.model, there, at.state, at.inputs).matrices.A
+        slope = (np.asarray(A, np.float64) - modes.A) / _STEP
+        changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
+        slopes[name] = changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)
+    return slopes

@@ -25,6 +25,7 @@ from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.late_inputs import LATE
@@ -167,10 +168,11 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
 
     def gained(data: Data) -> float:
         """Of twice the log-likelihood where the unknowns follow, and rows are as white as these."""
-        there = evaluate(layout, data, at.noise, at.z)
-        if not (np.all(np.isfinite(there.r)) and np.all(np.isfinite(there.J))):
+        there = residual_and_jacobian(layout, data, at.noise, at.z)
+        rows, J = jax.device_get((there.r, there.J))
+        if not (np.all(np.isfinite(rows)) and np.all(np.isfinite(J))):
             return -np.inf
-        left = _beside(there.J, there.r)
+        left = _beside(J, rows)
         change = left - before
         gain = float(before @ before - left @ left)
         return gain / _correlated(at, change, before) if gain > 0 else gain
@@ -337,15 +339,15 @@ def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
     """The inputs of these names later by so much, or earlier; between samples their mean."""
     flights = []
     for flight in data.flights:
-        inputs = {}
-        for n, samples in naming.asdict(flight.inputs).items():
+        inputs = naming.asdict(flight.inputs)
+        for n in inputs.keys() & set(names):
             # By NumPy: each step of it would be a program of JAX's to load.
-            u = np.asarray(samples)
+            u = np.asarray(inputs[n])
             t = np.arange(u.size, dtype=u.dtype)
             moved = np.interp(t - seconds / float(flight.dt), t, u).astype(u.dtype)
-            inputs[n] = moved if n in names else u
+            inputs[n] = jax.device_put(moved)
         flights.append(flight._replace(inputs=type(flight.inputs)(**inputs)))
-    return data._replace(flights=jax.device_put(tuple(flights)))
+    return data._replace(flights=tuple(flights))
 
 
 def _moved(at: Solution, e: Evaluation, step: np.ndarray) -> dict[str, float]:

@@ -44,7 +44,7 @@ def drives(
     u = [_normal(np.asarray(inputs[n])) for n in moving]
     y = np.asarray(e.simulated[i][name])
     response = [_normal(y), _normal(np.gradient(y))]
-    curved = [w for v in (*u, *response) for w in (v**3, np.abs(v) * v, v**2)]
+    curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
     # Friction has a sign and no size.
     curved += [np.sign(v) for v in response]
     # What play takes off hangs on where the stick came from, not on where it is: no power does.

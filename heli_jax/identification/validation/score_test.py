@@ -14,10 +14,11 @@ Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score 
 others (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.fft
 import scipy.linalg
 import scipy.special
 from jaxtyping import Complex, Float
@@ -42,6 +43,8 @@ _AT_LEAST = 14.0
 """gain below which no p value is asked for: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
+_AT_ONCE = 16
+"""filters that products are made of together"""
 _EULER = 0.5772156649015329
 
 
@@ -96,23 +99,25 @@ def lines_of(
     if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
         return None
     h = whitening(e - e.mean(), holes)
-    columns = np.concatenate([e[:, None], J, drives], axis=1)
-    scales = np.sqrt(np.mean(columns**2, axis=0))
-    columns = columns - columns.mean(axis=0)
+    # A signal a row: NumPy is quick along its last axis alone.
+    rows = np.concatenate([e[None], J.T, drives.T])
+    scales = np.sqrt(np.mean(rows**2, axis=1, keepdims=True))
+    rows -= rows.mean(axis=1, keepdims=True)
     # Differences with the filter's own order left out have no samples from before the record.
-    white = np.stack([np.convolve(c, h)[ORDER : e.size] for c in columns.T], axis=1)
+    white = np.stack([np.convolve(c, h, "valid") for c in rows])
     # What jumps because samples are missing is no answer: the filter's order after a hole is as if
     # nothing had been measured.
-    white[across(holes, e.size)[ORDER:]] = 0.0
-    v = np.fft.rfft(white, axis=0)[1 : 1 + (n - 1) // 2] / np.sqrt(n)
+    white[:, across(holes, e.size)[ORDER:]] = 0.0
+    v = scipy.fft.rfft(white)[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
-    v = np.where(np.sqrt(np.mean(np.abs(v) ** 2, axis=0)) > _ROUNDING * scales, v, 0.0)
+    mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
+    v[(np.sqrt(mean_squares) <= _ROUNDING * scales)[:, 0]] = 0.0
     # Of one size in all records: their noise differs.
-    size = float(np.sqrt(np.mean(np.abs(v[:, 0]) ** 2)))
-    v = v / size
+    size = float(np.sqrt(mean_squares[0, 0]))
+    v /= size
     q = J.shape[1]
-    angles = 2.0 * np.pi * np.arange(1, len(v) + 1) / n
-    return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles, size)
+    angles = 2.0 * np.pi * np.arange(1, v.shape[1] + 1) / n
+    return Lines(v[0], v[1 : 1 + q].T, v[1 + q :].T, angles, size)
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
@@ -192,45 +197,38 @@ def strongest(
         residual: that of these records, where it is at hand.
     """
     of, records = residual or residual_of(records), _lowest(records)
-    white, freedom = of.white, of.freedom
-    X = np.concatenate([record.drives for record in records])
+    freedom, squares = of.freedom, np.sum(of.white**2)
+    X = np.concatenate([record.drives for record in records]).T
     filters = _filters(records, bank, plain)
-    back = np.exp(-1j * of.angles)
-    asked, answers = _asked(
-        *_responses(filters, back),
-        _complex(of.known),
-        _complex(white),
-        np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
-        [_pair(X[:, i], back) for i in drives],
-    )
+    columns = _Columns(np.concatenate([_ends(records), X[[*beside]]]), X[[*drives]], of.angles)
+    asked, answers = _asked(filters, columns, _complex(of.known).T, _complex(of.white).T)
     gains = _gains(asked, answers)
     k = int(np.argmax(gains))
-    gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
+    gain = float(gains.reshape(-1)[k] * freedom / squares)
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > max(_AT_LEAST, least):
         nothing = np.zeros(of.J.shape[1])
         return Strongest(gain, 1.0, drive, *one, nothing, nothing, 0.0)
     # The same phases for the same residual, whoever asks. In single precision, half the work: what
     # chance makes is known to a tenth of itself.
-    turns = np.random.default_rng(0).random((len(X), _SURROGATES))
+    turns = np.random.default_rng(0).random((len(of.angles), _SURROGATES))
     turns, basis = (2.0 * np.pi * turns).astype(np.float32), of.known.astype(np.float32)
 
     def of_chance(turns: np.ndarray) -> np.ndarray:
         phases = np.cos(turns) + 1j * np.sin(turns)
-        anew = _without(basis, _real(_complex(white).astype(phases.dtype) * phases))
+        anew = _without(basis, _real(_complex(of.white).astype(phases.dtype) * phases))
         anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-        # Column by column: there are many residuals.
-        tried = _complex(anew)
-        answers = [_products(asked.filters, c, tried) for c in (asked.beside, *asked.drives)]
-        return _gains(asked, answers).max(axis=(0, 1))
+        return _gains(asked, _answers(filters, columns, _complex(anew).T)).max(axis=(0, 1))
 
     others = of_chance(turns[:, :_FIRST])
     if _by_chance(gain, others) < _CLEARLY:
         others = np.concatenate([others, of_chance(turns[:, _FIRST:])])
     chance = _by_chance(gain, others)
-    G = _complex(asked.filters[k // len(drives), :, None])
-    columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
-    return Strongest(gain, chance, drive, *one, *_steps(of.J, columns, of.e[:, None]))
+    ((G, _),) = _responses([one], columns.back)
+    found = np.concatenate([columns.beside, columns.drives[[k % len(drives)]]])
+    found = np.stack([found, found * columns.back], axis=1).reshape(-1, len(of.angles))
+    through = _real(_complex(G.T) * found.T)
+    return Strongest(gain, chance, drive, *one, *_steps(of.J, through, of.e[:, None]))
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
@@ -284,117 +282,124 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
     return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
-class _Asked(NamedTuple):
-    """Products, by filter, that do not depend on the residual; columns stand before the filter."""
+class _Columns(NamedTuple):
+    """What goes through the filters; each of them stands for itself and itself one sample later."""
 
-    filters: Float[np.ndarray, "F K2"]
-    """real and imaginary parts side by side"""
-    beside: Complex[np.ndarray, "K b"]
-    over: Float[np.ndarray, "F b b"]
-    """the inverse of their products, without what is known"""
-    drives: list[Complex[np.ndarray, "K 2"]]
-    cross: list[Float[np.ndarray, "F b 2"]]
-    """products of the columns beside with each drive, without what is known"""
-    own: list[Float[np.ndarray, "F 2 2"]]
-    """the inverse of each drive's products, without what is known and the columns beside"""
+    beside: Complex[np.ndarray, "b K"]
+    """those whose answer through the same filter is taken off first"""
+    drives: Complex[np.ndarray, "d K"]
+    angles: Float[np.ndarray, " K"]
+
+    @property
+    def back(self) -> Complex[np.ndarray, " K"]:
+        """The response of a delay by one sample."""
+        return np.exp(-1j * self.angles)
+
+
+class _Asked(NamedTuple):
+    """Products, by filter, that do not depend on the residual."""
+
+    over: Float[np.ndarray, "F b2 b2"]
+    """the inverse of those of the columns beside, without what is known"""
+    cross: Float[np.ndarray, "F d b2 2"]
+    """of the columns beside with each drive, without what is known"""
+    own: Float[np.ndarray, "F d 2 2"]
+    """the inverse of each drive's, without what is known and the columns beside"""
 
 
 def _asked(
-    G: Float[np.ndarray, "F K2"],
-    power: Float[np.ndarray, "F K"],
-    known: Complex[np.ndarray, "K q"],
-    residual: Complex[np.ndarray, "K 1"],
-    beside: Complex[np.ndarray, "K b"],
-    drives: list[Complex[np.ndarray, "K 2"]],
-) -> tuple[_Asked, list[Float[np.ndarray, "F c 1"]]]:
+    filters: Sequence[tuple[float, float]],
+    columns: _Columns,
+    known: Complex[np.ndarray, "q K"],
+    residual: Complex[np.ndarray, "1 K"],
+) -> tuple[_Asked, Float[np.ndarray, "F c 2 1"]]:
     """Precompute the products that do not depend on the residual, and those with this residual.
 
     By products of columns, since the filters all act on the same ones: a basis for each filter and
-    drive would take ten times as long. All in one product each, which reads the filters once.
+    drive would take ten times as long.
 
     Args:
-        G: responses of the filters by line, real and imaginary parts side by side.
-        power: their squared sizes.
+        filters: dampings and frequencies [rad a sample].
+        columns: that go through them.
         known: an orthonormal basis of the sensitivities; residuals have nothing of it.
         residual: whose products come second, of the columns beside first, then of each drive.
-        beside: columns whose answer through the same filter is taken off first.
-        drives: each with itself one sample later.
     """
-    b, groups = beside.shape[1], [beside, *drives]
-    ends = np.cumsum([c.shape[1] for c in groups])[:-1]
-    with_known = _products(
-        G, np.concatenate(groups, axis=1), np.concatenate([known, residual], axis=1)
+    taken = np.concatenate([known, residual])
+    (b, K), d = columns.beside.shape, len(columns.drives)
+    x, back, F = np.concatenate([columns.beside, columns.drives]), columns.back, len(filters)
+    once, each, size = _once(x, taken, back), np.conj(x[:b, None]) * x, np.abs(x[b:]) ** 2
+    # With itself, with the other one sample later, and with itself so: of two that are both later
+    # the product is that of the two.
+    rows = (np.real(v).reshape(-1, K) for v in (each, each * back, each * np.conj(back)))
+    twice = np.concatenate([*rows, size, size * np.real(back)])
+    products = [(G @ once.T, power @ twice.T) for G, power in _responses(filters, back)]
+    of_taken, both = (np.concatenate(parts) for parts in zip(*products, strict=True))
+    of_taken = of_taken.reshape(F, b + d, 2, -1)
+    shifted = both[:, : 3 * b * (b + d)].reshape(F, 3, b, b + d)[:, [[0, 1], [2, 0]]]
+    shifted = shifted.transpose(0, 3, 1, 4, 2).reshape(F, 2 * b, b + d, 2)
+    own = both[:, 3 * b * (b + d) :].reshape(F, 2, d)[:, [[0, 1], [1, 0]]].transpose(0, 3, 1, 2)
+    whole = shifted[:, :, :b].reshape(F, 2 * b, 2 * b)
+    by_beside = of_taken[:, :b, :, :-1].reshape(F, 2 * b, -1)
+    by_drive = of_taken[:, b:, :, :-1]
+    over = _inverse(whole - by_beside @ _turned(by_beside), whole)
+    cross = shifted[:, :, b:].transpose(0, 2, 1, 3) - by_beside[:, None] @ _turned(by_drive)
+    left = own - by_drive @ _turned(by_drive) - _turned(cross) @ over[:, None] @ cross
+    return _Asked(over, cross, _inverse(left, own)), of_taken[..., -1:]
+
+
+def _once(
+    x: Complex[np.ndarray, "c K"],
+    taken: Complex[np.ndarray, "t K"],
+    back: Complex[np.ndarray, " K"],
+) -> Float[np.ndarray, "n K2"]:
+    """The products of columns, and of each one sample later, with what is taken of them."""
+    both = np.conj(np.stack([x, x * back], axis=1))
+    rows = (both[:, :, None] * taken).reshape(-1, len(back))
+    return np.concatenate([np.real(rows), np.imag(rows)], axis=1)
+
+
+def _answers(
+    filters: Sequence[tuple[float, float]], columns: _Columns, taken: Complex[np.ndarray, "t K"]
+) -> Float[np.ndarray, "F c 2 t"]:
+    """As those of `_asked`, of other residuals in their precision."""
+    x, back = (
+        v.astype(taken.dtype)
+        for v in (np.concatenate([columns.beside, columns.drives]), columns.back)
     )
-    of_known = np.split(with_known[:, :, :-1], ends, axis=1)
-    # Products of two columns that are filtered both.
-    pairs = [(beside, beside), *((np.concatenate([beside, d], axis=1), d) for d in drives)]
-    each = [np.real(_pairs(u, v)) for u, v in pairs]
-    parts = np.split(power @ np.concatenate(each).T, np.cumsum([len(u) for u in each])[:-1], axis=1)
-    whole, *of_drives = (
-        part.reshape(len(G), -1, v.shape[1]) for part, (_, v) in zip(parts, pairs, strict=True)
+    G = np.concatenate(
+        [v.astype(np.real(taken).dtype) for v, _ in _responses(filters, columns.back)]
     )
-    over = _inverse(whole - of_known[0] @ _turned(of_known[0]), whole)
-    cross, own = [], []
-    for of_drive, products in zip(of_known[1:], of_drives, strict=True):
-        cross.append(products[:, :b] - of_known[0] @ _turned(of_drive))
-        whole = products[:, b:]
-        left = whole - of_drive @ _turned(of_drive) - _turned(cross[-1]) @ over @ cross[-1]
-        own.append(_inverse(left, whole))
-    answers = np.split(with_known[:, :, -1:], ends, axis=1)
-    return _Asked(G, beside, over, drives, cross, own), answers
+    # Column by column: there are many residuals.
+    each = [(G @ _once(v[None], taken, back).T).reshape(len(G), 2, len(taken)) for v in x]
+    return np.stack(each, axis=1)
 
 
-def _products(
-    G: Float[np.ndarray, "F K2"], a: Complex[np.ndarray, "K a"], b: Complex[np.ndarray, "K b"]
-) -> Float[np.ndarray, "F a b"]:
-    """Real parts of the products of filtered columns a with columns b, in the precision of b."""
-    G, each = G.astype(np.real(b).dtype, copy=False), _pairs(a.astype(b.dtype, copy=False), b)
-    each = np.concatenate([np.real(each), np.imag(each)], axis=1)
-    return (G @ each.T).reshape(len(G), a.shape[1], b.shape[1])
-
-
-def _pairs(
-    a: Complex[np.ndarray, "K a"], b: Complex[np.ndarray, "K b"]
-) -> Complex[np.ndarray, "ab K"]:
-    """The product at each line of each column of a, conjugate, with each of b."""
-    # Lines last: NumPy is quick along its last axis alone.
-    a, b = np.ascontiguousarray(a.T), np.ascontiguousarray(b.T)
-    return (np.conj(a)[:, None] * b).reshape(-1, a.shape[1])
-
-
-def _gains(
-    asked: _Asked, answers: Sequence[Float[np.ndarray, "F c r"]]
-) -> Float[np.ndarray, "F d r"]:
+def _gains(asked: _Asked, answers: Float[np.ndarray, "F c 2 r"]) -> Float[np.ndarray, "F d r"]:
     """Gains: the part of each residual's squares that a drive through a filter explains.
 
     Args:
         asked: the products of the columns.
         answers: those with the residuals, of the columns beside first, then of each drive.
     """
-    right, out = asked.over @ answers[0], []
-    for b, cross, own in zip(answers[1:], asked.cross, asked.own, strict=True):
-        b = b - _turned(cross) @ right
-        out.append(np.sum(b * (own @ b), axis=1))
-    return np.stack(out, axis=1)
+    b = answers.shape[1] - asked.cross.shape[1]
+    right = asked.over @ answers[:, :b].reshape(len(answers), 2 * b, -1)
+    left = answers[:, b:] - _turned(asked.cross) @ right[:, None]
+    return np.sum(left * (asked.own @ left), axis=2)
 
 
 def _turned(M: np.ndarray) -> np.ndarray:
-    return np.swapaxes(M, 1, 2)
+    return np.swapaxes(M, -1, -2)
 
 
 def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Of what is left (F, n, n) of the columns' products, without directions of which next to
+    """Of what is left (..., n, n) of the columns' products, without directions of which next to
     nothing is; whole: of the columns themselves."""
-    sizes = np.sqrt(np.maximum(np.einsum("fii->fi", whole), 1e-300))
-    values, V = np.linalg.eigh(left / (sizes[:, :, None] * sizes[:, None, :]))
+    sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", whole), 1e-300))
+    values, V = np.linalg.eigh(left / (sizes[..., :, None] * sizes[..., None, :]))
     kept = values > _SAME**2
     over = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    V = V / sizes[:, :, None]
-    return V @ (over[:, :, None] * _turned(V))
-
-
-def _pair(x: np.ndarray, back: np.ndarray) -> Complex[np.ndarray, "K 2"]:
-    return np.stack([x, x * back], axis=1)
+    V = V / sizes[..., :, None]
+    return V @ (over[..., :, None] * _turned(V))
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
@@ -424,9 +429,9 @@ def _filters(
 
 def _responses(
     filters: Sequence[tuple[float, float]], back: Complex[np.ndarray, " K"]
-) -> tuple[Float[np.ndarray, "F K2"], Float[np.ndarray, "F K"]]:
+) -> Iterator[tuple[Float[np.ndarray, "F K2"], Float[np.ndarray, "F K"]]]:
     """Frequency responses of the filters at the lines, real and imaginary parts side by side, and
-    their squared sizes.
+    their squared sizes; of a few filters at a time: fresh memory takes longer than the sums.
 
     Args:
         filters: dampings and frequencies [rad a sample].
@@ -438,22 +443,21 @@ def _responses(
     size = np.where(plain, 0.0, np.exp(-damping * w))
     twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
     over = np.stack([np.ones(len(w)), -twice, size**2], axis=1)
-    powers = np.stack([np.ones_like(back), back, back**2])
-    # By real numbers: NumPy divides complex ones slowly.
-    real, imaginary = over @ np.real(powers), over @ np.imag(powers)
-    power = 1.0 / (real**2 + imaginary**2)
-    return np.concatenate([real * power, -imaginary * power], axis=1), power
+    powers, K = np.stack([np.ones_like(back), back, back**2]), back.size
+    powers = np.concatenate([np.real(powers), np.imag(powers)], axis=1)
+    for k in range(0, len(w), _AT_ONCE):
+        # By real numbers: NumPy divides complex ones slowly.
+        G = over[k : k + _AT_ONCE] @ powers
+        power = 1.0 / (G[:, :K] ** 2 + G[:, K:] ** 2)
+        G[:, :K] *= power
+        G[:, K:] *= -power
+        yield G, power
 
 
-def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray, "K 2"]]:
+def _ends(records: Sequence[Lines]) -> Complex[np.ndarray, "r K"]:
     """By record what the filter's states at its ends are driven by."""
-    columns, first = [], 0
-    for record in records:
-        here = np.zeros(back.size)
-        here[first : first + record.e.size] = 1.0
-        columns.append(_pair(here, back))
-        first += record.e.size
-    return columns
+    sizes = [record.e.size for record in records]
+    return np.repeat(np.eye(len(sizes)), sizes, axis=1).astype(complex)
 
 
 def _steps(

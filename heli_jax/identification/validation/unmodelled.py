@@ -37,6 +37,7 @@ from heli_jax.identification.validation.residual_slopes import (
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
+    Lines,
     Strongest,
     lines_of,
     pulled_away,
@@ -88,36 +89,30 @@ def unmodelled(
         return ()
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
     lacking, J = [], sensitivities(at, e)
+    lines = {name: _lines(at, e, name, J) for name in names}
     for name in names:
-        asked = _of_output(at, e, name, J)
+        asked = _of_output(at, lines[name])
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
             lacking.append(_said(at, e, name, one, J, flights))
-    return (*lacking, *_asked_otherwise(at, e, names, J))
+    each = [[one for _, one in lines[name]] for name in names if lines[name]]
+    return (*lacking, *_asked_otherwise(at, e, each))
 
 
 def _asked_otherwise(
-    at: Solution, e: Evaluation, names: Sequence[str], J: Mapping[tuple[int, str], np.ndarray]
+    at: Solution, e: Evaluation, outputs: Sequence[Sequence[Lines]]
 ) -> list[Finding]:
     """A finding where the whitened answer to the inputs asks for other values of the parameters.
 
     Output error takes slow drift for slow modes; filter error learns also from how its disturbance
     goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
     """
-    k, lines, chances = len(at.layout.of_interest), [], []
-    for name in names:
-        of_output = []
-        for i, own in of_one_clock(at, e, name):
-            left, slopes = np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows]
-            of_output.append(lines_of(left, slopes, np.zeros((left.size, 0)), own.holes))
-        of_output = [one for one in of_output if one is not None]
-        if of_output:
-            chances.append(pulled_away(of_output, k))
-            lines += of_output
+    k = len(at.layout.of_interest)
+    chances = [pulled_away(lines, k) for lines in outputs]
     if not chances or min(chances) * len(chances) > IN_COLOUR:
         return []
     p = min(1.0, min(chances) * len(chances))
-    shifts = step_to_least(lines)[:k] * np.asarray(e.slopes)
+    shifts = step_to_least([one for lines in outputs for one in lines])[:k] * np.asarray(e.slopes)
     words = (
         f"The answer to the inputs asks for other values (p {p_value(p)}): a disturbance, drift or "
         "the assumed place or spectrum of the gusts has moved the estimates. Compare method: "
@@ -167,7 +162,7 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
         e = evaluate(*there)
         again = None
         if any(usable(there, e, i, name) for i in longest(at)):
-            again = _of_output(there, e, name, sensitivities(there, e))
+            again = _of_output(there, _lines(there, e, name, sensitivities(there, e)))
         if again is None or not again.deviance < asked.deviance:
             part *= 0.25
             continue
@@ -177,27 +172,33 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
     return asked
 
 
-def _of_output(
+def _lines(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
-) -> _Asked | None:
-    """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
-    where nothing can be asked."""
-    moving = moving_inputs(at)
-    samples = of_one_clock(at, e, name)
-    flights = [i for i, _ in samples]
-    over_time, each = changing(at, J, name, flights), []
+) -> list[tuple[int, Lines]]:
+    """By flight the lines of an output that can be asked of, with the drives that are asked for:
+    the inputs, what is not linear, and what parameters do that change."""
+    moving, samples = moving_inputs(at), of_one_clock(at, e, name)
+    over_time, out = changing(at, J, name, [i for i, _ in samples]), []
     for i, own in samples:
         X = drives(at, e, i, name, moving)
         X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
         X = np.concatenate([X, over_time[i][own.rows]], axis=1)
         left = np.asarray(e.raw[i][name])[own.rows]
-        each.append(lines_of(left, J[i, name][own.rows], X, own.holes))
-    those = [(i, one) for i, one in zip(flights, each, strict=True) if one is not None]
-    if not those or not moving:
+        lines = lines_of(left, J[i, name][own.rows], X, own.holes)
+        if lines is not None:
+            out.append((i, lines))
+    return out
+
+
+def _of_output(at: Solution, those: Sequence[tuple[int, Lines]]) -> _Asked | None:
+    """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
+    where nothing can be asked."""
+    m = len(moving_inputs(at))
+    if not those or not m:
         return None
     lines, k = [one for _, one in those], len(at.layout.of_interest)
-    m, columns = len(moving), lines[0].drives.shape[1]
-    constant = columns - over_time[flights[0]].shape[1]
+    columns = lines[0].drives.shape[1]
+    constant = columns - 2 * k
     residual = residual_of(lines)
     linear = strongest(lines, range(m), NARROW, residual=residual)
     # Of three answers the best one, of equal ones the first: chance is asked of no other.
