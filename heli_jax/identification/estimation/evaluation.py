@@ -112,13 +112,19 @@ def combined_deviations(
     return np.where(lost.any(axis=1), np.inf, sds)
 
 
-def directions(J: np.ndarray) -> np.ndarray:
-    """Orthonormal directions (n, k) in which the unknowns move finite whitened rows (n, q)."""
+def directions(J: np.ndarray, least: float = 1e-10) -> np.ndarray:
+    """Orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
+
+    Args:
+        J: the rows' derivatives, of any sizes by column.
+        least: part of the largest singular value of columns of one size, below which a direction is
+            rounding, or says nothing that the others do not.
+    """
     norms = np.linalg.norm(J, axis=0)
     J = np.asarray(J, np.float64) / np.where(norms > 0, norms, 1.0)
     # Singular values of J's triangle are those of J, and it has q rows instead of n.
     _, sizes, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
-    seen = sizes > 1e-10 * max(sizes[0], 1e-300)
+    seen = sizes > least * max(sizes[0], 1e-300)
     return J @ (right[seen].T / sizes[seen])
 
 

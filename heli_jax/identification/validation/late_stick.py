@@ -24,7 +24,7 @@ from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, directions, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
@@ -41,6 +41,8 @@ _LARGE = 0.1
 """of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
 _LEFT = 1e-3
 """part of the derivative by the shift that has to be left beside the sensitivities"""
+_ROUNDING = 1e-8
+"""part of the largest singular value of the sensitivities below which one is rounding"""
 _BLOCK = 1.0
 """[s] over which rows may be correlated"""
 _MOST = 3
@@ -200,7 +202,8 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
 
 def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
     """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), takes up."""
-    return v - J @ (pseudoinverse(J) @ v)
+    Q = directions(J, _ROUNDING)
+    return v - Q @ (Q.T @ v)
 
 
 def _of_samples(at: Solution, e: Evaluation, samples: _Samples) -> Finding:

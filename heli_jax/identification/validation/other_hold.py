@@ -13,7 +13,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, directions, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
@@ -132,11 +132,7 @@ def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> Likelie
 def _least(e: Evaluation) -> float:
     """The smallest sum of squares to first order about a point."""
     r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
-    norms = np.linalg.norm(J, axis=0)
-    Q, R = np.linalg.qr(J[:, norms > 0] / norms[norms > 0])
-    # Directions without effect take nothing off.
-    U, values, _ = np.linalg.svd(R)
-    taken = (Q @ U[:, values > _NULL * values[0]]).T @ r if values.size else np.zeros(0)
+    taken = directions(J, _NULL).T @ r
     return float(r @ r - taken @ taken)
 
 

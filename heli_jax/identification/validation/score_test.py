@@ -23,6 +23,8 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Complex, Float
 
+from heli_jax.identification.estimation.evaluation import directions
+
 ORDER = 10
 """of the autoregression that whitens"""
 NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
@@ -171,7 +173,7 @@ def residual_of(records: Sequence[Lines]) -> Residual:
         for each in zip(*[(r.e, r.J, r.angles) for r in _lowest(records)], strict=True)
     )
     rows, v = _real(J), _real(e[:, None])
-    known = _span(rows)
+    known = directions(rows, _SAME)
     return Residual(v[:, 0], rows, known, _without(known, v), angles)
 
 
@@ -248,13 +250,13 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
         k: how many of the unknowns, the first, are parameters.
     """
     e, J = (np.concatenate([record[i] for record in _lowest(records)]) for i in range(2))
-    nuisances = _span(_real(J[:, k:])) if J.shape[1] > k else np.zeros((2 * e.size, 0))
+    nuisances = directions(_real(J[:, k:]), _SAME) if J.shape[1] > k else np.zeros((2 * e.size, 0))
     whole = _real(J[:, :k])
     own = _without(nuisances, whole)
     shows = np.linalg.norm(own, axis=0) > _SAME * np.linalg.norm(whole, axis=0)
     if not shows.any():
         return 1.0
-    basis, white = _span(own[:, shows]), _without(nuisances, _real(e[:, None]))
+    basis, white = directions(own[:, shows], _SAME), _without(nuisances, _real(e[:, None]))
     power, whole = np.abs(_complex(white)[:, 0]) ** 2, float(np.sum(white**2))
 
     def by_phases(columns: np.ndarray) -> float:
@@ -490,12 +492,3 @@ def _without(basis: np.ndarray, v: np.ndarray) -> np.ndarray:
     for _ in range(2):
         v = v - basis @ (basis.T @ v)
     return v
-
-
-def _span(columns: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the columns."""
-    sizes = np.linalg.norm(columns, axis=0)
-    # Of its triangle, whose singular values are the same.
-    Q, R = np.linalg.qr(columns[:, sizes > 0] / sizes[sizes > 0])
-    U, values, _ = np.linalg.svd(R)
-    return Q @ U[:, : values.size][:, values > _SAME]
