@@ -167,7 +167,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     longest = max(f.duration for f in flights)
     window = settings.window or min(longest / 5.0, _LONGEST)
     require_window(window, longest + dt)
-    inputs = [n for n in flights[0].inputs if any(np.std(f.inputs[n]) > 0 for f in flights)]
+    inputs = [n for n in flights[0].inputs if any(_moves(f.inputs[n]) for f in flights)]
     if not inputs:
         raise ValueError(
             "no input moves, and a response is one to an input; a free decay is fitted by "

@@ -270,7 +270,7 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         dt: sample time [s].
         memory: how long the machine remembers its input [s].
     """
-    if not np.std(u) > 0:
+    if not np.ptp(u) > 0:
         return "the input does not move"
     if np.isnan(y).any():
         return "samples are missing"
@@ -325,7 +325,7 @@ def coherences(
     dt = sample_time(signals)
     memory_s = memory(model, params, at, dt * signals.times.size)
     # One that stands still explains nothing, and its rounding would count as an input to take out.
-    moving = [n for n, u in signals.inputs.items() if np.std(u) > 0]
+    moving = [n for n, u in signals.inputs.items() if np.ptp(u) > 0]
     results: dict[tuple[str, str], Coherence | str] = {
         (u, y): "the input does not move"
         for u in signals.inputs

@@ -78,7 +78,7 @@ def bode(flight: FittedFlight, baseline: Baseline | None) -> Panels:
         look: dict[str, Any] = {"color": style.ORANGE, "lw": 1.5, "ls": (0, (4, 2)), "label": _RLS}
         _curve(axes, below, H, reference.along(below, H), **look)
     note = _draw_record(axes, reference, record)
-    others_move = any(np.std(u) > 0 for n, u in signals.inputs.items() if n != input)
+    others_move = any(np.ptp(u) > 0 for n, u in signals.inputs.items() if n != input)
     # H = Suy / Suu is that of this input alone only where the others are uncorrelated with it.
     note += "; other inputs taken as uncorrelated" if known and others_move else ""
     if not reference.finite:
