@@ -18,7 +18,7 @@ LEFT_OUT = "channels.left-out"
 """code of what of a log is not read"""
 _FARTHEST = 10.0
 """times an estimate that one step of a test moves it; farther it tells no size"""
-_HALF_INTERVAL = 1.96
+HALF_INTERVAL = 1.96
 """standard deviations from an estimate to the end of its 95 % interval; a misfit that moves it
 further leaves an interval without the truth in it"""
 
@@ -99,16 +99,28 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
     Args:
         estimates: by parameter, with `value` and `sd` [SI]; None where it is not identifiable.
     """
+    known = {name: e for name, e in estimates.items() if e.sd is not None}
+
+    def parts(f: Finding) -> dict[str, float]:
+        """Shifts over half an interval."""
+        return {
+            n: abs(f.shifts.get(n, 0.0)) / max(HALF_INTERVAL * e.sd, 1e-300)
+            for n, e in known.items()
+        }
+
+    by_finding = [(f, parts(f)) for f in findings]
+    # One step is a size to first order: a misfit that takes one interval away takes those that it
+    # may move as far, by an amount that is not known.
+    takes = [(f, by, 0.5 if max(by.values(), default=0.0) > 1.0 else 1.0) for f, by in by_finding]
     out: dict[str, Distrust] = {}
-    for name, estimate in estimates.items():
-        if estimate.sd is None:
-            continue
-        moved = [f for f in findings if abs(f.shifts.get(name, 0.0)) > _HALF_INTERVAL * estimate.sd]
+    for name, estimate in known.items():
+        moved = [f for f, by, most in takes if by[name] > most]
         moved.sort(key=lambda f: -abs(f.shifts[name]))
         unsized = [f for f in findings if name in f.distrusts]
         if moved:
             shift = float(moved[0].shifts[name])
-            sized = abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
+            far = abs(shift) > HALF_INTERVAL * estimate.sd
+            sized = far and abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
             out[name] = Distrust(moved[0].code, shift if sized else None, moved[0].brief)
         elif unsized:
             out[name] = Distrust(unsized[0].code, None, unsized[0].brief)

@@ -134,8 +134,9 @@ def _by_what_moves(log: Log, path: str) -> str:
         return "roll-flybarless"
     if not moving:
         listed = ", ".join(map(shown, names[:12]))
-        problem = "found no stick beside a rate or an angle of its axis by their names, expected"
-        raise wrong(path, f"{problem} --model and then the signals by hand; it holds {listed}")
+        problem = "found by their names no stick that moves beside a rate or an angle of its axis"
+        remedy = "expected --model and then the signals by hand"
+        raise wrong(path, f"{problem} that moves, {remedy}; it holds {listed}")
     most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
     # Parts of full travel are compared as they are; of other numbers nobody knows full travel.
     alike = max(most.values()) <= _FULL_TRAVEL

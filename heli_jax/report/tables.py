@@ -582,7 +582,10 @@ _WORDS = {
     "phase_margin": "phase margin",
     "gain_margin": "gain margin",
 }
-_NO_RESULT = "the parameters that it hangs on are not determined, or no optimum was reached."
+_NO_RESULT = (
+    "the parameters that it depends on are not determined or not trusted, or no optimum was "
+    "reached."
+)
 _HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
 """what the terminal shows"""
 _AS_READ = {"s": ("ms", 1e3)}

@@ -146,6 +146,9 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
     large = Finding("x.large", "note", "", shifts={"a": -1.97, "b": 0.1}, brief="why")
     assert distrusted([small], estimates) == {}
     assert distrusted([small, large], estimates) == {"a": Distrust("x.large", -1.97, "why")}
+    # It takes what it may move as far with it: one step is a size to first order.
+    both = large._replace(shifts={"a": -1.97, "b": 1.0})
+    assert distrusted([both], estimates)["b"] == Distrust("x.large", None, "why")
     # By an amount that is not known.
     unsized = Finding("x.all", "doubt", "", distrusts=("b", "c"), brief="all")
     assert distrusted([unsized], estimates) == {"b": Distrust("x.all", None, "all")}

@@ -30,8 +30,8 @@ def moving_inputs(at: Solution) -> list[str]:
 def drives(
     at: Solution, e: Evaluation, i: int, name: str, moving: Sequence[str]
 ) -> Float[np.ndarray, "N d"]:
-    """The inputs that move, then what is not linear of these, of the output and of its rate, and
-    what a linkage with play keeps of the inputs.
+    """The inputs that move, then what is not linear of these and of `motions`, and what a linkage
+    with play keeps of the inputs.
 
     Args:
         at: where the fit ended.
@@ -43,12 +43,18 @@ def drives(
     inputs = naming.asdict(at.data.flights[i].inputs)
     u = [_normal(np.asarray(inputs[n])) for n in moving]
     y = np.asarray(e.simulated[i][name])
-    response = [_normal(y), _normal(np.gradient(y))]
+    response = [_normal(v) for v in motions(y)]
     curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
     # Friction has a sign and no size.
-    curved += [np.sign(v) for v in response]
+    curved += [np.sign(v) for v in response[:2]]
     # What play takes off hangs on where the stick came from, not on where it is: no power does.
     return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
+
+
+def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A simulated output (N,), its rate and its integral: a spring that is not linear acts by the
+    angle, of which only the rate may be measured."""
+    return y, np.gradient(y), np.cumsum(y - y.mean())
 
 
 def _behind_play(v: np.ndarray) -> np.ndarray:

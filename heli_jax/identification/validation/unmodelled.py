@@ -3,11 +3,12 @@ that changes over the record.
 
 Of every output the residual in time is tested against the inputs through a bank of filters, beyond
 what the sensitivities explain (`score_test`): the simulation and its residual are there by any
-method. Then against powers of inputs, of the simulated output and of its rate, and the sign of
-these two, beyond what the input through the same filter explains: a saturation, a rate limit, a
-deadband, friction and a machine that is not alike to both sides do not answer in proportion. Then
-against the sensitivities times the time, and of single flights: a rotor that slows down, a mass
-that changes and a stick of another scale leave what no constant takes up.
+method. Then against powers of inputs, of the simulated output, its rate and its integral, and the
+sign of the first two, beyond what the input through the same filter explains: a saturation, a rate
+limit, a deadband, friction, a spring that is not linear and a machine that is not alike to both
+sides do not answer in proportion. Then against the sensitivities times the time, and of single
+flights: a rotor that slows down, a mass that changes and a stick of another scale leave what no
+constant takes up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,14 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax.dynamics.kinematics import is_kinematic
-from heli_jax.finding import Finding
+from heli_jax.finding import HALF_INTERVAL, Finding
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.residual_drives import (
     changing,
     drives,
+    motions,
     moving_inputs,
     of_single_flights,
 )
@@ -244,9 +246,15 @@ def _said(
     first, own = of_one_clock(at, e, name)[0]
     frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
     where = f" near {frequency:.2g} rad/s" if strong.damping < 1.0 else ""
+    distrusts: tuple[str, ...] = ()
     chance = f"twice the log-likelihood gains {strong.statistic:.3g}, p {p_value(strong.p_value)}"
     if one.by_amplitude:
         shifts = _by_amplitude(at, e, name, J) * slopes
+        # That is the least. It takes away what it moves beyond the interval that noise leaves: an
+        # interval that allows for coloured residuals is wide by what was found here.
+        by_noise = deviations(e.J)[:k] * np.abs(slopes)
+        far = np.abs(shifts) > HALF_INTERVAL * by_noise
+        distrusts = tuple(n for n, one in zip(at.layout.of_interest, far, strict=True) if one)
         code, subjects = "dynamics.depends-on-amplitude", (name,)
         brief = f"the response of {name} depends on amplitude"
         remedy = (
@@ -273,7 +281,10 @@ def _said(
         code, subjects = LAG, (name, drive)
         brief = f"the residual of {name} still follows {drive}{where}"
         what = "a mode or a lag" if strong.damping < 1.0 else "dynamics"
-        remedy = f"the model lacks {what}, or this is a poor optimum (try fit.starts)"
+        remedy = (
+            f"the model lacks {what}, a constant that is held has another value (free it), or this "
+            "is a poor optimum (try fit.starts)"
+        )
     return Finding(
         code,
         "doubt",
@@ -283,6 +294,7 @@ def _said(
         subjects,
         dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
         brief,
+        distrusts=distrusts,
     )
 
 
@@ -290,7 +302,7 @@ def _by_amplitude(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> np.ndarray:
     """By unknown of interest (k,) its change from the record's mean amplitude to none, that of an
-    input, of the output or of its rate, whichever explains most.
+    input or of the output's `motions`, whichever explains most.
 
     The residual is regressed on the sensitivities, and on these times the amplitude. It is not
     whitened: the answer that depends on amplitude is as slow as the response itself.
@@ -301,7 +313,7 @@ def _by_amplitude(
     inputs = [at.data.flights[i].inputs for i, _ in samples]
     outputs = [np.asarray(e.simulated[i][name]) for i, _ in samples]
     signals = [[np.asarray(getattr(u, drive)) for u in inputs] for drive in moving_inputs(at)]
-    signals += [outputs, [np.gradient(y) for y in outputs]]
+    signals += [list(v) for v in zip(*(motions(y) for y in outputs), strict=True)]
     best, least = np.zeros(k), np.inf
     for signal in signals:
         amplitude = np.abs(
