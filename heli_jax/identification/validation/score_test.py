@@ -110,7 +110,7 @@ def lines_of(
     # What jumps because samples are missing is no answer: the filter's order after a hole is as if
     # nothing had been measured.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
-    v = scipy.fft.rfft(white)[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
+    v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
     v[(np.sqrt(mean_squares) <= _ROUNDING * scales)[:, 0]] = 0.0
