@@ -108,20 +108,21 @@ def distrusted(findings: Sequence[Finding], estimates: Mapping[str, Any]) -> dic
             for n, e in known.items()
         }
 
-    by_finding = [(f, parts(f)) for f in findings]
     # One step is a size to first order: a misfit that takes one interval away takes those that it
     # may move as far, by an amount that is not known.
-    takes = [(f, by, 0.5 if max(by.values(), default=0.0) > 1.0 else 1.0) for f, by in by_finding]
+    takes = [
+        (f, by, 0.5 if max(by.values(), default=0.0) > 1.0 else 1.0)
+        for f, by in ((f, parts(f)) for f in findings)
+    ]
     out: dict[str, Distrust] = {}
     for name, estimate in known.items():
-        moved = [f for f, by, most in takes if by[name] > most]
-        moved.sort(key=lambda f: -abs(f.shifts[name]))
+        moved = [(by[name], f) for f, by, most in takes if by[name] > most]
         unsized = [f for f in findings if name in f.distrusts]
         if moved:
-            shift = float(moved[0].shifts[name])
-            far = abs(shift) > HALF_INTERVAL * estimate.sd
-            sized = far and abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
-            out[name] = Distrust(moved[0].code, shift if sized else None, moved[0].brief)
+            part, first = max(moved, key=lambda one: one[0])
+            shift = float(first.shifts[name])
+            sized = part > 1.0 and abs(shift) <= _FARTHEST * max(abs(estimate.value), estimate.sd)
+            out[name] = Distrust(first.code, shift if sized else None, first.brief)
         elif unsized:
             out[name] = Distrust(unsized[0].code, None, unsized[0].brief)
     return out

@@ -101,7 +101,7 @@ class Varied:
     asked once."""
 
     def __init__(self, record: Record, fields: Sequence[str]) -> None:
-        """Of the names of these fields."""
+        """Take the names of these fields."""
         self._record, self._dtype = record, jnp.result_type(float)
         marks = {n: jnp.asarray(0.0, self._dtype) for n in fields}
         self._leaves, self._structure = jax.tree.flatten(replace(record, **marks))

@@ -228,7 +228,7 @@ def pseudoinverse(J: np.ndarray) -> np.ndarray:
     # The cut is on singular values, and units of the unknowns must not decide what it takes.
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    # Of its triangle, whose singular values are the same, and which has q rows instead of n.
+    # The triangle has the same singular values, and q rows instead of n.
     Q, R = np.linalg.qr(J / norms[None, :])
     return np.linalg.pinv(R, rcond=_NULL) @ Q.T / norms[:, None]
 

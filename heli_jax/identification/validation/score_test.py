@@ -285,7 +285,7 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
 
 
 class _Columns(NamedTuple):
-    """What goes through the filters; each of them stands for itself and itself one sample later."""
+    """Columns that go through the filters, each by itself and one sample later."""
 
     beside: Complex[np.ndarray, "b K"]
     """those whose answer through the same filter is taken off first"""
@@ -394,8 +394,8 @@ def _turned(M: np.ndarray) -> np.ndarray:
 
 
 def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Of what is left (..., n, n) of the columns' products, without directions of which next to
-    nothing is; whole: of the columns themselves."""
+    """Inverse of what is left (..., n, n) of the columns' products, without directions in which
+    next to nothing is left; whole: products of the columns themselves."""
     sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", whole), 1e-300))
     values, V = np.linalg.eigh(left / (sizes[..., :, None] * sizes[..., None, :]))
     kept = values > _SAME**2

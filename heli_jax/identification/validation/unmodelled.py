@@ -250,8 +250,8 @@ def _said(
     chance = f"twice the log-likelihood gains {strong.statistic:.3g}, p {p_value(strong.p_value)}"
     if one.by_amplitude:
         shifts = _by_amplitude(at, e, name, J) * slopes
-        # That is the least. It takes away what it moves beyond the interval that noise leaves: an
-        # interval that allows for coloured residuals is wide by what was found here.
+        # The shift is a lower bound. It is held against the interval that noise alone leaves: one
+        # that allows for coloured residuals is wide by what was found here.
         by_noise = deviations(e.J)[:k] * np.abs(slopes)
         far = np.abs(shifts) > HALF_INTERVAL * by_noise
         distrusts = tuple(n for n, one in zip(at.layout.of_interest, far, strict=True) if one)
