@@ -11,7 +11,7 @@ import ast
 import functools
 import inspect
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import jax
@@ -100,23 +100,25 @@ class Varied:
     """A record with some fields that change often: its class, which may convert and check them, is
     asked once."""
 
-    def __init__(self, record: Record, fields: Sequence[str]) -> None:
+    def __init__(self, record: Record, fields: Iterable[str]) -> None:
         """Take the names of these fields."""
         self._record, self._dtype = record, jnp.result_type(float)
-        marks = {n: jnp.asarray(0.0, self._dtype) for n in fields}
+        marks = {n: jnp.array(getattr(record, n), self._dtype) for n in fields}
         self._leaves, self._structure = jax.tree.flatten(replace(record, **marks))
-        at = {n: [i for i, v in enumerate(self._leaves) if v is mark] for n, mark in marks.items()}
+        at = {n: i for n, mark in marks.items() for i, v in enumerate(self._leaves) if v is mark}
+        same = sum(v is own for v, own in zip(self._leaves, jax.tree.leaves(record), strict=True))
         # A class that makes something else of what it is given is asked each time.
-        self._at = {n: i[0] for n, i in at.items()} if all(len(i) == 1 for i in at.values()) else {}
+        self._at = at if len(at) == len(marks) == len(self._leaves) - same else {}
 
     def having(self, values: Mapping[str, float]) -> Record:
-        """The record with these values; they are concrete, and of all fields that change."""
+        """The record with these values, which are concrete, of fields that change."""
         numbers = {n: np.asarray(v, self._dtype) for n, v in values.items()}
         if not self._at:
             return replace(self._record, **{n: jnp.asarray(v) for n, v in numbers.items()})
         leaves = list(self._leaves)
         for n, v in numbers.items():
-            leaves[self._at[n]] = v
+            # Arrays of JAX's, as the class itself would have; by `asarray` each takes ten times.
+            leaves[self._at[n]] = jax.device_put(v)
         return jax.tree.unflatten(self._structure, leaves)
 
 

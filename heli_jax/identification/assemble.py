@@ -23,7 +23,7 @@ from heli_jax.identification.fit_notes import Numbers, fit_notes, open_direction
 from heli_jax.identification.identifiability.swapped_modes import second_solutions
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.judgement import End, end_of, judge, params_of
+from heli_jax.identification.judgement import End, end_of, judge
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
@@ -199,15 +199,14 @@ def assemble(
         *judged.findings,
         *held.findings,
     ]
-    estimates = {k: numbers.of_interest[k] for k in layout.free}
     return Fit(
         model=problem.model.name,
         method=problem.method,
         status=status,
         n_samples=measured_count(search.data),
-        estimates=estimates,
+        estimates={k: numbers.of_interest[k] for k in layout.free},
         nuisance=numbers.nuisance,
-        params=params_of(problem, estimates),
+        params=end.params,
         verdict_before=run.before,
         verdict=errors.verdict,
         noise=numbers.noise,

@@ -3,10 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding
 from heli_jax.identification.agreement import (
@@ -22,7 +20,7 @@ from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Estimate, Signals
+from heli_jax.identification.result import Signals
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors
 from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.unknowns.nuisances import labels
@@ -82,6 +80,8 @@ class End(NamedTuple):
     """by pair of outputs"""
     absent: tuple[str, ...]
     """the parameters of disturbances that do not show"""
+    params: Any
+    """the vehicle with the estimates in place"""
 
     @property
     def arrived(self) -> bool:
@@ -105,16 +105,21 @@ def end_of(problem: Problem, search: Search, optimum: RelaxedOptimum, e: Evaluat
         optimum: where the optimiser ended.
         e: what it tells.
     """
-    signals = signals_of(e, problem.training)
+    signals, layout = signals_of(e, problem.training), search.layout
     return End(
         problem,
         optimum,
-        Solution(search.layout, search.data, optimum.noise, optimum.best.z),
+        Solution(layout, search.data, optimum.noise, optimum.best.z),
         e,
         signals,
-        whiteness_of(signals, e, problem.training, search.layout),
+        whiteness_of(signals, e, problem.training, layout),
         correlated_residuals(signals),
-        absent_names(search.layout, optimum),
+        absent_names(layout, optimum),
+        # Parameters alone: offsets, gains and shifts belong to the log, and a model that flies by
+        # itself has none of them.
+        problem.params_with(
+            {n: v for n, v in zip(layout.of_interest, e.named, strict=True) if n in layout.free}
+        ),
     )
 
 
@@ -148,8 +153,7 @@ def judge(
     weak = weak_by_instrument(problem, at, J) if arrived else ()
     responses = layout.estimator.response_agreement(layout, at.data, at.noise, at.z)
     instruments = _instruments(end, responses)
-    params = _params(end, numbers)
-    adequacy, ahead = _adequacy(end, params, responses)
+    adequacy, ahead = _adequacy(end, responses)
     verdict = unless_explains_nothing(errors.verdict, adequacy)
     explains = verdict is errors.verdict
     if arrived and not explains:
@@ -205,15 +209,15 @@ def _late_inputs(problem: Problem, layout: Layout, feedback: Sequence[Feedback])
     return late_inputs(list(zip(labels(problem.training), problem.training, strict=True)), feedback)
 
 
-def _adequacy(end: End, params: Any, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:
+def _adequacy(end: End, responses: ResponseAgreement | None) -> tuple[Adequacy, bool]:
     """Whether the model explains its records, and whether that was asked some seconds ahead."""
     problem, against = end.problem, _against_expected(end)
-    ahead = against is not None and (is_unstable(problem, params) or _bent(end, against))
+    ahead = against is not None and (is_unstable(problem, end.params) or _bent(end, against))
     pooled = pooled_metrics(end.signals)
     adequacy = (
         by_responses(responses)
         or by_excitation(problem, end.at, pooled)
-        or (_ahead(end, params) if ahead else _over_records(end, params, against))
+        or (_ahead(end) if ahead else _over_records(end, against))
     )
     if end.at.layout.estimator.noise_spectrum:
         adequacy = unless_unrelated(problem, adequacy)
@@ -263,7 +267,7 @@ def _feedback(end: End, numbers: Numbers) -> tuple[tuple[Feedback, ...], list[Fi
                 f._replace(severity="doubt", brief=_IN_A_LOOP, distrusts=tuple(estimates))
                 for f in findings
             ]
-        elif is_unstable(problem, _params(end, numbers), _HELD):
+        elif is_unstable(problem, end.params, _HELD):
             findings.append(_held(tuple(estimates)))
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     fast = [f._replace(distrusts=tuple(estimates)) for f in loop_between_samples(flights, feedback)]
@@ -280,24 +284,7 @@ def _held(names: tuple[str, ...]) -> Finding:
     return Finding(FEEDBACK, "doubt", words, brief=_IN_A_LOOP, distrusts=names)
 
 
-def _params(end: End, numbers: Numbers) -> Any:
-    return params_of(end.problem, {k: numbers.of_interest[k] for k in end.at.layout.free})
-
-
-def params_of(problem: Problem, estimates: dict[str, Estimate]) -> Any:
-    """The vehicle with the estimates in place.
-
-    Args:
-        problem: with the vehicle at its start values.
-        estimates: by parameter.
-    """
-    # Parameters alone: offsets, gains and shifts belong to the log, and a model that flies by
-    # itself has none of them.
-    values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
-    return naming.replace(problem.vehicle, **values)
-
-
-def _ahead(end: End, params: Any) -> Adequacy:
+def _ahead(end: End) -> Adequacy:
     """Adequacy by what is predicted some seconds ahead, under filter error: of a model whose
     simulation says nothing over a whole record."""
     problem, records, error, expected = end.problem, [], {}, {}
@@ -316,10 +303,10 @@ def _ahead(end: End, params: Any) -> Adequacy:
         agreement[n] = metrics(measured, predicted)
     against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
     evidence = Evidence(tuple(records), agreement, end.white, against, ahead=SECONDS)
-    return assess(problem, params, evidence)
+    return assess(problem, end.params, evidence)
 
 
-def _over_records(end: End, params: Any, against: dict[str, float] | None) -> Adequacy:
+def _over_records(end: End, against: dict[str, float] | None) -> Adequacy:
     """By what is simulated from the beginning of each record to its end."""
     problem, signals = end.problem, end.signals
     records = tuple(
@@ -329,4 +316,4 @@ def _over_records(end: End, params: Any, against: dict[str, float] | None) -> Ad
     ahead = tuple(None if s.innovations is None else dict(s.innovations) for s in signals)
     unknowns = end.at.layout.determined
     evidence = Evidence(records, pooled_metrics(signals), end.white, against, unknowns, ahead)
-    return assess(problem, params, evidence)
+    return assess(problem, end.params, evidence)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -21,6 +20,7 @@ from heli_jax.identification.filtered_noise import filtered_noise
 from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.push_scale import push_scales
+from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
@@ -206,6 +206,19 @@ class Problem:
         first = {n: float(flight.inputs[n][0]) for n in naming.names(self.model.Inputs)}
         return push_scales(self.model, params, first, sds, disturbances)
 
+    @functools.cached_property
+    def offset_inputs(self) -> tuple[str, ...]:
+        """The inputs whose offset is estimated, in the order of the model: as
+        `nuisance.input_offset` says, or the sticks of a machine in free flight."""
+        inputs, requested = naming.names(self.model.Inputs), self.nuisance.input_offset
+        if requested is None:
+            # The first flight alone: all are of one machine.
+            first = self.training[0]
+            return offset_inputs(self.model, self.start_params(), first, tuple(self.free))
+        if isinstance(requested, bool):
+            return inputs if requested else ()
+        return tuple(n for n in inputs if n in requested)
+
     @property
     def motion(self) -> float:
         """The largest standard deviation of a measured output; 1 where nothing moves."""
@@ -218,10 +231,20 @@ class Problem:
 
     def start_params(self) -> Any:
         """The vehicle with the free parameters at their starts."""
-        return naming.replace(
-            self.vehicle,
-            **{n: np.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
-        )
+        return self.params_with({n: f.start for n, f in self.free.items()})
+
+    def params_with(self, values: Mapping[str, Any]) -> Any:
+        """The vehicle with other values of parameters that are free, or known of a flight.
+
+        Args:
+            values: by name, SI.
+        """
+        return self._varied.having(values)
+
+    @functools.cached_property
+    def _varied(self) -> naming.Varied:
+        known = (n for f in self.flights for n in f.known)
+        return naming.Varied(self.vehicle, dict.fromkeys((*self.free, *known)))
 
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_problem

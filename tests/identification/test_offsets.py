@@ -8,7 +8,6 @@ import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import Scalar
 from tests.identification.bench import BENCH, amplitude_for, response, steps, vehicle
@@ -82,18 +81,18 @@ def problem_of(free: dict[str, Free], outputs: tuple[str, ...], nuisance: Nuisan
 )
 def test_where_the_offset_is_estimated_unless_told(free, outputs, expected):
     starts = {n: Free(s) for n, s in (("Lp", -2.0), ("Ld", 5.0), ("L0", 0.1)) if n in free}
-    assert offset_inputs(problem_of(starts, outputs, Nuisance())) == expected
-    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=True))) == ("d",)
-    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=False))) == ()
-    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=("d",)))) == ("d",)
+    assert problem_of(starts, outputs, Nuisance()).offset_inputs == expected
+    assert problem_of(starts, outputs, Nuisance(input_offset=True)).offset_inputs == ("d",)
+    assert problem_of(starts, outputs, Nuisance(input_offset=False)).offset_inputs == ()
+    assert problem_of(starts, outputs, Nuisance(input_offset=("d",))).offset_inputs == ("d",)
 
 
 def test_a_stand_takes_the_offset_up_in_the_bias():
     rng = np.random.default_rng(0)
     flight = Flight(dt=DT, inputs={"x_roll": steps(rng, N, DT, 1e-6)}, outputs={"roll": np.ones(N)})
-    assert offset_inputs(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE)) == ()
+    assert Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE).offset_inputs == ()
     limp = vehicle(BENCH | {"kappa": 0.0})
-    assert offset_inputs(Problem(models.roll_on_stand, limp, [flight], FREE)) == ("x_roll",)
+    assert Problem(models.roll_on_stand, limp, [flight], FREE).offset_inputs == ("x_roll",)
 
 
 def test_the_scale_of_the_offset_is_that_of_the_stick():

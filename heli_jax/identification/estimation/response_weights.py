@@ -28,7 +28,6 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.linear_machine import forgets
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.input_offsets import offset_inputs
 
 # Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
 
@@ -125,7 +124,7 @@ def _at_rest(problem: Problem, flights: int) -> tuple[tuple[Any, ...], tuple[dic
     """Initial states and offsets of zero, in the form in which they are found later."""
     # The same form from the beginning: another one would be compiled anew.
     state = zeros(problem.model.State) if problem.nuisance.initial_state else None
-    offsets = {n: jnp.zeros(()) for n in offset_inputs(problem)}
+    offsets = {n: jnp.zeros(()) for n in problem.offset_inputs}
     return (state,) * flights, (offsets,) * flights
 
 

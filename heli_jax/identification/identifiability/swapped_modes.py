@@ -7,12 +7,12 @@ put where they make each other's, the others follow until the linearised respons
 and the residuals are evaluated there.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -112,12 +112,8 @@ class _Family:
     def __init__(self, problem: Problem, values: dict[str, float], names: list[str]) -> None:
         self.problem, self.values, self.names = problem, values, names
         flight = problem.training[0]
-        self.params = naming.replace(
-            problem.vehicle,
-            **{n: jnp.asarray(v, jnp.result_type(float)) for n, v in flight.known.items()},
-        )
+        self.known = flight.known
         late = problem.model.delay_parameters
-        self._record = naming.Varied(self.params, names)
         # A logarithm keeps the sign; of what is zero, and of delays, which may be, so many samples.
         self.log = np.array([values[n] != 0.0 and n not in late for n in names])
         self.size = np.array([flight.dt if n in late else 1.0 for n in names])
@@ -134,12 +130,19 @@ class _Family:
         )
         self.rows = [naming.names(problem.model.Outputs).index(n) for n in flight.outputs]
 
-        self.here = self.responses(np.zeros(len(names)))
+    @functools.cached_property
+    def here(self) -> np.ndarray:
+        """Responses (k, p, m) at zero."""
+        return self.responses(np.zeros(len(self.names)))
+
+    @functools.cached_property
+    def gain(self) -> np.ndarray:
+        """Their sizes, by which differences are judged."""
         gain = np.abs(self.here)
         largest = np.max(gain, axis=0)
         # A response of nothing at all has no size of its own.
         largest = np.where(largest > 0, largest, max(float(np.max(gain)), 1e-300))
-        self.gain = np.maximum(gain, _FLOOR * largest)
+        return np.maximum(gain, _FLOOR * largest)
 
     def by_name(self, z: np.ndarray) -> dict[str, float]:
         """Values at coordinates (q,)."""
@@ -148,7 +151,7 @@ class _Family:
         return dict(zip(self.names, map(float, moved), strict=True))
 
     def _at(self, z: np.ndarray):  # a record of the model's Params
-        return self._record.having(self.by_name(z))
+        return self.problem.params_with(self.known | self.by_name(z))
 
     def poles(self, z: np.ndarray) -> np.ndarray:
         """Eigenvalues (n,) of A."""

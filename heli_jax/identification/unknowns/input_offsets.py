@@ -16,7 +16,6 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.problem import Problem
 from heli_jax.vehicle import of_helicopter
 
 # params, states and inputs are Any: records of a model, whose classes may be a user's own.
@@ -30,36 +29,31 @@ _POINTS = 200
 """samples at which the responses are compared"""
 
 
-def offset_inputs(problem: Problem) -> tuple[str, ...]:
-    """The inputs whose offset is estimated, in the order of the model.
+def offset_inputs(
+    model: Model, params: Any, flight: Flight, free: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The sticks of a machine in free flight: those whose constant offset no initial state and no
+    bias can take the place of, in the order of the model.
 
-    As `nuisance.input_offset` says; where it leaves that open, the sticks of a machine in free
-    flight: those whose constant offset no initial state and no bias can take the place of. Throttle
-    and collective have no centre, and where a free parameter is a constant term of the equations
-    that parameter stands for the offsets already.
+    Throttle and collective have no centre, and where a free parameter is a constant term of the
+    equations that parameter stands for the offsets already.
+
+    Args:
+        model: whose inputs they are.
+        params: its parameters, SI; what is known of the flight replaces them.
+        flight: how long, and how far the inputs go.
+        free: names of the free parameters.
     """
-    inputs = naming.names(problem.model.Inputs)
-    requested = problem.nuisance.input_offset
-    if requested is None:
-        return _in_free_flight(problem)
-    if isinstance(requested, bool):
-        return inputs if requested else ()
-    return tuple(n for n in inputs if n in requested)
-
-
-def _in_free_flight(problem: Problem) -> tuple[str, ...]:
-    model, params = problem.model, problem.start_params()
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
     # Our model that is not linear is the whole helicopter, which flies free. Its matrices at the
     # mean inputs and the model's own initial state, no trim, would say nothing.
     if of_helicopter(model.Params) and not model.linear:
         return tuple(sticks)
-    flight = problem.training[0]
     if flight.known:
         params = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # A model declared linear vanishes at zero, so it has no constant term to look for.
-    if not model.linear and _has_constant_term(model, params, tuple(problem.free)):
+    if not model.linear and _has_constant_term(model, params, free):
         return ()
     unexplained = _unexplained(model, params, flight)
     at = naming.names(model.Inputs)

@@ -21,7 +21,6 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.identification.unknowns.transforms import Real
 
 # Where a type is Any here it is a record class of the model (Params, State, Inputs: a user's own
@@ -258,7 +257,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
         bias=nuisance.bias,
-        offsets=offset_inputs(problem),
+        offsets=problem.offset_inputs,
         # By name, as JAX orders the dictionaries in everything that is compiled.
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         disturbance=tuple(problem.noise),

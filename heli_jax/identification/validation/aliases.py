@@ -7,7 +7,6 @@ past the Nyquist frequency is one of many that fit as well, each with a narrow i
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -143,21 +142,20 @@ def fast_modes(
         values: of the free parameters, SI; gains and shifts among them move no mode.
         noise: sd by flight and output, SI; without it nothing is said to be undetermined.
     """
-    free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
+    free = {n: v for n, v in values.items() if n in problem.free}
     modes = []
     for i, flight in enumerate(problem.training):
-        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-        params = naming.replace(problem.vehicle, **(free | known))
+        here = free | flight.known
         at = operating_point(
             problem.model,
-            params,
+            problem.params_with(here),
             flight.inputs,
             flight.outputs,
             flight.dt,
             substeps=problem.substeps,
         )
-        moving = [n for n in free if n not in known]
-        fast = _of_flight(problem, flight, params, at, moving, noise[i] if noise else None)
+        moving = [n for n in free if n not in flight.known]
+        fast = _of_flight(problem, flight, here, at, moving, noise[i] if noise else None)
         modes += [] if fast is None else [fast]
     return modes
 
@@ -165,12 +163,12 @@ def fast_modes(
 def _of_flight(
     problem: Problem,
     flight: Flight,
-    params: Any,
+    here: Mapping[str, float],
     at: OperatingPoint,
     moving: list[str],
     noise: Mapping[str, Any] | None,
 ) -> FastMode | None:
-    modes = modes_about(problem, params, at)
+    modes = modes_about(problem, problem.params_with(here), at)
     if modes is None:
         return None
     nyquist = np.pi / flight.dt
@@ -178,7 +176,7 @@ def _of_flight(
     past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _NEAR * nyquist]
     if not past:
         return None
-    slopes = _relative_slopes(problem, params, at, moving, modes)
+    slopes = _relative_slopes(problem, here, at, moving, modes)
     # A filter or a servo whose constants are given is simulated as it is, and has no alias.
     past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
     if not past:
@@ -245,14 +243,18 @@ def _known_otherwise(problem: Problem, name: str) -> bool:
 
 
 def _relative_slopes(
-    problem: Problem, params: Any, at: OperatingPoint, names: Sequence[str], modes: Modes
+    problem: Problem,
+    here: Mapping[str, float],
+    at: OperatingPoint,
+    names: Sequence[str],
+    modes: Modes,
 ) -> dict[str, np.ndarray]:
     """By parameter of every eigenvalue (n,) complex its change over its size, for a relative change
     of that parameter: first-order perturbation of a simple eigenvalue."""
-    values, slopes = {n: float(getattr(params, n)) for n in names}, {}
-    varied = naming.Varied(params, names)
-    for name, value in values.items():
-        there = varied.having(values | {name: value + _STEP * (abs(value) or 1.0)})
+    slopes = {}
+    for name in names:
+        value = here[name]
+        there = problem.params_with({**here, name: value + _STEP * (abs(value) or 1.0)})
         A = linearize(problem.model, there, at.state, at.inputs).matrices.A
         slope = (np.asarray(A, np.float64) - modes.A) / _STEP
         changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)

@@ -59,11 +59,13 @@ def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _behind_play(v: np.ndarray) -> np.ndarray:
     """Where a signal (N,) takes what follows it with play."""
-    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, np.empty(v.size)
-    for k, x in enumerate(v.tolist()):
+    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, []
+    # A stick that is held for many samples moves at a few of them.
+    begins = np.flatnonzero(np.diff(v, prepend=np.nan))
+    for x in v[begins].tolist():
         at = min(max(at, x - half), x + half)
-        out[k] = at
-    return out
+        out.append(at)
+    return np.repeat(out, np.diff(begins, append=v.size))
 
 
 def _normal(v: np.ndarray) -> np.ndarray:
