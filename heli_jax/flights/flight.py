@@ -1,5 +1,6 @@
 """What a flight is, whichever log it came from."""
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.finding import Finding
-from heli_jax.flights.signal_facts import SignalFacts
+from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
 
 HOLDS = ("zero-order", "linear", "mixed")
 _BY_NAME = {
@@ -240,6 +241,18 @@ class Flight:
         """
         facts = self.source.facts.get((name, kind)) if self.source else None
         return facts.usual if facts is not None and facts.usual > 0 else self.dt
+
+    @functools.cached_property
+    def facts(self) -> dict[tuple[str, str], SignalFacts]:
+        """What each signal is like, by name and kind: as it was logged, where that is known."""
+        known = self.source.facts if self.source else {}
+        signals = {(n, "input"): u for n, u in self.inputs.items()}
+        signals |= {(n, "output"): y for n, y in self.outputs.items()}
+        if signals.keys() <= known.keys():
+            return {key: known[key] for key in signals}
+        timed = {key: (self.times, x) for key, x in signals.items()}
+        outputs = frozenset(key for key in signals if key[1] == "output")
+        return {**facts_of_all(timed, outputs), **{k: known[k] for k in signals if k in known}}
 
     # Imported within: `summaries` is for notebooks, and a flight is made without it.
     def __repr__(self) -> str:

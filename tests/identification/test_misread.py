@@ -15,7 +15,7 @@ from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.identification.validation.late_angles import lateness
 from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
-from heli_jax.identification.validation.signal_quality import cut_off, facts_of
+from heli_jax.identification.validation.signal_quality import cut_off
 from heli_jax.identification.validation.signal_signs import angle_over_rate
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
@@ -33,7 +33,7 @@ class Motor(NamedTuple):
 
 
 def facts(problem):
-    return [facts_of(flight) for flight in problem.training]
+    return [flight.facts for flight in problem.training]
 
 
 @pytest.fixture

@@ -30,7 +30,6 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.late_inputs import LATE
 from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
-from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.identification.validation.unmodelled import LAG
 
 _CLEAR = 5.0
@@ -300,7 +299,7 @@ def _periods(flights: Sequence[Flight]) -> dict[str, float]:
     """By input that moves in steps the time between its samples as they were logged [s]."""
     longest: dict[str, float] = {}
     for name in _stepped(flights):
-        usual = [facts_of(f)[name, "input"].usual for f in flights if name in f.inputs]
+        usual = [f.facts[name, "input"].usual for f in flights if name in f.inputs]
         longest[name] = max(usual)
     return longest
 

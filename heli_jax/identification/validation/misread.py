@@ -22,7 +22,6 @@ from heli_jax.identification.validation.signal_quality import (
     Facts,
     cut_off,
     dropout_words,
-    facts_of,
 )
 from heli_jax.identification.validation.signal_signs import rate_against_angle
 from heli_jax.vehicle import of_helicopter
@@ -66,7 +65,7 @@ def record_doubts(problem: Problem) -> list[Finding]:
         problem: the flights, and the model, whose axes name headings.
     """
     # Of both questions once: sorting long records is what takes the time.
-    facts = [facts_of(flight) for flight in problem.training]
+    facts = [flight.facts for flight in problem.training]
     return [
         *misread(problem),
         *dropouts(problem, facts),

@@ -20,7 +20,6 @@ from heli_jax.flights.signal_facts import (
     SignalFacts,
     Stuck,
     at_rails,
-    facts_of_all,
     quantum,
 )
 from heli_jax.flights.strays import stray_words
@@ -29,7 +28,6 @@ from heli_jax.flights.table import sample_count
 __all__ = [
     "Rails",
     "cut_off",
-    "facts_of",
     "quantisation",
     "quantum",
     "rails",
@@ -73,18 +71,6 @@ type Facts = Mapping[tuple[str, str], SignalFacts]
 """of a flight's signals, by name and kind"""
 
 
-def facts_of(flight: Flight) -> dict[tuple[str, str], SignalFacts]:
-    """Of all signals, by name and kind: as they were logged, where the flight knows it."""
-    known = flight.source.facts if flight.source else {}
-    signals = {(n, "input"): u for n, u in flight.inputs.items()}
-    signals |= {(n, "output"): y for n, y in flight.outputs.items()}
-    if signals.keys() <= known.keys():
-        return {key: known[key] for key in signals}
-    timed = {key: (flight.times, x) for key, x in signals.items()}
-    outputs = frozenset(key for key in signals if key[1] == "output")
-    return {**facts_of_all(timed, outputs), **{k: known[k] for k in signals if k in known}}
-
-
 def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     """Signals that rest at an end of their range, the worst first.
 
@@ -93,7 +79,7 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     """
     saturated = []
     for label, flight in flights:
-        for (name, kind), facts in facts_of(flight).items():
+        for (name, kind), facts in flight.facts.items():
             if sum(facts.shares) > 0:
                 saturated.append((sum(facts.shares), label, kind, name, facts))
     if not saturated:
@@ -145,7 +131,7 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     """
     doubts: list[tuple[float, str]] = []
     for label, flight in flights:
-        for (name, kind), facts in facts_of(flight).items():
+        for (name, kind), facts in flight.facts.items():
             if facts.marks and kind == "output":
                 words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
                 doubts.append((0.0, f"{words}at what the log says of such values."))
@@ -208,7 +194,7 @@ def strays(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     stray = [
         (odd.times.size, f"{label}: {name} has {stray_words(odd)}: kept, and fitted as measured; ")
         for label, flight in flights
-        for (name, _), facts in facts_of(flight).items()
+        for (name, _), facts in flight.facts.items()
         for odd in facts.strays
     ]
     if not stray:
@@ -233,7 +219,7 @@ def quantisation(
     """
     doubts, worst = [], 0.0
     for (label, flight), noise in zip(flights, sd, strict=True):
-        facts = facts_of(flight)
+        facts = flight.facts
         for name in flight.outputs:
             logged = facts[name, "output"]
             rounding = _rounding(logged, flight.dt)

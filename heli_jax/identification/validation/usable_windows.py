@@ -4,7 +4,6 @@ import numpy as np
 
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
-from heli_jax.identification.validation.signal_quality import facts_of
 
 _RAILS = 0.05
 """part of a window's samples at an end of a signal's range, from which on it is left out"""
@@ -17,7 +16,7 @@ class Exclusions:
 
     def __init__(self, flights: tuple[Flight, ...]) -> None:
         self.flights = flights
-        self.facts = [facts_of(f) for f in flights]
+        self.facts = [f.facts for f in flights]
 
     def of(self, i: int, first: int, last: int) -> str:
         """In words; empty where it may be used.
