@@ -131,11 +131,11 @@ def _optimise_in_one_program(
     until: np.ndarray,
     trusted: np.ndarray,
 ) -> _End:
-    """`descend` from one start as one program, up to `until` steps in all; with one step it
-    evaluates z0 and nothing else."""
+    """`descend` from one start as one program, up to `until` steps in all; with none it evaluates
+    z0 and nothing else."""
 
     def more(now: _Loop) -> Array:
-        return (now.standing.k < until) & ~now.standing.state.done
+        return (now.standing.k < jnp.maximum(until, 1)) & ~now.standing.state.done
 
     def step(now: _Loop) -> _Loop:
         k, units, state = now.standing
@@ -144,8 +144,13 @@ def _optimise_in_one_program(
         units = jax.tree.map(
             lambda new, old: jnp.where(k == 0, new, old), scaling(e.r, e.J, trusted), units
         )
-        constants = constants_of(layout, z0, units)
-        state = advance(constants, state, compressed(constants, e.r, e.J))
+
+        def advanced() -> State:
+            constants = constants_of(layout, z0, units)
+            return advance(constants, state, compressed(constants, e.r, e.J))
+
+        # Where nobody steps the triangle of J, which takes longer than J, is not needed.
+        state = jax.lax.cond(until > 0, advanced, lambda: state)
         return _Loop(_Standing(k + 1, units, state), e)
 
     end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0, begun))
@@ -227,10 +232,10 @@ def residual_and_jacobian(
         z: the unknowns.
     """
     if layout.estimator.one_program(layout):
-        # An array and not a number, which would be compiled in: with one step alone the program
-        # of a whole run would then be another.
+        # An array and not a number, which would be compiled in: without steps the program of a
+        # whole run would then be another.
         begun, none = _not_begun(z.shape[0], z.dtype), nothing_trusted(layout)
-        return _optimise_in_one_program(layout, data, noise, z, begun, np.asarray(1), none).last
+        return _optimise_in_one_program(layout, data, noise, z, begun, np.asarray(0), none).last
     return differentiate(layout, data, noise, z)
 
 
