@@ -16,9 +16,14 @@ from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.chosen_windows import DETERMINES, ENOUGH, Window
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
-from heli_jax.identification.validation.record_windows import Ranking, window_samples
+from heli_jax.identification.validation.record_windows import (
+    DETERMINES,
+    ENOUGH,
+    Ranking,
+    Window,
+    window_samples,
+)
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
 from heli_jax.terminal import print_table, tell

@@ -124,10 +124,10 @@ def test_imports_point_one_way(name):
 
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
-    "methods", "free", "arguments", "push_scale", "filtered_noise", "problem", "unknowns",
+    "methods", "free", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
-    "agreement", "fit_notes", "judgement", "assemble", "further_starts", "fit", "likelier_hold",
-    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
+    "agreement", "fit_notes", "assemble", "further_starts", "fit",
+    "frequency_start", "method_comparison", "model_selection",
 )  # fmt: skip
 
 

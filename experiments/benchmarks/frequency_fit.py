@@ -28,8 +28,7 @@ import jax
 
 from heli_jax import Problem, fit
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.first_search import first_optima
-from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.multistart import Search, first_optima
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.fit import first_guess
 

@@ -21,7 +21,7 @@ from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.signal_facts import quantum
 from heli_jax.flights.table import Table, shown
-from heli_jax.identification.filtered_noise import filtered_noise
+from heli_jax.identification.defaults import filtered_noise
 from heli_jax.numbers import percent
 
 type _Channel = tuple[tuple[Filter, ...], float]

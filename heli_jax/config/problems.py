@@ -221,8 +221,11 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         InputError: no axis of the model can be disturbed.
     """
     # Not before it is needed: it imports the optimiser, which takes a second.
-    from heli_jax.identification.disturbed_sets import disturbed_sets, undisturbed_too
-    from heli_jax.identification.model_selection import alternatives
+    from heli_jax.identification.model_selection import (
+        alternatives,
+        disturbed_sets,
+        undisturbed_too,
+    )
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)

@@ -12,17 +12,15 @@ from heli_jax.identification.estimation.evaluation import directions
 from heli_jax.identification.result import Signals
 from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.decimated import (
-    is_decimated,
-    whiteness_in_band,
-)
 from heli_jax.identification.validation.metrics import (
     NO_METRICS,
     Metrics,
     Whiteness,
     diverges,
+    is_decimated,
     metrics,
     whiteness,
+    whiteness_in_band,
 )
 from heli_jax.numbers import percent
 

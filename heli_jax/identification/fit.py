@@ -16,15 +16,15 @@ from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.delay_starts import delay_starts
-from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
-from heli_jax.identification.estimation.drawn_starts import draw
+from heli_jax.identification.estimation.disturbance_search import (
+    disturbance_or_none,
+    likely_gusts,
+    those_that_show,
+)
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.first_search import FirstGuess, first_optima
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.likely_gusts import likely_gusts
-from heli_jax.identification.estimation.multistart import StartRow
+from heli_jax.identification.estimation.multistart import FirstGuess, StartRow, first_optima
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     better_of_two_guesses,
@@ -32,8 +32,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.same_responses import better_of_same_responses
-from heli_jax.identification.estimation.shooting_start import BY_WINDOWS, by_windows
-from heli_jax.identification.estimation.which_disturbances import those_that_show
+from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
 from heli_jax.identification.further_starts import (
     SAID_STABLE,
@@ -42,11 +41,10 @@ from heli_jax.identification.further_starts import (
     further_starts,
     left_stability,
 )
-from heli_jax.identification.identifiability.disturbances import of_disturbances
+from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.sentences import listed
-from heli_jax.identification.identifiability.swapped_modes import second_solutions
-from heli_jax.identification.identifiability.valley import Valley
+from heli_jax.identification.identifiability.through_inputs import of_disturbances
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
@@ -69,10 +67,9 @@ from heli_jax.identification.validation.expected_accuracy import (
     unstated_gusts,
 )
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
-from heli_jax.identification.validation.input_units import doubtful_inputs, scaled_by
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.misread import record_doubts
+from heli_jax.identification.validation.misread import doubtful_inputs, record_doubts, scaled_by
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (

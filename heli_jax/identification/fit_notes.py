@@ -6,12 +6,12 @@ from typing import NamedTuple
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
-from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.identifiability.through_inputs import of_disturbances
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate

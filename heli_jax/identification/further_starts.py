@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.equation_error.start import equation_error_start
-from heli_jax.identification.estimation.drawn_starts import draw
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, rank
 from heli_jax.identification.estimation.noise_covariance import (
@@ -17,6 +16,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relax_noise_covariance,
 )
+from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise, unpack

@@ -15,12 +15,16 @@ from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
 from heli_jax.dynamics.model import Model, require_constants, require_linear
 from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.arguments import check_arguments, warn_of_degrees
-from heli_jax.identification.filtered_noise import filtered_noise
-from heli_jax.identification.free import Free, Prior, Sign, check_free
+from heli_jax.identification.defaults import filtered_noise, offset_inputs, push_scales
+from heli_jax.identification.free import (
+    Free,
+    Prior,
+    Sign,
+    check_arguments,
+    check_free,
+    warn_of_degrees,
+)
 from heli_jax.identification.methods import estimator_of
-from heli_jax.identification.push_scale import push_scales
-from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
@@ -34,7 +38,7 @@ class Nuisance(NamedTuple):
 
     `input_offset` is a constant that is added to the logged input, since no stick is centred: True
     for all inputs, or their names; None leaves it to the machine: on for the sticks of one in free
-    flight, where an offset is integrated (`heli_jax.identification.unknowns.input_offsets`).
+    flight, where an offset is integrated (`heli_jax.identification.defaults`).
     """
 
     initial_state: bool = True

@@ -27,7 +27,7 @@ from heli_jax.identification.equation_error.first_guess import (
     EquationErrorStart,
     StartValue,
 )
-from heli_jax.identification.equation_error.stepwise import Step
+from heli_jax.identification.equation_error.regression import Step
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart

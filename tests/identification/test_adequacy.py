@@ -8,11 +8,10 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
-from heli_jax.identification.validation.adequacy import Evidence, assess
+from heli_jax.identification.validation.adequacy import Evidence, assess, predicts_nothing
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.held_out import worse_than_mean
 from heli_jax.identification.validation.metrics import metrics, whiteness
-from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from tests.identification.lag import LAG, Params, response
 
 N, DT = 400, 0.05

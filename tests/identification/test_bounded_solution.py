@@ -7,7 +7,8 @@ import pytest
 
 from heli_jax import Flight
 from heli_jax.flights.instruments import own_instruments
-from heli_jax.identification.estimation.bounded_solution import (
+from heli_jax.identification.estimation.response_weights import Machine
+from heli_jax.identification.estimation.window_errors import (
     bounded_outputs,
     driven_by,
     ends_outputs,
@@ -15,7 +16,6 @@ from heli_jax.identification.estimation.bounded_solution import (
     resolved,
     span,
 )
-from heli_jax.identification.estimation.linear_machine import Machine
 
 
 def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():

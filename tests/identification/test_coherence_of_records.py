@@ -7,11 +7,9 @@ import pytest
 import scipy.signal
 
 from heli_jax.identification.validation.enough import _of_feedback
-from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.excited_band import bands, hardly_moving, seen_parts
 from heli_jax.identification.validation.feedback import feedback_of
-from heli_jax.identification.validation.hardly_moving import hardly_moving
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.seen_parts import seen_parts
 from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 
 

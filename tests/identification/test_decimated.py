@@ -5,8 +5,7 @@ import pytest
 import scipy.signal
 
 from heli_jax.flights import Signal, read_flight
-from heli_jax.identification.validation.decimated import is_decimated, whiteness_in_band
-from heli_jax.identification.validation.metrics import whiteness
+from heli_jax.identification.validation.metrics import is_decimated, whiteness, whiteness_in_band
 
 
 def at_half_the_rate(noise: np.ndarray) -> np.ndarray:

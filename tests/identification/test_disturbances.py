@@ -12,7 +12,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import initial_sd_of
 from heli_jax.identification.estimation.kalman import innovations
-from heli_jax.identification.identifiability.disturbances import _of_columns
+from heli_jax.identification.identifiability.through_inputs import _of_columns
 from heli_jax.naming import asdict
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.inputs import random_steps

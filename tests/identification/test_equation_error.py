@@ -12,9 +12,8 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, linear_model, load_config, models
 from heli_jax.config import problem
 from heli_jax.errors import InputError
-from heli_jax.identification.equation_error.errors import basis_of, covariance, partial_f
-from heli_jax.identification.equation_error.regression import Rows
-from heli_jax.identification.equation_error.smoothing import segments, smoothed, smoothed_input
+from heli_jax.identification.equation_error.records import segments, smoothed, smoothed_input
+from heli_jax.identification.equation_error.regression import Rows, basis_of, covariance, partial_f
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.naming import Scalar
 

@@ -24,13 +24,13 @@ from heli_jax import (
 from heli_jax.dynamics.jacobians import point
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
+    Matrices,
     errors_of_lines,
     resolved,
     states,
 )
-from heli_jax.identification.estimation.frequency_machines import Matrices
+from heli_jax.identification.estimation.frequency_noise import smoothed
 from heli_jax.identification.estimation.frequency_records import Record, cut_notes
-from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive

@@ -5,8 +5,12 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from heli_jax.identification.estimation.frequency_gusts import Machine, whitening_by
-from heli_jax.identification.estimation.frequency_spectrum import smoothed, whitening_of
+from heli_jax.identification.estimation.frequency_noise import (
+    Machine,
+    smoothed,
+    whitening_by,
+    whitening_of,
+)
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     Moved,

@@ -12,9 +12,8 @@ from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
     following,
 )
-from heli_jax.identification.estimation.frequency_rows import _weighed
-from heli_jax.identification.estimation.frequency_slopes import _Sums
-from heli_jax.identification.estimation.frequency_spectrum import smoothed
+from heli_jax.identification.estimation.frequency_noise import smoothed
+from heli_jax.identification.estimation.frequency_slopes import _Sums, _weighed
 from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,

@@ -7,11 +7,10 @@ import pytest
 from heli_jax import fit
 from heli_jax.identification.estimation import frequency_error
 from heli_jax.identification.estimation.evaluation import least_share
-from heli_jax.identification.estimation.first_search import first_optima
-from heli_jax.identification.estimation.frequency_blocks import blocks_of
+from heli_jax.identification.estimation.frequency_lines import blocks_of
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.multistart import Search, first_optima
 from heli_jax.identification.fit import first_guess
 
 

@@ -10,14 +10,13 @@ import scipy.optimize
 
 from heli_jax import Free, Nuisance, Prior, Problem, fit, models
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.identification.estimation import fused_runs, many_runs
+from heli_jax.identification.estimation import many_runs
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_ERROR
-from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
+from heli_jax.identification.estimation.many_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
-from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.bootstrap import bootstrap, refit
 from heli_jax.identification.uncertainty.comparison import intervals
-from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from tests.identification.bench import BENCH, record, response, vehicle
@@ -185,7 +184,7 @@ def test_many_records_that_are_no_program_are_run_one_by_one(fitted, monkeypatch
     few = bootstrap(fitted, 2)
     assert few.note == ""
     monkeypatch.setattr(many_runs, "_MANY", 2)
-    monkeypatch.setattr(fused_runs, "_refused", lambda _: "a model of straw (at straw.py:3)")
+    monkeypatch.setattr(many_runs, "_refused", lambda _: "a model of straw (at straw.py:3)")
     again = bootstrap(fitted, 2)
     assert again.note != ""
     np.testing.assert_array_equal(again.values["Ixx"], few.values["Ixx"])

@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight, Signal
 from heli_jax.flights.flight import Source
-from heli_jax.identification.validation.input_units import doubtful_inputs
+from heli_jax.identification.validation.misread import doubtful_inputs
 
 N, DT, FULL = 500, 0.02, 0.5
 

@@ -14,8 +14,8 @@ from heli_jax import linear_model, models, simulate
 from heli_jax.dynamics import kinematics
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.identification.estimation.filter_error import errors_ahead
 from heli_jax.identification.estimation.kalman import innovations
-from heli_jax.identification.estimation.predictions_ahead import errors_ahead
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.options import SimulationOptions
 

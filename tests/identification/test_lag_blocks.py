@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
+from heli_jax.identification.validation.follows_response import correlations_with_sums, lag_blocks
 
 
 def autocorrelation(x: np.ndarray, lags: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     relax_noise_covariance,
 )
-from heli_jax.identification.estimation.trust_region import Nearing
+from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.unknowns.layout import Noise
 
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.smoothed import smoothed
+from heli_jax.identification.validation.signal_quality import smoothed
 from heli_jax.numerics.white_noise import highest_frequency
 
 DT, N = 0.01, 3000

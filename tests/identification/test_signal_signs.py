@@ -10,8 +10,7 @@ import scipy.signal
 
 from heli_jax import Flight, linear_model
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.late_angles import late_angles, lateness
-from heli_jax.identification.validation.late_inputs import late_inputs
+from heli_jax.identification.validation.late_inputs import late_angles, late_inputs, lateness
 from heli_jax.identification.validation.signal_signs import (
     against_start,
     rate_against_angle,

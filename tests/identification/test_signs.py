@@ -11,7 +11,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
-from heli_jax.identification.estimation.drawn_starts import _draw_values
+from heli_jax.identification.estimation.starts import _draw_values
 from tests.identification.bench import steps
 
 

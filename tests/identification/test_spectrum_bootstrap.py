@@ -10,8 +10,7 @@ from heli_jax import fit, stages
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
-from heli_jax.identification.uncertainty.bootstrap import bootstrap
-from heli_jax.identification.uncertainty.spectrum_bootstrap import _records
+from heli_jax.identification.uncertainty.bootstrap import _records, bootstrap
 
 
 @pytest.mark.parametrize("N", [7, 100, 101])

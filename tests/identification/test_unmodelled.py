@@ -13,8 +13,8 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.validation.adequacy import by_responses
-from heli_jax.identification.validation.own_samples import own_samples
 from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
+from heli_jax.identification.validation.unmodelled import own_samples
 from heli_jax.naming import Scalar
 from tests.identification.lag import LAG, Inputs, Params, Rate, response
 

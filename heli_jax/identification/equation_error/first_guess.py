@@ -2,7 +2,7 @@
 
 from typing import Literal, NamedTuple
 
-from heli_jax.identification.equation_error.stepwise import Selection
+from heli_jax.identification.equation_error.regression import Selection
 
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle", "not selected"]
 

@@ -14,8 +14,13 @@ import scipy.linalg
 from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model
-from heli_jax.identification.equation_error.records import Record, Segment
-from heli_jax.identification.equation_error.structure import Matrices, Structure, matrices
+from heli_jax.identification.equation_error.records import (
+    Matrices,
+    Record,
+    Segment,
+    Structure,
+    matrices,
+)
 
 # Instants are counted in whole numbers over all segments and flights. A gap of this many is longer
 # than any lag over which `errors` sums, so nothing is correlated across it.
@@ -302,3 +307,186 @@ def _damped(r: np.ndarray, J: np.ndarray, damping: float) -> np.ndarray:
     normal = scaled.T @ scaled + damping * np.eye(int(used.sum()))
     step[used] = -np.linalg.lstsq(normal, scaled.T @ r, rcond=1e-13)[0] / norms[used]
     return step
+
+
+# Standard errors and partial F-ratios of a regression whose residuals are autocorrelated.
+#
+# Smoothed residuals go together over many samples, and so do gusts: ordinary formulas would take
+# each sample for news. What is summed here over neighbouring instants is the product of regressor
+# and residual, with Bartlett's weights (W. K. Newey and K. D. West, Econometrica 55, 1987); V.
+# Klein and E. A. Morelli, Aircraft System Identification (2006), 5.2.3, correct for the same.
+
+
+_LAGS = 2.0
+"""times the root of the number of instants: how far neighbours are allowed for"""
+
+
+def covariance(rows: Rows) -> Float[np.ndarray, "q q"]:
+    """Of the estimates (q, q), by the residuals where the search ended."""
+    # The sandwich: curvature on both sides, between them the variance of the gradient as the
+    # residuals have it. Where these are white it becomes the ordinary formula.
+    bread = np.linalg.pinv(rows.J.T @ rows.J, hermitian=True)
+    scores = by_instant(rows.J * rows.r[:, None], rows.times)
+    return bread @ _long_run(scores) @ bread
+
+
+def partial_f(
+    basis: Float[np.ndarray, "n k"],
+    y: Float[np.ndarray, " n"],
+    x: Float[np.ndarray, " n"],
+    times: np.ndarray,
+) -> float:
+    """F-ratio of one more regressor: the square of its estimate over its standard error.
+
+    Args:
+        basis: of the regressors that are in (n, k), orthonormal (`basis_of`).
+        y: what is regressed (n,).
+        x: the one more (n,).
+        times: which rows belong to one instant, as `Rows.times`.
+    """
+    size = np.linalg.norm(x)
+    # The estimate of one more regressor beside others is that of what they leave of both signals
+    # (Frisch and Waugh, 1933): so each candidate costs one product, not a regression.
+    x, y = x - basis @ (basis.T @ x), y - basis @ (basis.T @ y)
+    power = float(x @ x)
+    # What the others give already has nothing of its own to say.
+    if power <= (1e-6 * size) ** 2:
+        return 0.0
+    left = y - x * (x @ y) / power
+    variance = float(_long_run(by_instant((x * left)[:, None], times))[0, 0])
+    return float((x @ y) ** 2 / variance) if variance > 0 else float("inf")
+
+
+def basis_of(X: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """An orthonormal basis of the columns of X."""
+    return np.linalg.qr(X)[0] if X.shape[1] else X
+
+
+def by_instant(scores: Float[np.ndarray, "n k"], times: np.ndarray) -> Float[np.ndarray, "T k"]:
+    """Sums over the rows of each instant (T, k), with zeros between segments."""
+    distinct, number = np.unique(times, return_inverse=True)
+    lags = _lags(distinct.size)
+    # A gap is as long as no lag reaches: neighbours across it count for nothing.
+    place = np.r_[0, np.cumsum(np.minimum(np.diff(distinct), lags + 1))]
+    sums = np.zeros((int(place[-1]) + 1, scores.shape[1]))
+    np.add.at(sums, place[number], scores)
+    return sums
+
+
+def _long_run(scores: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "k k"]:
+    """The variance of the scores' sum: their products over all lags, weighed by Bartlett."""
+    lags = _lags(scores.shape[0])
+    total = scores.T @ scores
+    for lag in range(1, min(lags, scores.shape[0] - 1) + 1):
+        product = scores[lag:].T @ scores[:-lag]
+        # Falling weights keep the sum positive semi-definite; cut off at a lag, it could give a
+        # negative variance (Newey and West).
+        total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    return total
+
+
+def _lags(instants: int) -> int:
+    return int(_LAGS * instants**0.5)
+
+
+# Stepwise selection of terms by partial F-ratios, as SIDPAC's `swr` does.
+#
+# Source: V. Klein and E. A. Morelli, Aircraft System Identification (2006), 5.4; N. R. Draper and
+# H. Smith, Applied Regression Analysis. Here the F-ratio allows for autocorrelated residuals
+# (`errors.partial_f`).
+
+
+class Step(NamedTuple):
+    """One step of the selection. The names of the fields are keys of fit.json."""
+
+    parameter: str
+    entered: bool
+    """or it was removed"""
+    f_ratio: float
+    r_squared: float
+    """of all equations together, each over its residual, after the step"""
+
+
+class Selection(NamedTuple):
+    """The terms that are in at the end, and how it came to that."""
+
+    selected: tuple[str, ...]
+    steps: tuple[Step, ...]
+    f_ratios: dict[str, float]
+    """at the end, of every term: to remove it where it is in, to enter it where it is not"""
+
+
+def select(
+    rows: Rows,
+    values: Float[np.ndarray, " q"],
+    names: Sequence[str],
+    forced: Sequence[str],
+    limits: tuple[float, float],
+) -> Selection:
+    """Terms out and in again, until none is left that asks for the other side.
+
+    All terms are in at first, where `swr` begins with none: with half of a response missing, what
+    is left over is so autocorrelated that no term by itself would pass.
+    Products of parameters are taken as they are linear about the point where all terms are in.
+
+    Args:
+        rows: there, weighed.
+        values: of the parameters there (q,).
+        names: theirs.
+        forced: those that stay in: of a known sign, they cannot be zero.
+        limits: F to enter and F to remove; the second is at most the first.
+    """
+    terms = _Terms(rows, values, tuple(names), frozenset(forced))
+    inside, steps = list(range(len(names))), []
+    # At most each term out and in a few times: rounding must not turn in a circle.
+    for _ in range(4 * len(names)):
+        # Out before in: the limit to remove is at most that to enter, so a term that has just come
+        # in is not thrown out by the same number.
+        leaving = terms.to_remove(inside)
+        worst = min(leaving, key=lambda j: leaving[j], default=None)
+        if worst is not None and leaving[worst] < limits[1]:
+            inside.remove(worst)
+            steps.append(Step(names[worst], False, leaving[worst], terms.explained(inside)))
+            continue
+        entering = terms.to_enter(inside)
+        best = max(entering, key=lambda j: entering[j], default=None)
+        if best is None or entering[best] < limits[0]:
+            break
+        inside.append(best)
+        steps.append(Step(names[best], True, entering[best], terms.explained(inside)))
+    final = {**terms.to_enter(inside), **terms.to_remove(inside)}
+    ratios = {names[j]: final[j] for j in sorted(final)}
+    return Selection(tuple(n for j, n in enumerate(names) if j in inside), tuple(steps), ratios)
+
+
+class _Terms:
+    """The regressors, and what is regressed on them."""
+
+    def __init__(
+        self, rows: Rows, values: np.ndarray, names: tuple[str, ...], forced: frozenset[str]
+    ) -> None:
+        # About the point where all terms are in r = y - X v, so X = -J: the nonlinear problem as
+        # the linear regression that F-ratios are defined for.
+        self.X, self.y = -rows.J, rows.r - rows.J @ values
+        self.times, self.names, self.forced = rows.times, names, forced
+
+    def to_enter(self, inside: list[int]) -> dict[int, float]:
+        """The F-ratios of what is out, by number."""
+        basis = basis_of(self.X[:, inside])
+        out = [j for j in range(len(self.names)) if j not in inside]
+        return {j: partial_f(basis, self.y, self.X[:, j], self.times) for j in out}
+
+    def to_remove(self, inside: list[int]) -> dict[int, float]:
+        """The F-ratios of what is in and may go, by number."""
+        ratios = {}
+        # Each against all others that are in: what one term explains depends on which ones stand
+        # beside it.
+        for j in (j for j in inside if self.names[j] not in self.forced):
+            basis = basis_of(self.X[:, [i for i in inside if i != j]])
+            ratios[j] = partial_f(basis, self.y, self.X[:, j], self.times)
+        return ratios
+
+    def explained(self, inside: list[int]) -> float:
+        """The part of the sum of squares that what is in explains."""
+        basis = basis_of(self.X[:, inside])
+        return float(np.sum((basis.T @ self.y) ** 2) / np.sum(self.y**2))

@@ -14,27 +14,29 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.equation_error import errors, records
+from heli_jax.identification.equation_error import records
 from heli_jax.identification.equation_error.first_guess import (
     Equation,
     EquationErrorStart,
     Origin,
     StartValue,
 )
-from heli_jax.identification.equation_error.regression import (
-    Optimum,
-    Regression,
-    Rows,
-    finite,
-    search,
-)
-from heli_jax.identification.equation_error.stepwise import Selection, select
-from heli_jax.identification.equation_error.structure import (
+from heli_jax.identification.equation_error.records import (
     Structure,
     generic,
     held,
     matrices,
     structure,
+)
+from heli_jax.identification.equation_error.regression import (
+    Optimum,
+    Regression,
+    Rows,
+    Selection,
+    covariance,
+    finite,
+    search,
+    select,
 )
 from heli_jax.identification.free import Free
 from heli_jax.vehicle import of_helicopter
@@ -105,7 +107,7 @@ def equation_error_start(
         if selection.selected:
             regression = regression._replace(names=selection.selected, base=kept.base)
             optimum = _optimum(kept, regression)
-    sd = np.sqrt(np.maximum(np.diag(errors.covariance(optimum.rows)), 0.0))
+    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
     coefficients = {
         n: (float(v), float(s))
         for n, v, s in zip(regression.names, optimum.values, sd, strict=True)

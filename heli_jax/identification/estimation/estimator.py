@@ -24,8 +24,8 @@ from heli_jax.identification.estimation.measured_signals import (
     signal_numbers,
     signals,
 )
+from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.estimation.simulated_flights import Run
-from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 

@@ -5,9 +5,10 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,38 +16,39 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.disturbed_records import disturbed_records
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
+from heli_jax.identification.estimation.kalman import (
+    SMALL,
+    Estimate,
+    Innovations,
+    begun,
+    by_name,
+    corrected,
+    filter_of,
+    innovations,
+)
 from heli_jax.identification.estimation.measured_signals import (
     measured_count,
     measured_signals,
     measurement_sd,
     signals,
 )
-from heli_jax.identification.estimation.noiseless_outputs import (
-    REMEDY,
-    noiseless,
-    noiseless_words,
-)
-from heli_jax.identification.estimation.noisy_scales import (
+from heli_jax.identification.estimation.noise_scales import (
     free_scales,
     not_attenuating,
-    slopes_at,
-    slopes_changed,
-)
-from heli_jax.identification.estimation.restricted_likelihood import (
     own_at,
     own_changed,
+    slopes_at,
+    slopes_changed,
     taken_up,
     with_own_noise,
 )
 from heli_jax.identification.estimation.shared_covariance import innovations_together
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -55,9 +57,98 @@ from heli_jax.identification.unknowns.layout import (
     Solution,
     Unknowns,
     scales_of,
+    unpack,
 )
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.numerics.white_noise import highest_frequency, without_noise
 from heli_jax.simulation.options import SimulationOptions
+from heli_jax.simulation.simulate import simulate
+
+# Outputs that have no noise of a sensor: they were low-passed before they were logged.
+
+
+REMEDY = (
+    "Filter error holds its predictions against white noise, of which there is none, and the noise "
+    "that it estimates runs to zero: use output-error, whose intervals allow for autocorrelated "
+    "residuals."
+)
+
+
+def noiseless(outputs: Mapping[str, np.ndarray]) -> list[str]:
+    """Which outputs (N,) have no noise of a sensor; NaN is missing."""
+    return [n for n, y in outputs.items() if without_noise(y)]
+
+
+def noiseless_words(outputs: Mapping[str, np.ndarray], dt: float) -> str:
+    """What outputs without noise are, and how fast what is in them.
+
+    Args:
+        outputs: those without noise, one at least (N,).
+        dt: from sample to sample [s].
+    """
+    names = list(outputs)
+    listed = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
+    verb, it = ("have", "they were") if len(names) > 1 else ("has", "it was")
+    highest = [f for y in outputs.values() if (f := highest_frequency(y, dt)) is not None]
+    band = f" (99.9 % of the power lies below {max(highest):.2g} Hz)" if highest else ""
+    return (
+        f"{listed} {verb} no noise of a sensor: {it} low-passed before the log{band}, or simulated"
+    )
+
+
+# Records of a fitted model with the disturbance drawn anew.
+
+
+_BATCH = 8
+"""records that are drawn side by side"""
+
+
+def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
+    """By name the outputs (runs, N) with a disturbance drawn for each key.
+
+    Args:
+        reached: where the fit ended.
+        u: the unknowns there.
+        i: number of the flight.
+        keys: of the draws.
+    """
+    layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
+    drawn_state = _random_first_state(layout, drive, reached.z.dtype)
+
+    @jax.jit
+    def run(key: Array) -> Any:
+        of_first, of_noise = jax.random.split(key)
+        return simulate(
+            layout.model,
+            drive.params,
+            drive.inputs,
+            dt=drive.dt,
+            initial_state=drawn_state(of_first),
+            solver=layout.solver,
+            substeps=layout.substeps,
+            key=of_noise,
+            hold=layout.hold(i),
+        ).outputs
+
+    return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
+
+
+def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
+    """Of a key the State at the first sample, with what is random there drawn."""
+    model, params = layout.model, drive.params
+    first = drive.state if drive.state is not None else model.initial_state(params)
+    names = naming.names(model.State)
+    sds = initial_sd_of(model, params, dtype)
+    # Factored without the sds, which may be zero.
+    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
+
+    def draw(key: Array) -> Any:
+        drawn = jnp.sum(factor * jax.random.normal(key, (1, len(names)), dtype), axis=1)
+        values = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
+        return naming.replace(first, **values)
+
+    return draw
+
 
 _FLOOR = 1e-3
 """The likelihood's row stays real however far the noise falls; the next round has another level."""
@@ -426,3 +517,88 @@ def _root_mean_square(y: Array | np.ndarray) -> float:
 
 
 ESTIMATOR = FilterError()
+
+
+# Predictions some seconds ahead, from the state that a filter has estimated by then.
+#
+# A simulation of an unstable machine leaves any record, and one step ahead everything is predicted
+# well. In between stands what such a model can be judged by.
+
+
+SECONDS = 2.0
+"""ahead of the filter at most; each window of so long begins with the filter's prediction"""
+
+
+class Ahead(NamedTuple):
+    """Predictions up to `SECONDS` ahead of one flight, by output; NaN where nothing is measured."""
+
+    predicted: dict[str, Float[np.ndarray, " N"]]
+    """SI"""
+    variance: dict[str, Float[np.ndarray, " N"]]
+    """of the error, as disturbance and noise make it"""
+
+
+def predictions_ahead(at: Solution) -> tuple[Ahead, ...]:
+    """By flight what is predicted in windows from the filter's state at the begin of each.
+
+    Args:
+        at: where a fit by filter error ended.
+    """
+    layout, data, noise, z = at
+    # Outside of what is compiled: how many samples that are decides where windows begin.
+    samples = tuple(max(1, round(SECONDS / float(flight.dt))) for flight in data.flights)
+    errors = jax.device_get(_errors(layout, data, noise, z, samples))
+    return tuple(
+        Ahead(
+            {n: np.asarray(f.outputs[n]) - e for n, e in innovations.error.items()},
+            innovations.variance,
+        )
+        for f, innovations in zip(data.flights, errors, strict=True)
+    )
+
+
+@eqx.filter_jit
+def _errors(
+    layout: Layout, data: Data, noise: Noise, z: Array, samples: tuple[int, ...]
+) -> tuple[Innovations, ...]:
+    u = unpack(layout, data, z)
+    return tuple(
+        errors_ahead(*filter_arguments(layout, data, noise, u, i), every)
+        for i, every in enumerate(samples)
+    )
+
+
+def errors_ahead(
+    positional: tuple[Model, Any, Any, dict[str, Array], dict[str, Any]],
+    options: SimulationOptions,
+    every: int,
+) -> Innovations:
+    """Measured less predicted in windows of so many samples, and the variance of that.
+
+    Args:
+        positional: model, params, inputs, measured and sd, as of `kalman.innovations`.
+        options: as there.
+        every: samples of a window, each begun at what the filter predicts for its first.
+    """
+    drive, first, y, R = begun(*positional, options)
+    filter_ = filter_of(drive)
+
+    def step(carry: tuple[Estimate, Estimate], sample: Any) -> tuple[Any, Any]:
+        filtered, ahead = carry
+        y, begins, now = sample
+        x, P = jax.tree.map(lambda f, a: jnp.where(begins, f, a), filtered, ahead)
+        C, rest = filter_.measure(x, now)
+        error = y - rest - jnp.sum(C * x[None, :], axis=1)
+        variance = jnp.sum((C @ P) * C, axis=1) + R
+        filtered, _ = corrected(filter_, filtered, R, y, now)
+        moved = (_symmetric(filter_.move(*filtered, now)), _symmetric(filter_.move(x, P, now)))
+        return moved, (error, jnp.where(jnp.isfinite(y), variance, jnp.nan))
+
+    begins = jnp.arange(y.shape[0]) % every == 0
+    _, (error, variance) = jax.lax.scan(step, (first, first), (y, begins, filter_.samples))
+    return by_name(positional[3], error, variance)
+
+
+def _symmetric(estimate: Estimate) -> Estimate:
+    x, P = estimate
+    return x, 0.5 * (P + P.T)

@@ -29,7 +29,6 @@ from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import least_share
-from heli_jax.identification.estimation.frequency_gusts import whitening_by
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     as_instruments_have_it,
@@ -37,6 +36,12 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrumented_inputs,
 )
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_noise import (
+    log_determinants,
+    whitening_alone,
+    whitening_by,
+    whitening_without_model,
+)
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
     cut_notes,
@@ -46,18 +51,16 @@ from heli_jax.identification.estimation.frequency_records import (
     records_of,
     without_parts,
 )
-from heli_jax.identification.estimation.frequency_rows import rows_of_lines
-from heli_jax.identification.estimation.frequency_spectrum import (
-    log_determinants,
-    whitening_alone,
-)
+from heli_jax.identification.estimation.frequency_slopes import rows_of_lines
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
-from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
+from heli_jax.identification.estimation.linearised_flights import (
+    cannot_linearise,
+    condition_of,
+    linearisation_notes,
+)
+from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
-from heli_jax.identification.estimation.trust_region import Nearing
-from heli_jax.identification.estimation.what_inputs_leave import whitening_without_model
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,

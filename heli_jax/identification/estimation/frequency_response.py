@@ -36,7 +36,6 @@ from heli_jax.analysis.response_errors import noise_density, response_of
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
-from heli_jax.identification.estimation.gusts_in_windows import gusts_through
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.measured_signals import least_noise, signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -44,6 +43,7 @@ from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
     back,
     first_weights,
+    gusts_through,
     on_device,
     outputs_that_forget,
     weighed,

@@ -16,25 +16,91 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.frequency_lines import (
     Errors,
+    Matrices,
     Resolved,
+    Signals,
+    alike,
     at_lines,
+    by_flight,
     errors_of_some,
+    machines_of,
+    measured,
+    parts_of_group,
     real,
     resolved,
     stacked,
 )
-from heli_jax.identification.estimation.frequency_machines import (
-    Matrices,
-    Signals,
-    alike,
-    by_flight,
-    machines_of,
-    measured,
-    parts_of_group,
-)
 from heli_jax.identification.estimation.frequency_records import Record
-from heli_jax.identification.estimation.shared_unknowns import differentiated
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+
+# The unknowns that all flights share, as a vector, and what hangs on them with its derivatives.
+
+
+def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
+    """Parameters, gains and the time shift: all but initial states, biases and offsets.
+
+    Args:
+        layout: what the unknowns are.
+        u: the unknowns, in the units of the model.
+    """
+    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
+    shift = [] if u.shift is None else [u.shift]
+    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
+
+
+def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
+    """The unknowns with those of a vector in place.
+
+    Args:
+        layout: what the unknowns are.
+        u: all of them.
+        v: as `shared_of` orders them.
+    """
+    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
+    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
+    return u._replace(
+        params={n: values[n] for n in layout.free},
+        gains={n: values[n] for n in layout.gains},
+        shift=None if u.shift is None else v[-1],
+    )
+
+
+def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
+    """Arrays in tuples and their derivatives by v, a last axis; None in place of those that are
+    zero.
+
+    Args:
+        make: of v.
+        v: where.
+    """
+
+    moving: list[bool] = []
+
+    # Called beside `make`: which derivatives are zero shows as they are made, and to trace a model
+    # once more for it takes as long as to differentiate it.
+    @jax.custom_jvp
+    def look(*leaves: Array) -> Array:
+        return jnp.zeros((), v.dtype)
+
+    def rule(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+        zero = jax.custom_derivatives.SymbolicZero
+        moving[:] = [not isinstance(t, zero) for t in tangents]
+        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+
+    look.defjvp(rule, symbolic_zeros=True)
+
+    def looked_at(v: Array) -> T:
+        made = make(v)
+        look(*jax.tree.leaves(made))
+        return made
+
+    def along(direction: Array) -> tuple[T, T]:
+        return jax.jvp(looked_at, (v,), (direction,))
+
+    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    leaves, structure = jax.tree.flatten(slopes)
+    kept = [d if moves else None for d, moves in zip(leaves, moving, strict=True)]
+    return value, jax.tree.unflatten(structure, kept)
 
 
 class Products(NamedTuple):
@@ -297,3 +363,52 @@ def _moved(
         part = jnp.einsum("ar,ksrq->ksaq", G, stacked(du)).reshape(K, 2 * G.shape[0], -1)
         total = part if total is None else total + part
     return total
+
+
+# The rows that frequency error makes small: as many as unknowns, and one for what is left.
+#
+# With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
+# solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
+# covariance, and their derivative $R^{-T} Z^T J$ the information of the estimate, $M^T (Z^T Z)^{-1}
+# M$ with $M = Z^T J$. Directly $Z = J$, and with the row $|e - J J^+ e|$ beside them the sum of
+# squares is that of all errors: maximum likelihood, in a few rows. By instrument $Z$ are the
+# derivatives of the response to what of the inputs follows the instruments.
+#
+# Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon
+# and Schoukens (2012), chapter 9.
+
+
+_NOTHING = 100.0
+"""times the machine's precision: what of the information, of columns of one size, is rounding"""
+
+
+def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
+    """Those rows, with the derivative that a step of Gauss and Newton needs.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: with the whitening of each record, and whether instruments are used.
+        u: the unknowns, in the units of the model.
+    """
+    v = shared_of(layout, u)
+    at, rest = jax.lax.stop_gradient((v, u))
+    made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
+    r, M = _weighed(made)
+    left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
+    left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
+    r, M, left = jax.lax.stop_gradient((r, M, left))
+    # The derivative is exactly M, whatever else moves with the unknowns.
+    return jnp.append(r + M @ (v - at), left)
+
+
+def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
+    # Of one size: units do not decide what is rounding.
+    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
+    kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    along = root[:, None] * vectors.T * over[None, :]
+    return along @ of.Ze, along @ of.ZJ

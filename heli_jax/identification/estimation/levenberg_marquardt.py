@@ -16,22 +16,20 @@ from heli_jax.identification.estimation.optimiser_step import (
     SINGLE,
     Compiled,
     Constants,
+    Nearing,
+    Scaling,
     State,
     advance,
+    awakened,
     begin,
     compressed,
     constants_of,
-    point,
-)
-from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
-from heli_jax.identification.estimation.scaling import (
-    Scaling,
-    awakened,
     nothing_trusted,
+    point,
     scaling,
     trusted_columns,
 )
-from heli_jax.identification.estimation.trust_region import Nearing
+from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 from heli_jax.numerics.jitted import jitted
 

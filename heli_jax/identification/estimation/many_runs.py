@@ -1,26 +1,345 @@
 """Levenberg-Marquardt from many starts near an optimum, or on many records, side by side."""
 
-from collections.abc import Callable
-from typing import Any
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import stages
-from heli_jax.fused.code import UnsupportedError
-from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
+from heli_jax.fused.code import UnsupportedError, translating
+from heli_jax.fused.kernel import Kernel, lanes_for
+from heli_jax.fused.sensitivities import Products, Sensitive, full
+from heli_jax.fused.traced import Traced, traced
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     descend,
     residual_and_jacobian,
 )
 from heli_jax.identification.estimation.measured_signals import measured_counts
-from heli_jax.identification.estimation.optimiser_step import BATCHED, constants_of
-from heli_jax.identification.estimation.residual import differentiate
-from heli_jax.identification.estimation.scaling import Scaling, scaling, trusted_columns
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
+from heli_jax.identification.estimation.optimiser_step import (
+    BATCHED,
+    Scaling,
+    constants_of,
+    scaling,
+    trusted_columns,
+)
+from heli_jax.identification.estimation.output_error import OutputError
+from heli_jax.identification.estimation.residual import differentiate, prior_rows, weak_rows
+from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    FlightData,
+    Layout,
+    Noise,
+    Solution,
+    unpack,
+)
+from heli_jax.numerics.cores import cores
+from heli_jax.simulation.accumulate import Steps, in_steps
+from heli_jax.simulation.options import SimulationOptions
+
+# Residuals and Jacobians of many runs as programs of machine code, a vehicle beside the other.
+#
+# What least squares asks of a record is the sums of products of its rows and columns; with these
+# made on the way nothing of the flight is kept but its last state.
+
+
+_MOST = 6000
+"""operations of a sample, derivatives included: more would take longer to compile than to run"""
+
+# `Any` below: the functions that JAX compiles, and trees of arrays.
+
+
+class Own(NamedTuple):
+    """What each run has of its own, beside its unknowns."""
+
+    inputs: bool
+    outputs: bool
+    """as measured"""
+
+
+class _Part(NamedTuple):
+    """One flight's program."""
+
+    kernel: Kernel
+    run: Traced
+    begin: Any
+    """of (what is shared, records, unknowns (b, q)): what a run begins with, `Traced.own`"""
+    common: Any
+    """of the same for one run: what stays and is the same for all"""
+    places: np.ndarray
+    """where its columns stand among [r J]"""
+
+
+class FusedRuns:
+    """Residuals and Jacobians of a problem at many points, or of many records."""
+
+    def __init__(self, layout: Layout, data: Data, noise: Noise, own: Own) -> None:
+        """Translate and compile, or take what was compiled for the same.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: of the measurements, by which the rows are divided.
+            own: what of the records each run has of its own.
+
+        Raises:
+            UnsupportedError: this has no such program.
+        """
+        if reason := _refused(layout):
+            raise UnsupportedError(reason)
+        self._layout, self._shared = layout, (_bare(data), noise.sd)
+        self._records = [(f.inputs, f.outputs) for f in data.flights]
+        self._own = own
+        leaves, structure = jax.tree.flatten((data, noise.sd))
+        kinds = tuple((np.shape(v), np.asarray(v).dtype) for v in leaves)
+        self._parts = _compiled(layout, structure, kinds, own)
+
+    def __call__(self, data: Data, z: Array) -> tuple[Array, Array]:
+        """Rows (b, n) and Jacobians (b, n, q): of each run those of a triangle that stands for its
+        measurements, then those of the priors.
+
+        Args:
+            data: the numbers of the problem; all of it has a leading axis (b,).
+            z: the unknowns (b, q).
+        """
+        triangle = _triangles(self._sums(data, np.asarray(z)))
+        r, J = _priors(self._layout, data, z)
+        rows = jnp.concatenate([jnp.asarray(triangle[:, :, 0], z.dtype), r], axis=1)
+        return rows, jnp.concatenate([jnp.asarray(triangle[:, :, 1:], z.dtype), J], axis=1)
+
+    def _sums(self, data: Data, z: np.ndarray) -> np.ndarray:
+        """(b, q + 1, q + 1) of the measurements' [r J], its transpose times itself."""
+        count, q = z.shape
+        # Whole vectors of runs: the last one again where there are too few.
+        lanes = self._parts[0].kernel.lanes
+        filled = np.minimum(np.arange(-(-count // lanes) * lanes), count - 1)
+        sums = np.zeros((count, q + 1, q + 1))
+        for i, part in enumerate(self._parts):
+            flight = data.flights[i]
+            records = [
+                jax.tree.map(lambda v: np.asarray(v)[filled].T, its) if own else shared
+                for own, its, shared in zip(
+                    self._own, (flight.inputs, flight.outputs), self._records[i], strict=True
+                )
+            ]
+            of_flight = self._part(part, records, z[filled])
+            sums[np.ix_(range(count), part.places, part.places)] += of_flight[:count]
+        return sums
+
+    def _part(self, part: _Part, records: Sequence[Any], z: np.ndarray) -> np.ndarray:
+        one = tuple(
+            jax.tree.map(lambda v: v[:, 0], of) if own else of
+            for own, of in zip(self._own, records, strict=True)
+        )
+        carry, own = part.begin(self._shared, one, z)
+        common = part.common(self._shared, one, z[0])
+        carry, own = ([np.moveaxis(np.asarray(v), 0, -1) for v in p] for p in (carry, own))
+        stays = part.run.stays(own, common)
+        stored = [np.asarray(v) for v in jax.tree.leaves(records)]
+        (triangle,) = part.kernel([np.asarray(v) for v in stays], stored, carry, cores())
+        return full(np.asarray(triangle))
+
+
+def _refused(layout: Layout) -> str | None:
+    """Why a problem has no such program; None where it may have one."""
+    if type(layout.estimator) is not OutputError:
+        return "a method other than output error"
+    if layout.shift:
+        return "a time shift among the unknowns"
+    if any(count > 1 for count, _ in layout.windows):
+        return "windows"
+    return None
+
+
+def _bare(data: Data) -> Data:
+    """The numbers without the records."""
+    flights = tuple(
+        f._replace(inputs=None, outputs=dict.fromkeys(f.outputs), by_instrument=None)
+        for f in data.flights
+    )
+    return data._replace(flights=flights)
+
+
+def _with(data: Data, i: int, records: Any, samples: tuple[int, ...]) -> Data:
+    """With the records of the i-th flight; of the others the lengths alone."""
+    flights = list(data.flights)
+    for j, flight in enumerate(flights):
+        nothing = np.broadcast_to(np.zeros((), np.float64), samples[j])
+        flights[j] = flight._replace(outputs=dict.fromkeys(flight.outputs, nothing))
+    inputs, outputs = records
+    flights[i] = flights[i]._replace(inputs=inputs, outputs=outputs)
+    return data._replace(flights=tuple(flights))
+
+
+class _Columns(NamedTuple):
+    """The unknowns that a flight feels, by their places in z."""
+
+    throughout: list[int]
+    at_first: list[int]
+    biases: list[int]
+
+
+def _columns(layout: Layout, i: int) -> _Columns:
+    at = layout.first_nuisance
+    for j in range(i):
+        at += len(layout.states) + layout.constants(layout.outputs[j])
+    states, outputs = len(layout.states), len(layout.outputs[i]) if layout.bias else 0
+    first, offsets = at + states, at + states + outputs
+    return _Columns(
+        [*range(len(layout.of_interest)), *range(offsets, offsets + len(layout.offsets))],
+        list(range(at, first)),
+        list(range(first, offsets)),
+    )
+
+
+def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
+    """The i-th flight as `fused.traced.Making`."""
+    columns, names = _columns(layout, i), layout.outputs[i]
+
+    def making(shared: Any, records: Any, z: Any) -> Products:
+        data, sd = _with(shared[0], i, records, samples), shared[1][i]
+        flight: FlightData = data.flights[i]
+
+        def run(z: Any) -> Steps:
+            u = unpack(layout, data, z)
+            drive = driven(layout, data, u, i)
+
+            def update(_: Any, outputs: Any, measured: Any) -> Any:
+                # A missing sample says nothing: its row is zero, and so is its derivative.
+                seen = {n: jnp.isfinite(measured[n]) for n in names}
+                error = {n: measured[n] - u.biases[i][n] - getattr(outputs, n) for n in names}
+                return tuple(
+                    (jnp.where(seen[n], error[n], 0.0) / sd[n], seen[n].astype(z.dtype))
+                    for n in names
+                )
+
+            zero = jnp.zeros((), z.dtype)
+            return in_steps(
+                layout.model,
+                drive.params,
+                drive.inputs,
+                update,
+                tuple((zero, zero) for _ in names),
+                data=flight.outputs,
+                options=SimulationOptions(
+                    dt=drive.dt,
+                    initial_state=drive.state,
+                    solver=layout.solver,
+                    substeps=layout.substeps,
+                    hold=layout.hold(i),
+                ),
+            )
+
+        def rows(value: Any, derivatives: Any) -> Any:
+            made = []
+            for k, name in enumerate(names):
+                r, seen = value[k]
+                by_bias = [jnp.zeros_like(r)] * len(columns.biases)
+                if columns.biases:
+                    # In the order of the outputs, and felt by no state.
+                    by_bias[k] = -flight.bias_scale[name] / sd[name] * seen
+                made.append([r, *(d[k][0] for d in derivatives), *by_bias])
+            return made
+
+        # What a sample computed stands in the carry, beside the limits that nobody asks for.
+        return Products(
+            Sensitive(
+                run,
+                samples[i] - 1,
+                columns.throughout,
+                columns.at_first,
+                lambda carry: carry[1][0],
+                lambda z, carry: run(z).last(carry).value,
+                rows,
+            ),
+            z,
+        )
+
+    return making
+
+
+@functools.lru_cache(maxsize=16)
+@translating()
+def _compiled(
+    layout: Layout,
+    structure: Any,
+    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...],
+    own: Own,
+) -> tuple[_Part, ...]:
+    data, sd = jax.tree.unflatten(structure, [np.zeros(*kind) for kind in kinds])
+    samples = tuple(next(iter(f.outputs.values())).shape[0] for f in data.flights)
+    return tuple(
+        _part(layout, i, (_bare(data), sd), data.flights[i], samples, own)
+        for i in range(len(data.flights))
+    )
+
+
+def _part(
+    layout: Layout,
+    i: int,
+    shared: Any,
+    flight: FlightData,
+    samples: tuple[int, ...],
+    own: Own,
+) -> _Part:
+    records = flight.inputs, flight.outputs
+    each = [o for o, of in zip(own, records, strict=True) for _ in jax.tree.leaves(of)]
+    z = np.zeros(layout.size)
+    run = traced(_making(layout, i, samples), shared, records, z, each)
+    if (size := _size(run.run.step.jaxpr)) > _MOST:
+        raise UnsupportedError(f"a sample of {size} operations, more than {_MOST}")
+    columns = _columns(layout, i)
+    places = np.array([0, *(1 + j for part in columns for j in part)])
+    return _Part(
+        Kernel(run.run, lanes_for(np.dtype(np.float64))),
+        run,
+        jax.jit(jax.vmap(run.own, in_axes=(None, None, 0))),
+        jax.jit(run.common),
+        places,
+    )
+
+
+def _size(jaxpr: Any) -> int:
+    """Operations, those of inner functions too."""
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = [v for v in equation.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
+        passes = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
+        total += max(1, passes * sum(_size(getattr(v, "jaxpr", v)) for v in inner))
+    return total
+
+
+def _triangles(sums: np.ndarray) -> np.ndarray:
+    """(b, m, m) whose products with themselves, transposed, are the sums (b, m, m).
+
+    Where a sum is not finite all is NaN, as the rows would be.
+    """
+    usable = np.isfinite(sums).all(axis=(1, 2))
+    safe = np.where(usable[:, None, None], sums, np.eye(sums.shape[1]))
+    size = np.sqrt(np.diagonal(safe, axis1=1, axis2=2))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(safe / unit[:, :, None] / unit[:, None, :])
+    # Rounding leaves directions without effect a little below zero.
+    roots = np.sqrt(np.maximum(values, 0.0))
+    rows = roots[:, :, None] * np.swapaxes(vectors, 1, 2) * unit[:, None, :]
+    return np.where(usable[:, None, None], rows, np.nan)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _priors(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
+    """The rows of the priors, and their Jacobians."""
+
+    def rows(data: Data, z: Array) -> Array:
+        return jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
+
+    return jax.vmap(rows)(data, z), jax.vmap(jax.jacfwd(rows, argnums=1))(data, z)
+
 
 _MANY = 24
 """runs from which on a program of machine code is worth its compilation"""

@@ -1,7 +1,7 @@
 """Where the optimiser starts and how it is run: a first guess, several starts, bounds."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,18 +9,158 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.model import Disturbance
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
     optimise,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.noise_search import costs_at, noise_guess_at
+from heli_jax.identification.estimation.optimiser_step import Nearing
+from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack, within_bounds
+from heli_jax.numerics.jitted import jitted
+
+# A first guess of the disturbances: the greatest likelihood on a coarse grid.
+
+
+_DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
+"""by which the coarse search moves sigma_w"""
+_FINER, _ROUNDS = 0.2, 3
+"""decades between the points of a finer search, and how often it is done: a round reaches 0.4
+decades up and 0.6 down"""
+_TAUS = 3
+"""correlation times between a few samples and a part of the record, from which a search that ran
+to an end is begun again; with the decades as many points as the coarse search has"""
+
+
+def noise_guess_at(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it; of several
+    disturbances first all together, then each by itself.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+    """
+    z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
+    # A grid over all at once would have 18 to the power of their number.
+    several = [d for d in disturbances_of(layout.model) if d.sigma in layout.disturbance]
+    for d in several if len(several) > 1 else []:
+        z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau))
+    return z
+
+
+def one_noise_guess(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    z0: Float[Array, " q"],
+    names: tuple[str, ...],
+    width: float = 1.0,
+) -> Float[Array, " q"]:
+    """z0 with the named parameters of disturbances moved together, by the same factors of every
+    sigma and of every tau, to the greatest likelihood on a coarse grid about it.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+        names: of the parameters; those that are no unknowns stay.
+        width: of the grid, in decades between its points.
+    """
+    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
+    steps = {
+        "sigma": _DECADES,
+        "tau": np.log(10.0) * np.arange(-1, 2),
+    }
+    # One factor for all sigmas and one for all taus: the grid stays two-dimensional however many
+    # disturbances there are.
+    kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
+    used = [k for k in steps if k in kinds.values()]
+    grid = np.stack(np.meshgrid(*(steps[k] for k in used), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(used))
+    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
+    for name, kind in kinds.items():
+        points[:, layout.disturbance_at(name)] += width * grid[:, used.index(kind)]
+    costs = np.asarray(costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    return jnp.asarray(points[best], z0.dtype)
+
+
+def finer_noise_guess(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z: of the coarse search.
+    """
+    # As many points as the coarse search has: what was compiled for it serves here too.
+    for _ in range(_ROUNDS):
+        for d in disturbances_of(layout.model):
+            if {d.sigma, d.tau} & set(layout.disturbance):
+                z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau), _FINER)
+    return z
+
+
+def noise_guesses_by_tau(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"], d: Disturbance
+) -> list[Float[Array, " q"]]:
+    """z0 with one disturbance at correlation times from five samples to a fifth of the longest
+    record, sigma_w of the greatest likelihood on a coarse grid for each; the most likely first.
+
+    Args:
+        layout: what the unknowns are, d.tau among them.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid of sigma_w has its middle.
+        d: the disturbance.
+    """
+    dt = min(float(f.dt) for f in data.flights)
+    longest = max(float(f.dt) * next(iter(f.outputs.values())).shape[0] for f in data.flights)
+    first, last = sorted((5.0 * dt, 0.2 * longest))
+    decades = _DECADES if d.sigma in layout.disturbance else np.zeros(1)
+    points = np.tile(np.asarray(z0), (_TAUS, decades.size, 1))
+    points[..., layout.disturbance_at(d.tau)] = np.log(np.geomspace(first, last, _TAUS))[:, None]
+    if d.sigma in layout.disturbance:
+        points[..., layout.disturbance_at(d.sigma)] += decades
+    flat = jnp.asarray(points.reshape(-1, points.shape[-1]), z0.dtype)
+    costs = np.asarray(costs_at(layout, data, noise, flat)).reshape(points.shape[:2])
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    best = points[np.arange(_TAUS), np.argmin(costs, axis=1)]
+    return [jnp.asarray(best[i], z0.dtype) for i in np.argsort(costs.min(axis=1))]
+
+
+@jitted
+def costs_at(
+    layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
+) -> Float[Array, " s"]:
+    """The mean of the squared rows at each of some points.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        points: in the layout's coordinates.
+    """
+    # One point after another: side by side they would need the memory of as many filters, for a
+    # search of a few points.
+    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
+
 
 Progress = Callable[[str], None]
 
@@ -370,3 +510,60 @@ def _cost(run: Optimum) -> float:
     # NaN would compare as neither better nor worse, and sort at random.
     cost = float(run.cost)
     return cost if np.isfinite(cost) else float("inf")
+
+
+# The search from the start values, by what takes least time to search with.
+
+
+class FirstGuess(NamedTuple):
+    """A problem at its first guess."""
+
+    layout: Layout
+    data: Data
+    noise: Noise
+    z: Float[Array, " q"]
+    e: Evaluation
+    begun: Data
+    """what the first search goes by"""
+
+
+class FirstOptima(NamedTuple):
+    """Where each start led, and by what."""
+
+    search: Search
+    noise: Noise
+    points: Float[Array, "s q"]
+    optima: list[Optimum]
+
+
+def first_optima(
+    search: Search,
+    at: FirstGuess,
+    starts: Callable[[Noise, tuple[Any, Any]], Float[Array, "s q"]],
+    report: Progress | None = None,
+) -> FirstOptima:
+    """An optimum for each start, after which the noise is relaxed.
+
+    Args:
+        search: the optimiser over the problem.
+        at: its first guess.
+        starts: makes them of the noise to begin with, and of residuals and Jacobian at the guess.
+        report: called with a sentence after each of several.
+    """
+    layout, estimator = at.layout, at.layout.estimator
+    r_J: tuple[Any, Any] = (at.e.r, at.e.J)
+    first = Search(search.problem, layout, at.begun, search.max_steps)
+    quick, quickly = estimator.to_begin_with(layout, at.data, at.noise, at.z, r_J)
+    points = starts(quick, quickly)
+
+    def run(noise: Noise, known: tuple[Array, Array]) -> list[Optimum]:
+        # Residuals at the first start are those of the first guess.
+        same = at.begun is at.data and bool(np.array_equal(points[0], at.z))
+        ends = known if same else None
+        return first.run(noise, points, report, nearing=estimator.nearing, known=ends)
+
+    optima = run(quick, quickly)
+    # What a part of the data leads to nowhere may be found by all of them.
+    if quick is not at.noise and not any(bool(o.converged) for o in optima):
+        quick, optima = at.noise, run(at.noise, r_J)
+    return FirstOptima(first, quick, points, optima)

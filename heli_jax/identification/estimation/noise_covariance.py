@@ -12,8 +12,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
-from heli_jax.identification.estimation.noisy_scales import slopes_changed
-from heli_jax.identification.estimation.restricted_likelihood import own_changed
+from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise

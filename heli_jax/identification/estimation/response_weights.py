@@ -1,12 +1,14 @@
 """What the fit of frequency responses weighs its errors by."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex
+import scipy.linalg
+from jaxtyping import Array, Bool, Complex, Float
 
 from heli_jax import naming
 from heli_jax.analysis.response_errors import (
@@ -20,14 +22,99 @@ from heli_jax.analysis.response_errors import (
     whitening,
 )
 from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.windowed import Windowed, windowed
-from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.analysis.windowed import Windowed, hann, windowed
+from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.linear_machine import forgets
+from heli_jax.identification.estimation.frequency_noise import corners_of, powers_of, shapes_of
+from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
+from heli_jax.simulation.blocks import blockwise
+from heli_jax.simulation.discretize import Discrete
+from heli_jax.simulation.hold import between_samples
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs
+from heli_jax.simulation.stepping import held_columns, start_state
+
+# A flight's linear machine in discrete time: matrices, and simulation.
+#
+# The one place from which the fit of responses takes them: a model that is linearised at a flight's
+# trim need only be put in here.
+
+
+_LAGS = 48
+"""lags, from a sample to the record's length, at which an impulse response is looked at"""
+
+
+class Machine(NamedTuple):
+    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
+
+    Ad: Float[Array, "n n"]
+    B: Float[Array, "n r"]
+    U: Float[Array, "N r"]
+    """inputs now, late ones, and next ones"""
+    acting: Float[Array, "N m"]
+    C: Float[Array, "p n"]
+    D: Float[Array, "p m"]
+    x0: Float[Array, " n"]
+
+    def simulated(self, block: int) -> Float[Array, "p N"]:
+        """The outputs from the first sample on.
+
+        Args:
+            block: samples in a step of the recurrence.
+        """
+        dt = jnp.ones((), self.Ad.dtype)
+        args = ZeroOrderHoldArgs(None, tuple(self.U.T), dt, None, Discrete(self.Ad, self.B, None))
+        states = jnp.stack(blockwise(args, block, tuple(self.x0)))
+        return self.C @ states + self.D @ self.acting.T
+
+
+def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:
+    """The i-th flight's, with the outputs that it measures.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        u: the unknowns.
+        i: the flight's number.
+    """
+    model, drive = layout.model, driven(layout, data, u, i)
+    model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
+    Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
+    _, _, C, D = jacobians(model, drive.params)
+    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
+    x0 = start_state(model, drive.params, drive.state, drive.inputs)
+    return Machine(Ad, B, U, acting, C[rows], D[rows], naming.ravel(x0, Ad.dtype))
+
+
+def forgets(
+    matrices: StateSpace, dt: float, sizes: Float[np.ndarray, " m"], length: int, samples: int
+) -> Bool[np.ndarray, " p"]:
+    """Of each output whether what an input did has decayed to a part of e after a window, and stays
+    so over the record: then a simulation of the whole record is sound.
+
+    Args:
+        matrices: of the model, with numbers.
+        dt: [s].
+        sizes: standard deviation of each input.
+        length: samples of a window.
+        samples: of the record.
+    """
+    A, B, C = (np.asarray(v, float) for v in matrices[:3])
+    if not all(np.isfinite(v).all() for v in (A, B, C)):
+        return np.zeros(C.shape[0], bool)
+    Ad = scipy.linalg.expm(A * dt)
+    lags = np.geomspace(1, max(samples, 2 * length), _LAGS).astype(int)
+    lags = np.unique(np.append(lags, length))
+    with np.errstate(all="ignore"):
+        powers = [np.linalg.matrix_power(Ad, int(t)) for t in lags]
+        g = np.array([np.linalg.norm(C @ P @ (B * sizes), axis=1) for P in powers])
+        peak = np.max(g[lags <= length], axis=0)
+        return np.all(g[lags >= length] <= np.exp(-1.0) * peak, axis=0)
+
 
 # Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
 
@@ -244,3 +331,155 @@ def on_device(weights: ResponseWeights) -> ResponseWeights:
 def back(weights: ResponseWeights) -> ResponseWeights:
     """The same in NumPy."""
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
+
+
+# What the machine makes of gusts, as windows show it: a shape for the noise of responses.
+#
+# The noise's spectrum in windows is a mean over few of their lines. Gusts come through the
+# machine's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
+# and what the record tells of the mode is weighed by too much noise beside it and too little at it.
+# So
+#
+# $$S_0 = \sum_i q_i \int |W|^2 h_i h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
+#
+# is found first, as in `frequency_gusts` but through the windows' own transform W, and the mean is
+# taken of what is left where it is divided by that.
+#
+# Sources: Blackman and Tukey (1958) for prewhitening.
+
+
+_APART = 0.04
+"""part of the frequency within which lines are taken together"""
+_UNSEEN = 1e-20
+"""part of the largest power of a state's effect below which outputs do not show one"""
+_OFFSETS = np.arange(-1.875, 2.0, 0.25)
+"""from a line to the frequencies that a window brings to it, in lines: its main lobe. None of them
+is zero, where integrations have no finite response"""
+
+
+Described = Callable[[np.ndarray, list[int]], np.ndarray | None]
+"""of raw spectral matrices (k, q, q) of some outputs, by their place in the windows, what the
+machine makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
+
+
+def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
+    """The shape that the first flight's machine gives to the noise.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+        w: the flights in windows.
+    """
+    Ad, C = (np.asarray(v, float) for v in _matrices(layout, data, z))
+    rows = [naming.names(layout.model.Outputs).index(n) for n in w.outputs]
+    return described(Ad, C[rows], w)
+
+
+@eqx.filter_jit
+def _matrices(
+    layout: Layout, data: Data, z: Float[Array, " q"]
+) -> tuple[Float[Array, "n n"], Float[Array, "p n"]]:
+    """Ad from sample to sample, and C of all outputs of the model."""
+    u = unpack(layout, data, z)
+    C = jacobians(layout.model, driven(layout, data, u, 0).params)[2]
+    return machine_of(layout, data, u, 0).Ad, jnp.asarray(C)
+
+
+class _Cells(NamedTuple):
+    """Lines that are taken together."""
+
+    first: np.ndarray
+    """(c,) index of the first of each"""
+    lines: np.ndarray
+    """(c,) how many"""
+    at: np.ndarray
+    """(c,) their mean, in periods of a window"""
+
+
+def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
+    """The shape that a machine gives to the noise.
+
+    Args:
+        Ad: from sample to sample.
+        C: of the outputs in windows.
+        w: the flights in windows.
+    """
+    cells = _cells(w.lines)
+    # A line on a mode that does not decay has no finite response.
+    with np.errstate(all="ignore"):
+        ways = ways_of(Ad, C, cells.at, w.length)
+
+    def of(raw: Complex[np.ndarray, "k q q"], outputs: list[int]) -> np.ndarray | None:
+        size = np.sqrt(np.mean(np.real(np.einsum("kii->ki", raw)), axis=0))
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            return None
+        scale = size[:, None] * size[None, :]
+        seen = ways[:, :, outputs][:, :, :, outputs] / scale
+        fine = np.isfinite(seen).all((1, 2, 3))
+        if not fine.any():
+            return None
+        # What rounding leaves of a state that no output shows would pass for a huge gust's way.
+        effects = np.max(np.real(np.einsum("cnii->cni", seen[fine])), axis=(0, 2))
+        seen = seen * (effects > _UNSEEN * np.max(effects))[:, None, None]
+        power = np.add.reduceat(raw / scale, cells.first, axis=0) / cells.lines[:, None, None]
+        f = cells.at / w.length
+        shapes = shapes_of(f, corners_of(f))
+        with np.errstate(all="ignore"):
+            q, r = powers_of(seen[fine], shapes[:, fine], power[fine], cells.lines[fine])
+            S = np.einsum("nb,bc,cnij->cij", q, shapes[:, fine], seen[fine])
+        S = (S + np.diag(r)) * scale
+        return _between(S, cells.at[fine], w.lines) if np.isfinite(S).all() else None
+
+    return of
+
+
+def _cells(lines: np.ndarray) -> _Cells:
+    """Each line by itself at first, then those within a part of the frequency."""
+    first = [0]
+    while (end := np.searchsorted(lines, lines[first[-1]] * (1.0 + _APART), "right")) < lines.size:
+        first.append(int(end))
+    counts = np.diff(np.append(first, lines.size)).astype(float)
+    return _Cells(np.array(first), counts, np.add.reduceat(lines.astype(float), first) / counts)
+
+
+def ways_of(
+    Ad: Float[np.ndarray, "n n"],
+    C: Float[np.ndarray, "p n"],
+    lines: Float[np.ndarray, " c"],
+    length: int,
+) -> Complex[np.ndarray, "c n p p"]:
+    """By line and state what windows show of the outputs in white gusts of power 1.
+
+    Args:
+        Ad: from sample to sample.
+        C: of the outputs.
+        lines: in periods of a window.
+        length: of a window, in samples.
+    """
+    f = lines[:, None] + _OFFSETS
+    z = np.exp(2j * np.pi * f / length)[:, :, None, None]
+    H = np.swapaxes(C @ np.linalg.inv(z * np.eye(len(Ad)) - Ad), 2, 3)
+    weights = _weights(lines, length)
+    return np.einsum("co,conp,conq->cnpq", weights, H, np.conj(H), optimize=True)
+
+
+def _weights(lines: Float[np.ndarray, " c"], length: int) -> Float[np.ndarray, "c o"]:
+    """How much of the power at each offset windows bring to a line."""
+    t, window = np.arange(length), hann(length)
+    lobe = np.exp(2j * np.pi * np.outer(_OFFSETS, t) / length) @ window
+    # What the mean of a window takes off is a part of the first line.
+    constant = np.exp(2j * np.pi * np.outer(1.0 + _OFFSETS, t) / length).sum(axis=1)
+    mean = np.mean(window * np.exp(-2j * np.pi * t / length))
+    seen = np.where(lines[:, None] < 1.5, lobe - mean * constant, lobe)
+    return np.abs(seen) ** 2 / np.sum(np.abs(lobe) ** 2)
+
+
+def _between(
+    S: Complex[np.ndarray, "c p p"], at: Float[np.ndarray, " c"], lines: np.ndarray
+) -> Complex[np.ndarray, "k p p"]:
+    """Straight lines from cell to cell."""
+    low = np.clip(np.searchsorted(at, lines, side="right") - 1, 0, max(len(at) - 2, 0))
+    high = np.minimum(low + 1, len(at) - 1)
+    part = np.clip((lines - at[low]) / np.maximum(at[high] - at[low], 1e-300), 0.0, 1.0)
+    return S[low] + part[:, None, None] * (S[high] - S[low])

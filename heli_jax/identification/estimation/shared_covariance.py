@@ -1,22 +1,248 @@
 """Flights of one linear model side by side: their Kalman filters differ in the states alone."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import Innovations, first_covariance
 from heli_jax.identification.estimation.measured_signals import measurement_sd
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
-from heli_jax.identification.estimation.steady_gain import Gaussian, Records, filtered_records
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import between_samples
 from heli_jax.simulation.stepping import held_columns
+
+# The Kalman filter of a linear model over whole records: one covariance, and a gain that settles.
+#
+# With no sample missing the covariances depend on the model alone, not on what is measured: records
+# of one model share them, as columns. They converge (Kalman, 1960); from there on the gain stays,
+# and what is left of the filter is a linear recurrence. Both are followed with derivatives of their
+# own: those of the Riccati equation are a Lyapunov recursion in the closed-loop matrix, which all
+# unknowns have in common, and those of the state the same recurrence driven otherwise.
+#
+# Nothing is approximated: where the covariance does not converge (an unstable mode that no output
+# shows, a record that is too short) the gain never freezes, and this is the exact filter to the
+# end.
+
+
+_CHUNK = 64
+"""samples after which the covariance is compared with what it was"""
+_CONVERGED = 1e-10
+"""change of a covariance within a chunk, in units of the two standard deviations, below which it
+stays: derivatives converge later than values, by a factor of about the samples that it took"""
+
+
+class Records(NamedTuple):
+    """m records of N samples, side by side."""
+
+    U: Float[Array, "N m r"]
+    """what `Gaussian.B` multiplies"""
+    acting: Float[Array, "N m i"]
+    """the inputs that act at the samples themselves"""
+    y: Float[Array, "N m p"]
+    """measured; no NaN"""
+    x0: Float[Array, "m n"]
+    """mean of the state at the first sample"""
+
+
+class Gaussian(NamedTuple):
+    """x[k+1] = Ad x[k] + B U[k] + noise, y[k] = C x[k] + D u[k] + noise."""
+
+    Ad: Float[Array, "n n"]
+    B: Float[Array, "n r"]
+    C: Float[Array, "p n"]
+    D: Float[Array, "p i"]
+    Q: Float[Array, "n n"]
+    """covariance that a step adds"""
+    R: Float[Array, " p"]
+    """variances of the measurement noise"""
+    P0: Float[Array, "n n"]
+    """covariance of the state at the first sample"""
+
+
+class _Gain(NamedTuple):
+    """How a sample is used."""
+
+    G: Float[Array, "n p"]
+    """what an innovation adds to the next predicted state: Ad times the Kalman gain"""
+    white: Float[Array, "p p"]
+    """inverse of the Cholesky factor of the innovations' covariance"""
+
+
+class _State(NamedTuple):
+    """The filter between two chunks."""
+
+    x: Float[Array, "m n"]
+    P: Float[Array, "n n"]
+    gain: _Gain
+    steady: Bool[Array, ""]
+
+
+def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
+    """Errors (N, m, p) and variances (N, p) of the innovations.
+
+    Outputs of one sample are taken one after another, as in `kalman.innovations`: the error of each
+    is what the samples before and the outputs before it leave.
+
+    Args:
+        system: n states, p outputs.
+        records: m of them, no sample missing.
+    """
+    N, m, p = records.y.shape
+    n, count = records.x0.shape[1], -(-N // _CHUNK)
+
+    def chunk(state: _State, part: Any) -> tuple[_State, Any]:
+        # By chunks: within one the loop has no branch, and a gain that has settled is noticed one
+        # chunk late at most.
+        return jax.lax.cond(state.steady, _frozen, _transient, system, state, *part)
+
+    # What the last chunk is filled up with comes behind the record and is cut off again.
+    samples = (records.U, records.acting, records.y)
+    parts = jax.tree.map(
+        lambda v: jnp.pad(v, ((0, count * _CHUNK - N), (0, 0), (0, 0))).reshape(
+            count, _CHUNK, *v.shape[1:]
+        ),
+        samples,
+    )
+    dtype = records.y.dtype
+    none = _Gain(jnp.zeros((n, p), dtype), jnp.zeros((p, p), dtype))
+    begin = _State(records.x0, system.P0, none, jnp.asarray(False))
+    _, (error, sd) = jax.lax.scan(chunk, begin, parts)
+    error, sd = error.reshape(-1, m, p)[:N], sd.reshape(-1, p)[:N]
+    return error, jnp.square(sd)
+
+
+def _transient(
+    system: Gaussian, state: _State, U: Array, acting: Array, y: Array
+) -> tuple[_State, tuple[Array, Array]]:
+    """A chunk with a gain anew at each sample."""
+    Ad, B, C, D, Q, R, _ = system
+
+    def step(carry: tuple[Array, Array, _Gain], now: Any) -> tuple[Any, Any]:
+        x, P, _ = carry
+        U, acting, y = now
+        # The covariance does not see the measurements, so one recursion serves all records; only
+        # the states beside it are many.
+        P, gain = riccati(Ad, C, Q, R, P)
+        nu = y - acting @ D.T - x @ C.T
+        x = x @ Ad.T + nu @ gain.G.T + U @ B.T
+        return (x, P, gain), (nu @ gain.white.T, jnp.diagonal(gain.white))
+
+    carry = (state.x, state.P, state.gain)
+    (x, P, gain), (white, scale) = jax.lax.scan(step, carry, (U, acting, y))
+    sd = 1.0 / scale
+    return _State(x, P, gain, _converged(state.P, P)), (white * sd[:, None, :], sd)
+
+
+def _frozen(
+    system: Gaussian, state: _State, U: Array, acting: Array, y: Array
+) -> tuple[_State, tuple[Array, Array]]:
+    """A chunk with the gain that there is."""
+    G, white = state.gain
+    v = y - acting @ system.D.T
+    # With a gain that stays, prediction and correction are one matrix, the filter's closed loop.
+    x, X = recurrence(system.Ad - G @ system.C, v @ G.T + U @ system.B.T, state.x)
+    sd = 1.0 / jnp.diagonal(white)
+    error = (v - X @ system.C.T) @ (white * sd[:, None]).T
+    return state._replace(x=x), (error, jnp.broadcast_to(sd, (U.shape[0], sd.shape[0])))
+
+
+def _converged(before: Array, after: Array) -> Array:
+    before, after = jax.lax.stop_gradient((before, after))
+    sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 0.0))
+    # By the two standard deviations: whatever the units, and for what is known all but exactly too.
+    return _in_all(jnp.all(jnp.abs(after - before) <= _CONVERGED * sd[:, None] * sd[None, :]))
+
+
+# Side by side the gain freezes where it may in all: a condition of each its own would be computed
+# both ways in all of them.
+@jax.custom_batching.custom_vmap
+def _in_all(flag: Array) -> Array:
+    return flag
+
+
+@_in_all.def_vmap
+def _(size: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
+    return jnp.all(flag), False
+
+
+@jax.custom_jvp
+def riccati(Ad: Array, C: Array, Q: Array, R: Array, P: Array) -> tuple[Array, _Gain]:
+    """The covariance of the state one sample on, and how the sample between is used.
+
+    Args:
+        Ad: (n, n).
+        C: (p, n).
+        Q: (n, n), covariance that the step adds.
+        R: (p,), variances of the measurement noise.
+        P: (n, n), covariance of the state predicted for the sample.
+    """
+    following, gain, _ = _riccati(Ad, C, Q, R, P)
+    return following, gain
+
+
+def _riccati(
+    Ad: Array, C: Array, Q: Array, R: Array, P: Array
+) -> tuple[Array, _Gain, tuple[Array, Array]]:
+    """`riccati`, the Kalman gain, and Ad times the covariance of the corrected state."""
+    H = P @ C.T
+    # By its Cholesky factor the innovation of each output is freed of what the outputs before it
+    # tell: the same numbers as when they are taken one after another.
+    L = jnp.linalg.cholesky(C @ H + jnp.diag(R))
+    white = jax.scipy.linalg.solve_triangular(L, jnp.eye(R.shape[0], dtype=R.dtype), lower=True)
+    whitened = H @ white.T
+    K = whitened @ white
+    corrected = Ad @ (P - whitened @ whitened.T)
+    following = corrected @ Ad.T + Q
+    # Symmetric by force: rounding would grow with each step.
+    return 0.5 * (following + following.T), _Gain(Ad @ K, white), (K, corrected)
+
+
+@riccati.defjvp
+def _riccati_jvp(primals: Any, tangents: Any) -> Any:
+    """With G = Ad K and F = Ad - G C: dP+ = F dP F' + dQ + G dR G' + W + W', where
+    W = dAd (P corrected) Ad' - G dC P F'. The gain is the best there is, so that no dK enters."""
+    Ad, C, _, _, P = primals
+    dAd, dC, dQ, dR, dP = tangents
+    following, gain, (K, corrected) = _riccati(*primals)
+    F, H = Ad - gain.G @ C, P @ C.T
+    W = dAd @ corrected.T - gain.G @ dC @ (P @ F.T)
+    d_following = F @ dP @ F.T + dQ + (gain.G * dR[None, :]) @ gain.G.T + W + W.T
+    dCH = dC @ H
+    dS = C @ dP @ C.T + dCH + dCH.T + jnp.diag(dR)
+    # L^-1 dS L^-T = Phi + Phi' gives dL = L Phi, with Phi a lower triangle.
+    whitened = gain.white @ dS @ gain.white.T
+    half = jnp.tril(whitened) - 0.5 * jnp.diag(jnp.diagonal(whitened))
+    d_white = -half @ gain.white
+    # The gain's own derivative enters the states, although it drops out of the covariance.
+    dK = (dP @ C.T + P @ dC.T - K @ dS) @ (gain.white.T @ gain.white)
+    return (following, gain), (d_following, _Gain(dAd @ K + Ad @ dK, d_white))
+
+
+@jax.custom_jvp
+def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
+    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all of them.
+
+    Args:
+        F: (n, n).
+        forcing: (K, m, n), of m records.
+        x0: (m, n).
+    """
+    return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
+
+
+@recurrence.defjvp
+def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
+    (F, _, _), (dF, d_forcing, dx0) = primals, tangents
+    x, X = recurrence(*primals)
+    # All samples' dF x at once, in place of a product more in every step.
+    driven = X @ dF.T + d_forcing
+    return (x, X), recurrence(F, driven, dx0)
 
 
 def innovations_together(

@@ -10,22 +10,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.identifiability.combinations import (
-    NOT_ASKED,
-    TAKES_PART,
-    Elsewhere,
-    Tied,
-    combinations,
-    row_reduced,
-    unit_vector,
-)
 from heli_jax.identification.identifiability.directions import (
+    NOT_ASKED,
+    TAKES_NO_PART,
+    TAKES_PART,
     Directions,
+    Elsewhere,
     Exchange,
+    Tied,
     WithoutWeakPriors,
+    combinations,
     correlation_of,
     covariance_of,
     directions,
+    factor,
+    further,
+    holds_zero,
+    one_sided,
+    reported_too_wide,
+    row_reduced,
+    single_too_wide,
+    too_wide,
+    unit_vector,
+    weakly_held,
     without_effect_of,
 )
 from heli_jax.identification.identifiability.sentences import (
@@ -41,17 +48,6 @@ from heli_jax.identification.identifiability.verdict import (
     SecondSolution,
     Unknown,
     Verdict,
-)
-from heli_jax.identification.identifiability.wide_intervals import (
-    TAKES_NO_PART,
-    factor,
-    further,
-    holds_zero,
-    one_sided,
-    reported_too_wide,
-    single_too_wide,
-    too_wide,
-    weakly_held,
 )
 
 NULL = 1e-8

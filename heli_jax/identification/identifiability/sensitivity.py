@@ -7,11 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.identifiability.analysis import NULL, analyse
-from heli_jax.identification.identifiability.combinations import Elsewhere, Tied, combinations
-from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
-from heli_jax.identification.identifiability.valley import Valley
+from heli_jax.identification.identifiability.directions import (
+    Elsewhere,
+    Tied,
+    WithoutWeakPriors,
+    combinations,
+    projected,
+)
+from heli_jax.identification.identifiability.equivalents import Valley
 from heli_jax.identification.identifiability.verdict import (
     Combination,
     SecondSolution,

@@ -20,7 +20,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.evaluation import Evaluation, deviations
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 

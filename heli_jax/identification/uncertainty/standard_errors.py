@@ -10,12 +10,13 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.identifiability.beyond_slopes import (
     AS_SLOPES,
     Limits,
     beyond_slopes,
 )
+from heli_jax.identification.identifiability.equivalents import Valley
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.through_inputs import (
     MOSTLY,
@@ -27,7 +28,6 @@ from heli_jax.identification.identifiability.through_inputs import (
     resting_on_disturbance,
     through_inputs,
 )
-from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import (
     Z95,
     Combination,

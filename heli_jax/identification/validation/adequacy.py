@@ -13,15 +13,22 @@ With filter error the simulation does not know the disturbance, so it is judged 
 estimated disturbance lets expect.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
+from heli_jax import naming
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding, note
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
     GATE,
@@ -31,9 +38,36 @@ from heli_jax.identification.validation.advice import (
     is_unstable,
 )
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
-from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from heli_jax.numbers import explained_text, percent, vaf_text
 from heli_jax.numerics.white_noise import white_part
+
+# Does a filter predict anything of an output, beyond what its mean or the last sample says?
+
+
+BETTER = 0.8
+"""share of the squared error of the mean, or of the sample before, that a prediction may leave at
+most: more is what smoothing a noisy signal leaves without any model"""
+
+
+def predicts_nothing(flights: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Whether predictions one step ahead are hardly better than the mean of the flight, or than the
+    sample before (persistence).
+
+    Args:
+        flights: by flight the measured output (N,) and the errors of its prediction (N,), SI, NaN
+            where nothing was measured.
+    """
+    left, mean, before = 0.0, 0.0, 0.0
+    for measured, error in flights:
+        y, error = np.asarray(measured), np.asarray(error)
+        # A sample is foretold by the one before only where both were measured.
+        both = np.isfinite(y[1:]) & np.isfinite(y[:-1])
+        if both.any():
+            left += float(np.sum(error[1:][both] ** 2))
+            mean += float(np.sum((y[1:][both] - np.nanmean(y)) ** 2))
+            before += float(np.sum(np.diff(y)[both] ** 2))
+    return left > BETTER * min(mean, before) > 0.0
+
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -369,3 +403,96 @@ def _reason(output: OutputAdequacy, ahead: float | None) -> str:
         f"noise, expected at least {percent(EXPLAINED, 0)} (VAF {vaf_text(vaf)}); the acceptance "
         "card asks for a VAF of 90 %."
     )
+
+
+# A fit whose model explains nothing of what was measured determines nothing of it either.
+
+
+def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
+    """The verdict; where every output is followed worse than by its mean no parameter is
+    determined.
+
+    Args:
+        verdict: what the data determine by the slopes at the optimum, and about it.
+        adequacy: how the model explains what was measured.
+    """
+    # A disturbance, or predictions ahead, let a good model's simulation be as poor.
+    judged = [o for o in adequacy.judged if o.against_disturbance is None]
+    worse = bool(judged) and all(o.vaf < 0 for o in adequacy.judged)
+    if not adequacy.denied or adequacy.ahead is not None or not worse:
+        return verdict
+    outputs = listed([o.output for o in adequacy.judged])
+    sentence = (
+        f"The data do not determine {listed(verdict.names, 'or')}: the model explains nothing of "
+        f"{outputs} at this optimum. Start nearer, from several points (fit.starts), or from what "
+        "the data say (start: equation-error)."
+    )
+    return verdict.nothing(sentence)
+
+
+# Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
+#
+# What is then estimated is the colour of the noise, and not how the machine answers: from other
+# starts, or with another disturbance, it is something else, with an interval as narrow.
+
+
+def unless_inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
+    """The verdict; where the inputs explain nothing that determines no parameter.
+
+    Args:
+        at: the optimum.
+        e: what it tells.
+        verdict: what the data determine as the model has it.
+    """
+    # Without a disturbance that is asked of the response: it has to stand out of the noise.
+    if not verdict.identifiable or not e.innovations:
+        return verdict
+    gain = gain_of_inputs(at, e)
+    free = len(at.layout.free)
+    # Written so that a gain that is no number changes nothing.
+    if not scipy.special.chdtrc(free, max(gain, 0.0)) >= _BY_CHANCE:
+        return verdict
+    names = sorted({n for flight in at.data.flights for n in _moving(flight)})
+    sentence = (
+        f"The data do not determine {listed(verdict.names, 'or')}: {listed(names)} "
+        f"{'explain' if len(names) > 1 else 'explains'} nothing of what was measured (twice the "
+        f"log-likelihood gained by the inputs is {max(gain, 0.0):.2g}, chance alone makes up to "
+        f"{scipy.special.chdtri(free, _BY_CHANCE):.2g}), so that the estimates are those of the "
+        "disturbance and the noise. Larger inputs are needed, or other columns: are these the "
+        "signals that move the machine?"
+    )
+    return verdict.nothing(sentence)
+
+
+def gain_of_inputs(at: Solution, e: Evaluation) -> float:
+    """Twice the log-likelihood that the inputs gain at the optimum over inputs that rest at their
+    means; NaN where no input moves.
+
+    All unknowns stay as they are: estimated anew without the inputs the likelihood could only be
+    larger, and the gain smaller, so that a gain of no account is certain.
+
+    Args:
+        at: the optimum.
+        e: what it tells.
+    """
+    if not any(_moving(flight) for flight in at.data.flights):
+        return float("nan")
+    still = at.data._replace(flights=tuple(_at_rest(flight) for flight in at.data.flights))
+    without = evaluate(at.layout, still, at.noise, at.z)
+    if not np.isfinite(without.r).all():
+        return float("nan")
+    return 2.0 * (_likelihood(at, at.data, e) - _likelihood(at, still, without))
+
+
+def _likelihood(at: Solution, data: Data, e: Evaluation) -> float:
+    return at.layout.estimator.log_likelihood(at.layout, data, at.noise, e)
+
+
+def _moving(flight: FlightData) -> list[str]:
+    return [n for n, u in naming.asdict(flight.inputs).items() if np.ptp(np.asarray(u)) > 0]
+
+
+def _at_rest(flight: FlightData) -> FlightData:
+    """The flight with each input at its mean, of the same shapes and types."""
+    still = {n: jnp.full_like(u, jnp.mean(u)) for n, u in naming.asdict(flight.inputs).items()}
+    return flight._replace(inputs=naming.replace(flight.inputs, **still))

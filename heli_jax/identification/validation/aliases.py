@@ -13,7 +13,7 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.identifiability.valley import SAME, Valley
+from heli_jax.identification.identifiability.equivalents import SAME, Valley
 from heli_jax.identification.problem import Problem
 from heli_jax.numerics.white_noise import white_part
 

@@ -14,20 +14,18 @@ from heli_jax.identification.validation.excitation_test import outputs_against_e
 from heli_jax.identification.validation.excited_band import NOTHING, NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.feedback import feedback_notes, untested, why_untested
 from heli_jax.identification.validation.follows_response import LEVEL, Feedback
-from heli_jax.identification.validation.input_units import doubtful_inputs
-from heli_jax.identification.validation.late_angles import late_angles
-from heli_jax.identification.validation.late_inputs import LATE, late_inputs
+from heli_jax.identification.validation.late_inputs import LATE, late_angles, late_inputs
 from heli_jax.identification.validation.logging_rate import (
     LOGGING_RATE,
     logging_rate,
     loop_between_samples,
 )
-from heli_jax.identification.validation.misread import misread
-from heli_jax.identification.validation.missing_outputs import missing_outputs
-from heli_jax.identification.validation.next_flight import next_flight
+from heli_jax.identification.validation.misread import doubtful_inputs, misread
+from heli_jax.identification.validation.next_flight import missing_outputs, next_flight
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
     saturation,
+    smoothed,
     strays,
     stuck,
 )
@@ -36,7 +34,6 @@ from heli_jax.identification.validation.signal_signs import (
     rate_against_angle,
     sticks_of,
 )
-from heli_jax.identification.validation.smoothed import smoothed
 from heli_jax.numbers import p_value
 
 # params is Any: a record of a model's Params, whose class may be a user's own.

@@ -1,7 +1,8 @@
 """Which band each input excites, and which inputs move together there."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,173 @@ from jaxtyping import Bool, Complex, Float
 from heli_jax.analysis.spectral import partial_coherence, segment_transforms, without
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.hardly_moving import hardly_moving
-from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
+from heli_jax.flights.parts import spans
+
+# Inputs that move so little that they tell nothing: a count of the log, a few samples. Outputs
+# that never move.
+
+
+_FEW = 8
+"""samples away from the value that an input mostly has: fewer are a spike rather than a stick"""
+_ON_LATTICE = 5
+"""steps from zero, of a value between which and the next one all motion is, from which on that
+step is taken for the log's: what is commanded seldom stands at whole multiples of its own size"""
+
+
+def hardly_moving(flights: Sequence[Flight], moving: Sequence[str]) -> list[Finding]:
+    """Doubts about inputs that move by one step of the log, or in a few samples alone.
+
+    Args:
+        flights: those that are fitted.
+        moving: the inputs that move in any of them.
+    """
+    findings = []
+    for name in moving:
+        values = [f.inputs[name] for f in flights]
+        away, samples = sum(_away(u) for u in values), sum(u.size for u in values)
+        levels = np.unique(np.concatenate(values))
+        if words := _one_step(levels):
+            text = f"{name} moves by one step of the log alone, between {words}: it excites nothing"
+        elif away < _FEW:
+            text = f"{name} moves in {away} of {samples} samples alone: it excites hardly anything"
+        else:
+            continue
+        criterion = f"samples in which it is away from its usual value, {_FEW}"
+        findings.append(
+            Finding("excitation.excited-band", "doubt", f"{text}.", float(away), criterion)
+        )
+    return findings
+
+
+def _away(u: Float[np.ndarray, " N"]) -> int:
+    """Samples at other values than the one that is most frequent."""
+    _, counts = np.unique(u, return_counts=True)
+    return int(u.size - counts.max())
+
+
+def _one_step(levels: Float[np.ndarray, " k"]) -> str:
+    """Between which two neighbouring counts an input moves, in words; empty where it moves more."""
+    if levels.size != 2:
+        return ""
+    low, high = (float(v) for v in levels)
+    multiple = min(abs(low), abs(high)) / (high - low)
+    if multiple < _ON_LATTICE or abs(multiple - round(multiple)) > 1e-6 * multiple:
+        return ""
+    return f"{low:.6g} and {high:.6g}"
+
+
+def moving_outputs(flight: Flight) -> tuple[Flight | None, str]:
+    """The flight with the outputs that move, or None; what to say of the others.
+
+    Args:
+        flight: with at least one measured sample of each output.
+    """
+    outputs = {n: y for n, y in flight.outputs.items() if np.nanmin(y) < np.nanmax(y)}
+    still = ", ".join(n for n in flight.outputs if n not in outputs)
+    if not outputs:
+        return None, f"none of its outputs ({still}) ever moves"
+    said = f"{still} never moves, and is left out in frequency" if still else ""
+    return with_outputs(flight, outputs), said
+
+
+def with_outputs(flight: Flight, names: Collection[str]) -> Flight:
+    """The flight with some of its outputs.
+
+    Args:
+        flight: any.
+        names: of the outputs to keep.
+    """
+    outputs, sd = (
+        {n: v for n, v in of.items() if n in names} for of in (flight.outputs, flight.sd)
+    )
+    return replace(flight, outputs=outputs, sd=sd)
+
+
+# Parts of flights in which outputs are seen without a hole, for what needs samples in a row.
+
+
+_BRIDGED = 5
+"""samples in a row at most that a straight line bridges: far fewer than a segment of a spectrum"""
+_SHARE = 0.05
+"""part of an output's samples that may be bridged; what makes up more is no longer measured"""
+
+
+class Part(NamedTuple):
+    """Samples in a row of one flight, every output seen or bridged in all of them."""
+
+    inputs: dict[str, Float[np.ndarray, " n"]]
+    outputs: dict[str, Float[np.ndarray, " n"]]
+
+    @property
+    def n_samples(self) -> int:
+        """The samples of the part."""
+        return next(iter(self.inputs.values())).size
+
+
+class SeenParts(NamedTuple):
+    """What can be looked at of some flights, and what cannot."""
+
+    outputs: tuple[str, ...]
+    parts: tuple[Part, ...]
+    left_out: dict[str, str]
+    """by output why it is not among `outputs`, in words"""
+
+
+def seen_parts(flights: Sequence[Flight]) -> SeenParts:
+    """Parts without a hole, few missing samples bridged by straight lines.
+
+    Args:
+        flights: of one sample time.
+    """
+    used: list[str] = []
+    left_out: dict[str, str] = {}
+    filled: list[dict[str, np.ndarray]] = [{} for _ in flights]
+    for name in dict.fromkeys(n for f in flights for n in f.outputs):
+        if not all(name in f.outputs for f in flights):
+            left_out[name] = "is not in every flight"
+            continue
+        made = [_bridged(f.outputs[name]) for f in flights]
+        missing = sum(int(np.isnan(f.outputs[name]).sum()) for f in flights)
+        line = sum(count for _, count in made)
+        total = sum(f.n_samples for f in flights)
+        # Within its own span: what is missing before the first and after the last is cut off.
+        if line > _SHARE * total or missing > 0.5 * total:
+            left_out[name] = f"lacks {100 * missing / total:.2g} % of its samples"
+            continue
+        used.append(name)
+        for outputs, (y, _) in zip(filled, made, strict=True):
+            outputs[name] = y
+    parts = tuple(p for f, ys in zip(flights, filled, strict=True) for p in _whole(f, ys))
+    return SeenParts(tuple(used), parts, left_out)
+
+
+def _bridged(y: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], int]:
+    """An output with its short holes bridged, and by how many samples; longer ones stay."""
+    seen = np.flatnonzero(np.isfinite(y))
+    if seen.size < 2:
+        return y, 0
+    within = np.arange(y.size)
+    # Which pair of seen samples a missing one lies between, and how far these are apart.
+    after = np.searchsorted(seen, within)
+    inside = (after > 0) & (after < seen.size) & np.isnan(y)
+    apart = np.zeros(y.size)
+    apart[inside] = seen[after[inside]] - seen[after[inside] - 1] - 1
+    short = inside & (apart <= _BRIDGED)
+    line = y.copy()
+    line[short] = np.interp(within[short], seen, y[seen])
+    return line, int(short.sum())
+
+
+def _whole(flight: Flight, outputs: dict[str, np.ndarray]) -> list[Part]:
+    """The runs of samples in which every output has a number."""
+    return [
+        Part(
+            {n: u[first:last] for n, u in flight.inputs.items()},
+            {n: y[first:last] for n, y in outputs.items()},
+        )
+        for first, last in spans([np.zeros(flight.n_samples), *outputs.values()])
+    ]
+
 
 COHERENT = 0.6
 """coherence from which on a response is taken for the input's: Tischler and Remple, Aircraft and

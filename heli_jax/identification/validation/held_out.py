@@ -11,7 +11,8 @@ from jaxtyping import Array
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes

@@ -33,11 +33,16 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, named
-from heli_jax.identification.estimation.frequency_gusts import LEAST, PART, whitening_by
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_noise import (
+    GUST_LEAST,
+    GUST_PART,
+    averages,
+    inverse_roots,
+    whitening_by,
+)
 from heli_jax.identification.estimation.frequency_records import Record, parts_of, records_of
-from heli_jax.identification.estimation.frequency_spectrum import averages, inverse_roots
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise
@@ -51,8 +56,7 @@ from heli_jax.identification.validation.excitation_test import (
     Followed,
     errors_against_excitation,
 )
-from heli_jax.identification.validation.frequency_bands import band_edges
-from heli_jax.identification.validation.hardly_moving import moving_outputs, with_outputs
+from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
 from heli_jax.identification.validation.held_out_agreement import (
     HeldOutBand,
     HeldOutFlight,
@@ -64,6 +68,31 @@ from heli_jax.identification.validation.own_estimates import (
     explained_by_estimates,
     own_estimates,
 )
+
+# Bands of frequencies that a page shows.
+
+
+_FEWEST = 12
+"""lines of a band at least"""
+
+
+def band_edges(hz: Float[np.ndarray, " K"]) -> list[tuple[float, float]]:
+    """Bands between the lowest and the highest of some frequencies, at 1, 3, 10, 30 ... Hz, each
+    with some lines.
+
+    Args:
+        hz: the lines.
+    """
+    low, high = float(np.min(hz)), float(np.max(hz))
+    decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    grid = np.sort(np.concatenate([10.0**decades, 3.0 * 10.0**decades]))
+    edges = [low]
+    for edge in grid[(grid > low) & (grid < high)]:
+        above = np.sum(hz > edge) >= _FEWEST
+        if above and np.sum((hz >= edges[-1]) & (hz <= edge)) >= _FEWEST:
+            edges.append(float(edge))
+    return list(zip(edges, [*edges[1:], high], strict=True))
+
 
 _NO_SPECTRUM = "its errors have no spectrum: two of its outputs are one, or there is no noise"
 _SAME_RATE = 1e-6
@@ -263,7 +292,7 @@ def _whitening(
     fitted, W = max(alike, key=lambda v: v[0].lines)
     counts = tuple(Counter(r.lines for r in records_of(at.layout)).items())
     p = W.shape[1]
-    n = np.maximum(averages(fitted.lines, counts, PART, LEAST), p + 1.0)
+    n = np.maximum(averages(fitted.lines, counts, GUST_PART, GUST_LEAST), p + 1.0)
     # The fit's own weights allow twice for a spectrum that is estimated: for what it makes of
     # errors that it was not estimated from, as here, and for the estimates'.
     W = W * np.sqrt(n / (n - p))[:, None, None]

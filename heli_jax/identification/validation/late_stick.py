@@ -24,7 +24,8 @@ from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.evaluation import Evaluation, directions, evaluate
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import directions, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution

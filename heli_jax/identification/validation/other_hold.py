@@ -1,5 +1,6 @@
 """What the estimates would be if the inputs moved otherwise between their samples, and which of the
-two the record bears out."""
+two the record bears out.
+"""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -13,7 +14,8 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.evaluation import Evaluation, directions, evaluate
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import directions, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution

@@ -10,35 +10,312 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from heli_jax import naming
 from heli_jax.finding import Finding, note
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.measured_signals import signal_numbers
+from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.identifiability.expected import (
     Sensitivity,
     expected_sd,
     sensitivity_at,
+    together,
     triangle,
 )
 from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.chosen_windows import Choice, Window, chosen
-from heli_jax.identification.validation.usable_windows import Exclusions
-from heli_jax.identification.validation.window_states import (
-    begins_on_record,
-    prior_weights,
-    states_of_record,
-)
+
+# Why a window of a record is not to be used: gaps, missing samples, signals at their ends.
+
+
+_RAILS = 0.05
+"""part of a window's samples at an end of a signal's range, from which on it is left out"""
+_GAP = 0.25
+"""seconds without a sample of an output, and five of its usual steps, that are a gap"""
+
+
+class Exclusions:
+    """Why a window of a flight is not to be used."""
+
+    def __init__(self, flights: tuple[Flight, ...]) -> None:
+        self.flights = flights
+        self.facts = [f.facts for f in flights]
+
+    def of(self, i: int, first: int, last: int) -> str:
+        """In words; empty where it may be used.
+
+        Args:
+            i: number of the flight.
+            first: sample.
+            last: sample after the window's last one.
+        """
+        inside = slice(first, last)
+        flight = self.flights[i]
+        for name, y in flight.outputs.items():
+            if missing := _missing(y, inside, flight.dt):
+                return f"{name}: {missing}"
+        for (name, _), whole in self.facts[i].items():
+            facts = whole.within(first * flight.dt, (last - 1) * flight.dt)
+            if facts.stuck is not None:
+                length = sum(one.end - one.begin for one in facts.stretches)
+                return f"{name} stuck at one value for {length:.2g} s"
+            if facts.dropped >= DROP_SHARE and facts.dropouts is not None:
+                words = f"jumps to {facts.dropouts.value:.4g} and back"
+                return f"{name} {words}, in {100 * facts.dropped:.2g} % of the samples"
+            share = sum(facts.shares)
+            if share >= _RAILS:
+                return f"{name} at an end of its range in {100 * share:.0f} % of the samples"
+        return ""
+
+
+def _missing(y: np.ndarray, inside: slice, dt: float) -> str:
+    """What is missing of an output within a window, in words."""
+    seen = np.flatnonzero(np.isfinite(y))
+    # A sensor slower than the flight's rate leaves samples out that are no gap.
+    usual = float(np.median(np.diff(seen))) if seen.size > 1 else 1.0
+    here = np.flatnonzero(np.isfinite(y[inside]))
+    n = inside.stop - inside.start
+    if here.size < 2:
+        return "no samples"
+    longest = float(np.max(np.diff(np.concatenate([[-1], here, [n]]))))
+    if longest > 5.0 * usual and longest * dt > _GAP:
+        return f"a gap of {longest * dt:.2g} s"
+    if here.size < 0.5 * n / usual:
+        return f"{100 * (1 - here.size * usual / n):.0f} % of the samples missing"
+    return ""
+
+
+# Where the windows of a record begin, so that none says more than the record it is cut from.
+#
+# A window has an initial state, biases and offsets of its own. With states and offsets that fit its
+# samples best it would move more than the record does at the start values, and with weak priors of
+# its own it would know more: both would let a part say more than the whole. So a window begins
+# where the record's own simulation is at that instant, and its share of what the weak priors say is
+# its share of the samples.
+
+
+_DIVERGED = 10.0
+"""times the measured range, beyond which the simulation of the whole record says nothing of where a
+window begins"""
+_FREE = 1e-3
+"""weight of the weak prior of a state that the whole record has none for: next to nothing, and no
+direction without any information, which would be rounding"""
+
+
+def states_of_record(at: Solution, e: Evaluation) -> tuple[np.ndarray, ...] | None:
+    """By flight the simulated states (s, N); None where the simulation diverges.
+
+    Args:
+        at: layout, data and unknowns of the whole record.
+        e: the evaluation there.
+    """
+    for run, flight in zip(e.simulated, at.data.flights, strict=True):
+        for name, y in run.items():
+            size = float(np.nanmax(np.abs(np.asarray(flight.outputs[name]))))
+            if not np.isfinite(y).all() or np.max(np.abs(y)) > _DIVERGED * max(size, 1e-300):
+                return None
+    states = tuple(np.asarray(x) for x in jax.device_get(_states(at.layout, at.data, at.z)))
+    return states if all(np.isfinite(x).all() for x in states) else None
+
+
+@eqx.filter_jit
+def _states(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, ...]:
+    return tuple(run.states for run in predict(layout, data, unpack(layout, data, z)))
+
+
+def begins_on_record(
+    layout: Layout,
+    data: Data,
+    cuts: Sequence[tuple[int, int, int]],
+    at: Solution,
+    states: tuple[np.ndarray, ...],
+) -> Float[Array, " k"]:
+    """The nuisances of all windows: states from the whole record's simulation, biases and offsets
+    those of the record.
+
+    Args:
+        layout: of the windows.
+        data: of the windows.
+        cuts: (flight, first, last) of each of the layout's flights.
+        at: the whole record.
+        states: of `states_of_record`.
+    """
+    every = naming.names(layout.model.State)
+    values: list[float] = []
+    for c, (i, first, _) in enumerate(cuts):
+        count, m = layout.windows[c]
+        scale = data.flights[c].state_scale
+        for k in range(count):
+            x = states[i][:, first + k * m]
+            values += [float(x[every.index(n)]) / float(scale[n]) for n in layout.states]
+        values += [float(v) for v in _constants(at, i)]
+    return jnp.asarray(values, at.z.dtype)
+
+
+def _constants(at: Solution, i: int) -> np.ndarray:
+    """Biases and offsets of the i-th flight of the whole record."""
+    position = at.layout.first_nuisance
+    for j in range(i + 1):
+        position += at.layout.windows[j][0] * len(at.layout.states)
+        position += at.layout.constants(at.layout.outputs[j])
+    return np.asarray(at.z)[position - at.layout.constants(at.layout.outputs[i]) : position]
+
+
+def prior_weights(
+    layout: Layout,
+    cuts: Sequence[tuple[int, int, int]],
+    sizes: Sequence[int],
+    samples: int,
+    *,
+    shooting: bool,
+) -> Float[np.ndarray, " k"]:
+    """By nuisance of all windows, the part of its weak prior (as 1 / sd) that a window has.
+
+    Args:
+        layout: of the windows.
+        cuts: (flight, first, last) of each of the layout's flights.
+        sizes: samples of each whole flight.
+        samples: of a window.
+        shooting: whether the whole record has initial states at every window too.
+    """
+    weights: list[float] = []
+    for c, (i, first, _) in enumerate(cuts):
+        count, _ = layout.windows[c]
+        for k in range(count):
+            # In the whole record the state has a prior at its beginning alone.
+            stated = first == 0 and (k == 0 or shooting)
+            weights += [1.0 if stated else _FREE] * len(layout.states)
+        # All windows together have one prior of a bias, as the whole record has.
+        share = min(samples / sizes[i], 1.0) ** 0.5
+        weights += [share] * layout.constants(layout.outputs[c])
+    return np.array(weights)
+
+
+# The windows without overlap that together say most: greedy choice by the D-criterion.
+
+
+ENOUGH = 0.9
+"""D-efficiency of the windows that are taken: the q-th root of the determinant of their information
+over that of all windows, about the part of all that is known of a parameter"""
+DETERMINES = 1.0
+"""relative sd below which a parameter counts as determined: a factor of e either way"""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Window:
+    """One window of a flight."""
+
+    flight: int
+    """its number among the flights that are fitted"""
+    label: str
+    first: int
+    last: int
+    """samples from `first` up to but not including `last`"""
+    start: float
+    end: float
+    """[s] from the beginning of the flight"""
+    sd: Float[np.ndarray, " q"]
+    """expected by this window alone, relative; inf where it does not determine a parameter"""
+    excluded: str = ""
+    """why it is not to be used"""
+
+    def overlaps(self, other: "Window") -> bool:
+        """Whether both have samples in common."""
+        return self.flight == other.flight and self.first < other.last and other.first < self.last
+
+
+class Choice(NamedTuple):
+    """A window that was taken."""
+
+    window: Window
+    efficiency: float
+    """D-efficiency of all that are taken up to it"""
+    sd: Float[np.ndarray, " q"]
+    """expected by all that are taken up to it"""
+    reason: str
+
+
+def chosen(
+    unknowns: tuple[Unknown, ...],
+    windows: list[Window],
+    triangles: list[np.ndarray],
+    usable: list[int],
+    unknown: np.ndarray,
+) -> tuple[tuple[Choice, ...], np.ndarray]:
+    """Windows without overlap, the one that gains most first, until they say enough (Mehra, 1974),
+    and the triangle of all that could be taken.
+
+    Args:
+        unknowns: the parameters.
+        windows: all of them.
+        triangles: what each says.
+        usable: the numbers of those that may be taken.
+        unknown: (q,) whether the whole record does not determine a parameter.
+    """
+    size = triangles[0].shape[0]
+    begin = np.zeros((size, size))
+    order, left, R = [], list(usable), begin
+    steps = []
+    while left:
+        # The first of equal ones: the same record gives the same windows.
+        gains = [_log_det(unknowns, together(R, triangles[k])) for k in left]
+        best = left[int(np.argmax(gains))]
+        R = together(R, triangles[best])
+        order.append(best)
+        steps.append((R, max(gains)))
+        left = [k for k in left if not windows[k].overlaps(windows[best])]
+    q, total = len(unknowns), steps[-1][1]
+    taken, sd = [], np.full(q, np.inf)
+    for k, (R, log_det) in zip(order, steps, strict=True):
+        efficiency = float(np.exp((log_det - total) / q))
+        after = np.where(unknown, np.inf, expected_sd(unknowns, R))
+        taken.append(Choice(windows[k], efficiency, after, _reason(unknowns, sd, after)))
+        sd = after
+        if efficiency >= ENOUGH:
+            break
+    return tuple(taken), steps[-1][0]
+
+
+def _log_det(unknowns: tuple[Unknown, ...], R: np.ndarray) -> float:
+    """Logarithm of the determinant of what is known of the parameters of interest."""
+    q = len(unknowns)
+    # What nothing tells yet has the sd of its interval or of a factor of e, so that the determinant
+    # is never zero; of the noise's own unknowns, which are eliminated, that is an sd of ten.
+    weak = np.diag([max(u.prior, 1.0 / u.scale) for u in unknowns] + [0.1] * (len(R) - q))
+    whole = np.linalg.qr(np.vstack([R, weak]), mode="r")
+    # With the parameters last their corner of the triangle is what is left without the others.
+    whole = np.linalg.qr(np.hstack([whole[:, q:], whole[:, :q]]), mode="r")
+    corner = np.abs(np.diag(whole)[len(R) - q :])
+    return 2.0 * float(np.sum(np.log(np.maximum(corner, 1e-300))))
+
+
+def _reason(unknowns: tuple[Unknown, ...], before: np.ndarray, after: np.ndarray) -> str:
+    """Of which parameter a window told most."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        fall = np.where(np.isfinite(after), np.log(before / after), 0.0)
+    fall = np.nan_to_num(fall, nan=0.0, posinf=np.inf)
+    known, new = after < DETERMINES, (after < DETERMINES) & (before >= DETERMINES)
+    if not known.any():
+        return "determines no parameter by itself"
+    if new.any():
+        return f"determines {', '.join(u.name for u, n in zip(unknowns, new, strict=True) if n)}"
+    i = int(np.argmax(fall))
+    return f"{unknowns[i].name}: sd {100 * before[i]:.2g} % to {100 * after[i]:.2g} %"
+
 
 _PARTS = 12
 """windows in a record, unless their length is stated"""

@@ -20,21 +20,11 @@ from heli_jax.flights.signal_facts import (
     SignalFacts,
     Stuck,
     at_rails,
-    quantum,
 )
 from heli_jax.flights.strays import stray_words
 from heli_jax.flights.table import sample_count
-
-__all__ = [
-    "Rails",
-    "cut_off",
-    "quantisation",
-    "quantum",
-    "rails",
-    "saturation",
-    "strays",
-    "stuck",
-]
+from heli_jax.identification.estimation.filter_error import REMEDY, noiseless, noiseless_words
+from heli_jax.numerics.white_noise import noise_guess
 
 _RAIL_LIMIT = f"share of the samples at a rail, {RAIL_SHARE}"
 _CUT_OFF = 0.02
@@ -290,3 +280,31 @@ def _coarse_input(name: str, facts: SignalFacts) -> str:
         f"{name} moves at {100 * facts.moves:.0f} % of the samples between only {facts.levels} "
         "distinct values: steps of the log, not of the stick."
     )
+
+
+# Outputs that have no noise of a sensor, as a finding.
+
+
+_LIMIT = "white part over the output's sd, 1e-4"
+
+
+def smoothed(flights: Sequence[tuple[str, Flight]], *, process_noise: bool) -> list[Finding]:
+    """One sentence for each flight that has outputs without noise.
+
+    Args:
+        flights: by what each is called.
+        process_noise: whether the method holds predictions against the noise of the outputs.
+    """
+    findings = []
+    for label, flight in flights:
+        without = {n: flight.outputs[n] for n in noiseless(flight.outputs)}
+        if not without:
+            continue
+        part = max(noise_guess(y) / float(np.nanstd(y)) for y in without.values())
+        words = f"{label}: {noiseless_words(without, flight.dt)}; nothing faster is in it."
+        if process_noise:
+            words = f"{words} {REMEDY}"
+        findings.append(
+            Finding("quality.smoothed", "doubt" if process_noise else "note", words, part, _LIMIT)
+        )
+    return findings

@@ -16,26 +16,17 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
+from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import HALF_INTERVAL, Finding
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.evaluation import deviations, evaluate, simulated_outputs
+from heli_jax.identification.estimation.measured_signals import signals
+from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.other_hold import pseudoinverse
-from heli_jax.identification.validation.residual_drives import (
-    changing,
-    drives,
-    motions,
-    moving_inputs,
-    of_single_flights,
-)
-from heli_jax.identification.validation.residual_slopes import (
-    longest,
-    of_one_clock,
-    sensitivities,
-    usable,
-)
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -48,6 +39,288 @@ from heli_jax.identification.validation.score_test import (
     strongest,
 )
 from heli_jax.numbers import p_value
+
+# An output that is slower than the grid at its own samples, for what needs a row of them.
+
+
+_REGULAR = 0.98
+"""part of the steps between samples that are of one length, from which on they are a clock's"""
+_MOST = 50
+"""grid steps between two samples at most"""
+_JITTERS = 5
+"""grid steps between two samples from which on a clock falls on the grid one sooner or later"""
+
+
+class OwnSamples(NamedTuple):
+    """Where on the grid an output was sampled at even times."""
+
+    rows: np.ndarray
+    """(M,) their numbers"""
+    every: int
+    """grid steps from one to the next"""
+
+    @property
+    def holes(self) -> tuple[int, ...]:
+        """Where in `rows` the sample before is missing: a slow residual jumps there, and so does an
+        input, which is no answer of one to the other."""
+        apart = np.diff(self.rows)
+        return tuple((np.flatnonzero(apart > self.every + (self.every >= _JITTERS)) + 1).tolist())
+
+    def of_input(self, u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
+        """An input's mean from one sample to the next, so that nothing between them is lost; the
+        first from where the flight begins.
+
+        Args:
+            u: the input (N,), any unit.
+        """
+        summed = np.concatenate([[0.0], np.cumsum(u)])
+        # An input acts from its own sample on: that at the output's sample moves the next one.
+        first = np.maximum(self.rows + 1 - self.every, 0)
+        return (summed[self.rows + 1] - summed[first]) / (self.rows + 1 - first)
+
+
+def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
+    """Where an output was sampled; None where too much of its own samples is missing.
+
+    Args:
+        seen: whether there is one, on the grid.
+    """
+    rows = np.flatnonzero(seen)
+    if rows.size == seen.size:
+        return OwnSamples(rows, 1)
+    if rows.size < 2:
+        return None
+    steps = np.diff(rows)
+    usual = int(np.median(steps))
+    # A clock that is no multiple of the grid's falls on its rows one sooner or later.
+    near = np.abs(steps - usual) <= (0 if usual < _JITTERS else 1)
+    if usual > _MOST or np.mean(near) < _REGULAR:
+        return None
+    return OwnSamples(rows, usual)
+
+
+# What a simulation leaves of each output, which can be asked, and how the unknowns move it.
+
+
+_FLIGHTS = 6
+"""that are looked at, the longest"""
+_DIVERGED = -10.0
+"""VAF of a simulation below which its residual says nothing"""
+_ROUNDING = 1e-5
+"""part of an output's sd below which its residual is no noise"""
+_STEP = 1e-4
+"""of an unknown's coordinate, for differences"""
+
+
+def longest(at: Solution) -> list[int]:
+    """The flights that are looked at, of one sample time: filters are of samples.
+
+    Args:
+        at: where the fit ended.
+    """
+    flights = at.data.flights
+    sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
+    order = np.argsort(sizes, kind="stable")[::-1].tolist()
+    dt = float(flights[order[0]].dt)
+    return sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS])
+
+
+def usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
+    """Whether an output was measured, moves, and is followed by a simulation that stays with it.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+        i: the flight.
+        name: the output.
+    """
+    if name not in at.layout.outputs[i]:
+        return False
+    own = own_of(at, i, name)
+    if own is None:
+        return False
+    y = np.asarray(at.data.flights[i].outputs[name])[own.rows]
+    left = np.asarray(e.raw[i][name])[own.rows]
+    if not (np.isfinite(left).all() and np.std(y) > 0):
+        return False
+    with np.errstate(over="ignore"):
+        size = float(np.std(left) / np.std(y))
+    return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
+
+
+def own_of(at: Solution, i: int, name: str) -> OwnSamples | None:
+    """Where a flight's output was sampled.
+
+    Args:
+        at: where the fit ended.
+        i: the flight.
+        name: the output.
+    """
+    return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
+
+
+def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnSamples]]:
+    """The flights whose residual of an output can be asked, and where it was sampled in each; of
+    one clock, since filters are of samples.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+        name: the output.
+    """
+    flights = [(i, own_of(at, i, name)) for i in longest(at) if usable(at, e, i, name)]
+    samples = [(i, own) for i, own in flights if own is not None]
+    return [(i, own) for i, own in samples if own.every == samples[0][1].every]
+
+
+def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
+    """By flight and output (N, q) the derivative of the residual by all unknowns.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+    """
+    layout, data, noise, z = at
+    if layout.estimator is OUTPUT_ERROR:
+        rows, J = {}, np.asarray(e.J)
+        first = 0
+        for i, n in signals(layout):
+            count = data.flights[i].outputs[n].shape[0]
+            rows[i, n] = J[first : first + count] * float(noise.sd[i][n])
+            first += count
+        return rows
+    # By differences of the simulation, whose program is there: a Jacobian would compile another.
+    z = np.asarray(z)
+    blocks = _blocks(at)
+    common = [np.array([k]) for k in range(layout.first_nuisance)]
+    longest = max((b.size for b in blocks), default=0)
+    # Each flight's own unknowns move at once: none is felt by another flight.
+    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(longest)]
+    before = simulated_outputs(layout, data, jnp.asarray(z))
+    slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
+    step = _STEP if z.dtype == np.float64 else np.sqrt(_STEP)
+    for columns in (*common, *own):
+        there = z.copy()
+        there[columns] += step
+        after = simulated_outputs(layout, data, jnp.asarray(there))
+        for i, n in signals(layout):
+            for k in columns:
+                if k < layout.first_nuisance or k in blocks[i]:
+                    slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
+    return slopes
+
+
+def _blocks(at: Solution) -> list[np.ndarray]:
+    """By flight where in z its own unknowns stand."""
+    layout, first, out = at.layout, at.layout.first_nuisance, []
+    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        size = count * len(layout.states) + layout.constants(outputs)
+        out.append(np.arange(first, first + size))
+        first += size
+    return out
+
+
+# What may drive what a model lacks.
+#
+# The inputs, what is not linear of them and of the response, and what parameters do that change.
+
+
+_PLAY = 0.1
+"""part of an input's range that a linkage's play is asked for with; other plays answer alike"""
+
+
+def moving_inputs(at: Solution) -> list[str]:
+    """The inputs that move in some flight.
+
+    Args:
+        at: where the fit ended.
+    """
+    flights = [naming.asdict(f.inputs) for f in at.data.flights]
+    return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
+
+
+def drives(
+    at: Solution, e: Evaluation, i: int, name: str, moving: Sequence[str]
+) -> Float[np.ndarray, "N d"]:
+    """The inputs that move, then what is not linear of these and of `motions`, and what a linkage
+    with play keeps of the inputs.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+        i: the flight.
+        name: the output.
+        moving: of `moving_inputs`.
+    """
+    inputs = naming.asdict(at.data.flights[i].inputs)
+    u = [_normal(np.asarray(inputs[n])) for n in moving]
+    y = np.asarray(e.simulated[i][name])
+    response = [_normal(v) for v in motions(y)]
+    curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
+    # Friction has a sign and no size.
+    curved += [np.sign(v) for v in response[:2]]
+    # What play takes off hangs on where the stick came from, not on where it is: no power does.
+    return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
+
+
+def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A simulated output (N,), its rate and its integral: a spring that is not linear acts by the
+    angle, of which only the rate may be measured."""
+    return y, np.gradient(y), np.cumsum(y - y.mean())
+
+
+def _behind_play(v: np.ndarray) -> np.ndarray:
+    """Where a signal (N,) takes what follows it with play."""
+    half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, []
+    # A stick that is held for many samples moves at a few of them.
+    begins = np.flatnonzero(np.diff(v, prepend=np.nan))
+    for x in v[begins].tolist():
+        at = min(max(at, x - half), x + half)
+        out.append(at)
+    return np.repeat(out, np.diff(begins, append=v.size))
+
+
+def _normal(v: np.ndarray) -> np.ndarray:
+    v = v - v.mean()
+    size = float(np.std(v))
+    return v / size if size > 0 else v
+
+
+def changing(
+    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: Sequence[int]
+) -> dict[int, np.ndarray]:
+    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
+    one over the flights in their order, and one halfway.
+
+    Args:
+        at: where the fit ended.
+        J: by flight and output (N, q) the derivative of the residual by all unknowns.
+        name: the output.
+        flights: those that are looked at.
+    """
+    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
+    t = np.linspace(-1.0, 1.0, sum(sizes))
+    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
+    return {
+        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
+        for i, s in each
+    }
+
+
+def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
+    """With k further drives a record: what a change of each parameter in that record alone does.
+
+    Args:
+        lines: of each record.
+        k: how many of the unknowns, the first, are parameters.
+    """
+    out = []
+    for i, record in enumerate(lines):
+        more = np.zeros((record.e.size, k * len(lines)), complex)
+        more[:, k * i : k * (i + 1)] = record.J[:, :k]
+        out.append(record._replace(drives=np.concatenate([record.drives, more], axis=1)))
+    return out
+
 
 LAG = "dynamics.residual-follows-input"
 """the code of what answers an input later than the model, or beside it"""

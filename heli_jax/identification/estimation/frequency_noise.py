@@ -1,0 +1,584 @@
+"""The spectra of noise and of gusts, by what a model or the inputs leave of the outputs."""
+
+import functools
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax.identification.estimation.frequency_lines import (
+    Machine,
+    alike,
+    first_machine,
+    machines_of,
+)
+from heli_jax.identification.estimation.frequency_records import lines_of, records_of
+from heli_jax.identification.unknowns.layout import Data, Layout, unpack
+
+# Spectra of records at their own frequencies, smoothed over frequency and over records.
+#
+# Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012), chapter 10.
+
+
+LEAST, PART = 6.0, 0.08
+"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
+part of the frequency. Narrower ones follow the noise itself: intervals are then too narrow"""
+AVERAGES = 2.0 * np.pi**0.5 * LEAST
+"""independent lines of one record in a smoothed spectrum, at least: (sum w)^2 / sum w^2"""
+_ROUNDING = 1e-10
+"""of the mean over all frequencies, below which a spectrum is not taken to fall"""
+_KNOTS = 4.0
+"""in one sd of the Gaussian: between two of them a smoothed spectrum is a straight line to a
+hundredth"""
+
+
+def smoothed(
+    lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART, *, least: float = LEAST
+) -> list[Complex[np.ndarray, "K p p"]]:
+    """By record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
+
+    Args:
+        lines: by record at its own frequencies, those of N samples K = (N - 1) // 2.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
+    """
+    p = lines[0].shape[1]
+    # The half that lies below the diagonal: a spectrum is Hermitian.
+    below = _below(p)
+
+    def half(v: np.ndarray) -> np.ndarray:
+        # Of a session in single precision too: the view is of double numbers.
+        power = np.ascontiguousarray(summed_powers(v)[:, below[0], below[1]], dtype=complex)
+        return power.view(float)
+
+    spectra = {}
+    for K, of_half in _over_lines(lines, half, part, least).items():
+        made, S = of_half.view(complex), np.empty((K, p, p), complex)
+        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(made), made
+        own = np.einsum("kii->ki", S)
+        own += _ROUNDING * np.mean(np.real(own), axis=0)
+        spectra[K] = S
+    return [spectra[len(v)] for v in lines]
+
+
+def smoothed_with(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+    others: Sequence[Complex[np.ndarray, "K r"]],
+    part: float = PART,
+) -> list[Complex[np.ndarray, "K p r"]]:
+    """By record the cross-spectrum E e r^H with other signals, smoothed likewise.
+
+    Args:
+        lines: by record at its own frequencies.
+        others: the other signals, likewise.
+        part: sd of the Gaussian as a part of the frequency.
+    """
+    p, r = lines[0].shape[1], others[0].shape[1]
+
+    def products(v: np.ndarray) -> np.ndarray:
+        made = v[:, :, :p].transpose(1, 2, 0) @ np.conj(v[:, :, p:].transpose(1, 0, 2))
+        return np.ascontiguousarray(made.reshape(len(made), -1), dtype=complex).view(float)
+
+    both = [np.concatenate(v, axis=1) for v in zip(lines, others, strict=True)]
+    made = _over_lines(both, products, part, LEAST)
+    spectra = {K: v.view(complex).reshape(K, p, r) for K, v in made.items()}
+    return [spectra[len(v)] for v in lines]
+
+
+@functools.cache
+def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.tril_indices(p)
+
+
+def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
+    """The sum of e e^H over records.
+
+    Args:
+        v: at the lines of records of one length.
+    """
+    at_line = v.transpose(1, 2, 0)
+    return at_line @ np.conj(at_line.transpose(0, 2, 1))
+
+
+def _over_lines(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+    numbers: Callable[[Complex[np.ndarray, "f K p"]], Float[np.ndarray, "K m"]],
+    part: float,
+    least: float,
+) -> dict[int, Float[np.ndarray, "K m"]]:
+    """By length of the record the mean of some powers, smoothed over frequency.
+
+    Args:
+        lines: by record.
+        numbers: of records of one length the sum of these powers.
+        part: as that of `smoothed`.
+        least: likewise.
+    """
+    # Records of one length have one spectrum and one kernel: their powers are added first.
+    of_length = {len(v): [w for w in lines if len(w) == len(v)] for v in lines}
+    sums = {K: numbers(np.stack(v)) for K, v in of_length.items()}
+    made = {}
+    for K in sums:
+        _, (low, share) = knots_of(K, part, least)
+        total, weight = 0.0, 0.0
+        for other, power in sums.items():
+            kernel, of_one = _kernel(K, other, part, least)
+            total = total + kernel @ power
+            weight = weight + len(of_length[other]) * of_one
+        at_knots = total / np.asarray(weight)[:, None]
+        made[K] = at_knots[low] + share[:, None] * np.diff(at_knots, axis=0)[low]
+    return made
+
+
+def whitening_alone(
+    lines: Sequence[Complex[np.ndarray, "K p"]],
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record what makes white each signal by itself, with nothing of what they share.
+
+    Args:
+        lines: by record at its own frequencies.
+
+    Raises:
+        numpy.linalg.LinAlgError: a signal is zero throughout.
+    """
+
+    def own(v: np.ndarray) -> np.ndarray:
+        return np.sum(np.real(v) ** 2 + np.imag(v) ** 2, axis=0)
+
+    made = {}
+    # Flights held out may have other outputs.
+    for p in {v.shape[1] for v in lines}:
+        alike = [v for v in lines if v.shape[1] == p]
+        for K, power in _over_lines(alike, own, PART, LEAST).items():
+            root = _positive(power + _ROUNDING * np.mean(power, axis=0)) ** -0.5
+            made[K, p] = root[:, :, None] * np.eye(p, dtype=complex)
+    return tuple(made[v.shape] for v in lines)
+
+
+@functools.lru_cache(maxsize=32)
+def knots_of(
+    K: int, part: float = PART, least: float = LEAST
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
+    and how far it is on the way to the next.
+
+    Args:
+        K: lines.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
+    """
+    knots = [0]
+    while knots[-1] < K - 1:
+        width = max(least, part * (knots[-1] + 1))
+        knots.append(min(knots[-1] + max(1, int(width / _KNOTS)), K - 1))
+    at = np.array(knots if K > 1 else [0, 0])
+    low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
+    share = (np.arange(K) - at[low]) / np.maximum(at[low + 1] - at[low], 1)
+    return at, (low, share)
+
+
+@functools.lru_cache(maxsize=32)
+def _kernel(
+    K: int, other: int, part: float, least: float
+) -> tuple[Float[np.ndarray, "knots other"], Float[np.ndarray, " knots"]]:
+    """Weights that the lines of a record of `other` lines have at the knots of one of K, and their
+    sums."""
+    # In parts of the rate, which all records have in common.
+    f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
+    g = first * np.arange(1, other + 1)
+    width = np.maximum(least * first, part * f)
+    kernel = np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
+    return kernel, kernel.sum(axis=1)
+
+
+@functools.lru_cache(maxsize=32)
+def averages(
+    K: int, counts: tuple[tuple[int, int], ...], part: float = PART, least: float = LEAST
+) -> Float[np.ndarray, " K"]:
+    """Independent lines in a smoothed spectrum of K lines: (sum w)^2 / sum w^2.
+
+    Args:
+        K: lines of the record.
+        counts: lines of a record and how many there are of them, for each length.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
+    """
+    at, _ = knots_of(K, part, least)
+    kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
+    total = sum(n * of_one for n, _, of_one in kernels)
+    squares = sum(n * np.sum(w**2, axis=1) for n, w, _ in kernels)
+    return np.interp(np.arange(K), at, total**2 / squares)
+
+
+def whitening_of(
+    spectra: Iterable[Complex[np.ndarray, "K p p"]],
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record L^-1, where S = L L^H: L^-1 e is white."""
+    # Records of one length share their spectrum.
+    spectra = tuple(spectra)
+    made = {id(S): S for S in spectra}
+    made = {key: inverse_roots(S) for key, S in made.items()}
+    return tuple(made[id(S)] for S in spectra)
+
+
+def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
+    """L^-1, where S = L L^H.
+
+    Raises:
+        numpy.linalg.LinAlgError: one is not positive definite.
+    """
+    # Written out over the lines: for each matrix a routine would be called that takes longer to
+    # call.
+    p, at = S.shape[1], np.ascontiguousarray(S.transpose(1, 2, 0))
+    L, W = np.zeros_like(at), np.zeros_like(at)
+    for i in range(p):
+        left = np.real(at[i, i])
+        for j in range(i):
+            inner = sum((L[i, m] * np.conj(L[j, m]) for m in range(j)), start=0.0)
+            L[i, j] = np.real(W[j, j]) * (at[i, j] - inner)
+            left = left - np.real(L[i, j]) ** 2 - np.imag(L[i, j]) ** 2
+        W[i, i] = root = _positive(left) ** -0.5
+        for j in range(i):
+            W[i, j] = -root * sum((L[i, m] * W[m, j] for m in range(j, i)), start=0.0)
+    return np.ascontiguousarray(W.transpose(2, 0, 1))
+
+
+def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    if not (values > 0).all():
+        raise np.linalg.LinAlgError("a spectrum is not positive definite")
+    return values
+
+
+def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
+    """log |det W| of what makes noise white: products of triangles, whose diagonals say it.
+
+    Args:
+        W: lower triangular.
+    """
+    return np.sum(np.log(np.abs(np.diagonal(W, axis1=1, axis2=2))), axis=1)
+
+
+# The noise's spectrum by what the machine makes of gusts, and a mean over lines of what is left.
+#
+# Gusts come out of a machine with its integrations and modes in them: outputs that are coherent
+# with a gain that changes from line to line. A mean over lines makes something else of that,
+# estimates lose most of what the record tells, and intervals are too narrow. So the spectrum is
+# first described as
+#
+# $$S_0 = \sum_i h_i\, q_i\, h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
+#
+# with a gust at every state whose spectrum $q_i \ge 0$ falls with frequency somehow, and white
+# noise of each output in R. The errors, whitened by $S_0$, have a spectrum that is nearly flat, and
+# the mean over lines is taken of that: it may be wide, and corrects whatever the description lacks.
+#
+# A spectrum from n averages of p outputs weighs by $n / (n - p)$ too much, and the estimate is by
+# about the same worse than with the true one: both are allowed for.
+#
+# Sources: Blackman and Tukey (1958) for prewhitening; Sawada, Kameoka, Araki and Ueda (2013) for
+# the multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, for weights that
+# are estimated.
+
+
+GUST_LEAST, GUST_PART = 12.0, 0.12
+"""sd of the Gaussian that smooths what is left: lines at least, and as a part of the frequency"""
+_CELLS = 0.16, 6.0
+"""the same of what the description rests on: each line by itself up to the fiftieth, since slow
+modes are no wider, and from there on 4 % of the frequency"""
+_OCTAVES = 2
+"""from one corner of the gusts' spectra to the next"""
+_STEPS = 24
+"""towards the largest likelihood: what they leave is for the mean over lines"""
+_NOTHING = 1e-9
+"""of an output's power, below which none of it is noise"""
+_UNSEEN = 1e-10
+"""part of the largest effect of a state below which outputs do not show one"""
+
+
+@eqx.filter_jit
+def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
+    """That of the first flight: records of one length share a spectrum.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
+    members = alike(layout, data)[0]
+    return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
+
+
+def whitening_by(
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], part: float = 1.0
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record what makes its errors white; of records of one length the same array.
+
+    Args:
+        machine: that gusts come through.
+        errors: by record at its own frequencies.
+        part: of those, from the lowest, that they are at.
+    """
+    size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
+    size = np.where(size > 0, size, 1.0)
+    scaled = [e / size for e in errors]
+    before = _before(machine, scaled, size, part)
+    left = smoothed(
+        [np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], GUST_PART, least=GUST_LEAST
+    )
+    counts = tuple(Counter(len(e) for e in errors).items())
+    p, made = errors[0].shape[1], {}
+    for e, W in zip(errors, whitening_of(left), strict=True):
+        K = len(e)
+        if K not in made:
+            n = np.maximum(averages(K, counts, GUST_PART, GUST_LEAST), p + 1.0)
+            made[K] = ((n - p) / n)[:, None, None] * (W @ before[K]) / size[None, None, :]
+    return tuple(made[len(e)] for e in errors)
+
+
+class _Cells(NamedTuple):
+    """Lines that are taken together, of records of every length."""
+
+    f: Float[np.ndarray, " c"]
+    """in cycles a sample"""
+    H: Complex[np.ndarray, "c p n"]
+    power: Complex[np.ndarray, "c p p"]
+    """mean of e e^H"""
+    lines: Float[np.ndarray, " c"]
+
+
+def _before(
+    machine: Machine,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    size: Float[np.ndarray, " p"],
+    part: float,
+) -> dict[int, Complex[np.ndarray, "K p p"]]:
+    """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
+    p = errors[0].shape[1]
+    lengths = dict.fromkeys(len(e) for e in errors)
+    flat = {K: np.broadcast_to(np.eye(p, dtype=complex), (K, p, p)) for K in lengths}
+    with np.errstate(all="ignore"):
+        of_length = {K: [e for e in errors if len(e) == K] for K in lengths}
+        at = {K: _cells(machine, of_length[K], size, part) for K in lengths}
+        cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
+        corners = corners_of(cells.f)
+        # A line on a mode that does not decay has no finite response.
+        cells = _Cells(*(v[np.isfinite(cells.H).all((1, 2))] for v in cells))
+        if not cells.f.size:
+            return flat
+        parameters = _described(cells, corners)
+    if not all(np.isfinite(v).all() for v in parameters):
+        return flat
+    q, r = parameters
+    made = {}
+    for K, of in at.items():
+        S0 = _spectrum(np.nan_to_num(of.H), q @ shapes_of(of.f, corners), r)
+        root = inverse_roots(S0)
+        _, (low, share) = knots_of(K, *_CELLS)
+        made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
+    return made
+
+
+def _cells(
+    machine: Machine,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    size: Float[np.ndarray, " p"],
+    part: float,
+) -> _Cells:
+    """A cell around each knot of records of one length."""
+    K = len(errors[0])
+    at, _ = knots_of(K, *_CELLS)
+    edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
+    power = summed_powers(np.stack(errors)) / len(errors)
+    count = np.diff(np.append(edges, K)).astype(float)
+    power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
+    f = part * (at + 1) / (2 * K + 1)
+    Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
+    n = len(Ad)
+    z = np.exp(2j * np.pi * f)[:, None, None]
+    H = (C / size[:, None]) @ np.linalg.inv(z * np.eye(n) - Ad)
+    # What rounding leaves of a state that no output shows would pass for the way of a huge gust,
+    # and the spectrum would jump with the last digit of the parameters.
+    effects = np.max(np.where(np.isfinite(H), np.abs(H), 0.0), axis=(0, 1))
+    seen = effects > _UNSEEN * np.max(effects)
+    return _Cells(f, np.where(seen, H, 0.0), power, count * len(errors))
+
+
+def corners_of(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
+    """Of first-order lags, from half of the rate down to the lowest of some frequencies.
+
+    Args:
+        f: in cycles a sample.
+    """
+    first, last = float(np.min(f)), 0.5
+    return last * 0.5 ** np.arange(1.0, np.log2(last / first), _OCTAVES)
+
+
+def shapes_of(
+    f: Float[np.ndarray, " c"], corners: Float[np.ndarray, " b"]
+) -> Float[np.ndarray, "b1 c"]:
+    """Spectra that a gust's is a sum of: a white one and first-order lags.
+
+    Args:
+        f: in cycles a sample.
+        corners: of the lags.
+    """
+    return np.concatenate([np.ones((1, f.size)), 1.0 / (1.0 + (f / corners[:, None]) ** 2)])
+
+
+def _spectrum(
+    H: Complex[np.ndarray, "c p n"], Q: Float[np.ndarray, "n c"], r: Float[np.ndarray, " p"]
+) -> Complex[np.ndarray, "c p p"]:
+    return (H * Q.T[:, None, :]) @ np.conj(np.swapaxes(H, 1, 2)) + np.diag(r)
+
+
+def _described(
+    cells: _Cells, corners: Float[np.ndarray, " b"]
+) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
+    """Powers of the gusts, by state and shape, and of the outputs' own noise."""
+    h = np.swapaxes(cells.H, 1, 2)
+    ways = h[:, :, :, None] * np.conj(h[:, :, None, :])
+    return powers_of(ways, shapes_of(cells.f, corners), cells.power, cells.lines)
+
+
+def powers_of(
+    ways: Complex[np.ndarray, "c n p p"],
+    shapes: Float[np.ndarray, "b1 c"],
+    power: Complex[np.ndarray, "c p p"],
+    lines: Float[np.ndarray, " c"],
+) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
+    """Powers of gusts, by state and shape, and of the outputs' own white noise, that are the most
+    likely for complex normal errors.
+
+    Args:
+        ways: by cell and state what a gust of power 1 at the state makes of the outputs.
+        shapes: spectra that a gust's is a sum of; the first is white.
+        power: by cell the mean of e e^H.
+        lines: in each cell.
+    """
+    own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
+    gains = np.swapaxes(gains, 1, 2)
+    # To begin with as much as the output that shows least of a state leaves room for.
+    room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
+    room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
+    c, n, p, _ = ways.shape
+    # An output's own noise comes by a way that leads to it alone, and is white: the first shape.
+    powers = np.zeros((len(shapes), n + p))
+    powers[:, :n], least = room / len(shapes), np.zeros_like(powers)
+    powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
+    alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
+    ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
+    by_shape, told = shapes * lines, (_told_by_one if p == 1 else _told_by_several)(ways, power)
+    # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
+    # a third more in the interval of If.
+    for _ in range(_STEPS):
+        # Without the root that would make sure that each step gains: half as many are enough.
+        of_ways = (by_shape @ told(shapes.T @ powers)).reshape(-1, 2, n + p)
+        shown, due = of_ways[:, 0], of_ways[:, 1]
+        powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
+    return powers[:, :n].T, powers[0, n:]
+
+
+_Told = Callable[[Float[np.ndarray, "c m"]], Float[np.ndarray, "c 2m"]]
+"""by cell and way what of it the errors show, and what they should, of the ways' powers"""
+
+
+def _told_by_several(
+    ways: Complex[np.ndarray, "c m p p"], power: Complex[np.ndarray, "c p p"]
+) -> _Told:
+    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
+    # then products of real matrices.
+    c, m, p, _ = ways.shape
+    ways = np.ascontiguousarray(ways.reshape(c, m, -1), complex).view(float)
+    by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
+
+    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
+        inverse = np.linalg.inv((powers[:, None, :] @ ways).view(complex).reshape(c, p, p))
+        matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
+        return (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
+
+    return told
+
+
+def _told_by_one(
+    ways: Complex[np.ndarray, "c m 1 1"], power: Complex[np.ndarray, "c 1 1"]
+) -> _Told:
+    # Of one output they are numbers, and real ones.
+    ways, power = np.real(ways[:, :, 0, 0]), np.real(power[:, :, 0])
+
+    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
+        over = 1.0 / np.sum(powers * ways, axis=1, keepdims=True)
+        of_ways = ways * over
+        return np.concatenate([of_ways * (power * over), of_ways], axis=1)
+
+    return told
+
+
+_ALONE = 1e-9
+"""of the inputs' power, below which two of them move as one, and of the outputs', below which
+nothing is left"""
+
+
+# The noise's spectrum before any model: what the inputs leave of the outputs, line by line.
+#
+# Source: Brillinger, Time Series (1981), chapter 8, for regression of spectra; Pintelon and
+# Schoukens (2012), chapter 7, for the ends of a record as a smooth function of the frequency beside
+# them.
+
+
+def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...] | None:
+    """By record what makes white (K, p, p) that which no response to the inputs explains.
+
+    None where there are too few lines to tell. In a closed loop it is too small where feedback
+    moves the inputs more than the excitation does.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+    """
+    flights = jax.device_get(data.flights)
+    lines = []
+    for record in records_of(layout):
+        flight = flights[record.flight]
+        outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
+        signals = np.stack([*outputs, *flight.inputs], axis=1)[record.first : record.last]
+        lines.append(lines_of(signals))
+    p = len(layout.outputs[0])
+    powers = np.sum([np.sum(np.abs(v) ** 2, axis=0) for v in lines], axis=0)
+    moving = p + np.flatnonzero(powers[p:] > 0)
+    # A response changes over the lines that a spectrum is smoothed over, a mode's by much.
+    order = next((q for q in (2, 1) if (q + 1) * (moving.size + 1) <= 0.5 * AVERAGES), 0)
+    # What the ends of a record add is smooth over the lines around: a constant beside the inputs.
+    size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
+    lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
+    counts = tuple(sorted({len(v): sum(len(w) == len(v) for w in lines) for v in lines}.items()))
+    spectra = smoothed(lines)
+    left = {}
+    for S in spectra:
+        if id(S) in left:
+            continue
+        n, regressors = averages(len(S), counts), S.shape[1] - p
+        if np.min(n) <= regressors + p:
+            return None
+        left[id(S)] = _left(S, p) * (n / (n - regressors))[:, None, None]
+    return whitening_of(left[id(S)] for S in spectra)
+
+
+def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:
+    """Inputs (K, m) and a constant, times powers of the frequency up to an order: locally a
+    response that is a polynomial of it."""
+    beside = np.column_stack([inputs, np.full(len(inputs), size)])
+    f = np.arange(1, len(inputs) + 1)[:, None] / len(inputs)
+    return [beside * f**q for q in range(order + 1)]
+
+
+def _left(S: np.ndarray, p: int) -> np.ndarray:
+    """Spectra (K, p, p) of the first p signals without what the others explain."""
+    size = np.sqrt(np.real(np.einsum("kii->ki", S)))
+    R = S / (size[:, :, None] * size[:, None, :])
+    others = R[:, p:, p:] + _ALONE * np.eye(S.shape[1] - p)
+    rest = R[:, :p, :p] - R[:, :p, p:] @ np.linalg.solve(others, R[:, p:, :p])
+    rest = 0.5 * (rest + np.conj(np.swapaxes(rest, 1, 2))) + _ALONE * np.eye(p)
+    return rest * size[:, :p, None] * size[:, None, :p]
