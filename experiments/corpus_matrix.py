@@ -42,17 +42,17 @@ def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
 
 ABLATIONS: tuple[Ablation, ...] = (
     Ablation(
-        "noisy_scales", f"{_IDENTIFICATION}.estimation.noisy_scales:free_scales", lambda *_: ()
+        "noisy_scales", f"{_IDENTIFICATION}.estimation.noise_scales:free_scales", lambda *_: ()
     ),
     Ablation(
         "restricted_likelihood",
-        f"{_IDENTIFICATION}.estimation.restricted_likelihood:with_own_noise",
+        f"{_IDENTIFICATION}.estimation.noise_scales:with_own_noise",
         lambda problem, noise: noise,
     ),
     Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
     Ablation(
         "likelier_hold",
-        f"{_IDENTIFICATION}.likelier_hold:with_likelier_hold",
+        f"{_IDENTIFICATION}.model_selection:with_likelier_hold",
         lambda problem, fit, refit: (problem, fit),
     ),
     Ablation(
@@ -68,10 +68,10 @@ ABLATIONS: tuple[Ablation, ...] = (
     ),
     Ablation(
         "swapped_modes",
-        f"{_IDENTIFICATION}.identifiability.swapped_modes:second_solutions",
+        f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",
         lambda *_, **__: (),
     ),
-    Ablation("valley", f"{_IDENTIFICATION}.identifiability.valley:Valley.tied", _untied),
+    Ablation("valley", f"{_IDENTIFICATION}.identifiability.equivalents:Valley.tied", _untied),
 )
 
 
