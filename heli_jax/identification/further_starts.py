@@ -68,12 +68,8 @@ def further_starts(
         return drawn
     row = np.array(z0, np.float64)
     for i, (name, free) in enumerate(problem.free.items()):
-        value, (low, high) = guess.values[name].value, transforms.limits(free)
-        if np.isfinite(value) and transforms.inside(free, float(value)):
-            scale = transforms.sign_or_scale(free)
-            row[i] = float(transforms.to_coordinate(layout.kinds[i], value, scale, low, high))
-    if not np.isfinite(row).all():
-        return drawn
+        z = transforms.coordinate(free, layout.kinds[i], guess.values[name].value)
+        row[i] = row[i] if z is None else z
     return jnp.concatenate([jnp.asarray(row[None, :], z0.dtype), drawn])
 
 

@@ -82,7 +82,10 @@ class Valley(NamedTuple):
         layout = self.at.layout
         names, z = layout.of_interest, np.array(self.at.z, np.float64)
         for name, value in {**guess, **held}.items():
-            at = self._coordinate(name, value)
+            at = value
+            if name in layout.free:
+                kind = layout.kinds[layout.free.index(name)]
+                at = transforms.coordinate(self.problem.free[name], kind, value)
             if at is None:
                 return None
             z[names.index(name)] = at
@@ -167,18 +170,6 @@ class Valley(NamedTuple):
                         points.append(point.values)
                         break
             yield points
-
-    def _coordinate(self, name: str, value: float) -> float | None:
-        layout, data = self.at.layout, self.at.data
-        if name not in layout.free:
-            return value
-        i = layout.free.index(name)
-        if not transforms.inside(self.problem.free[name], value):
-            return None
-        # From NumPy: to index an array of JAX's is a program of its own to load.
-        limits = tuple(np.asarray(of)[i] for of in (data.sign, data.low, data.high))
-        z = float(transforms.to_coordinate(layout.kinds[i], value, *limits))
-        return z if math.isfinite(z) else None
 
     def _at(self, z: np.ndarray) -> Evaluation:
         layout, data, noise, z0 = self.at
@@ -303,26 +294,28 @@ def second_solutions(
         optimum: whether it is one, about which the other unknowns may follow.
     """
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
-    names = [n for n in problem.free if n in values]
+    values = {n: values[n] for n in problem.free if n in values}
     finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
-    if len(names) < 2 or not (finite and all(math.isfinite(values[n]) for n in names)):
+    if len(values) < 2 or not (finite and all(map(math.isfinite, values.values()))):
         return ()
+    family, others = _same_responses(problem, values)
+    valley = Valley(problem, at, e)
+    solutions = (_as_good(valley, family, z, optimum) for z in others)
+    return tuple(one for one in solutions if one is not None)
+
+
+def _same_responses(
+    problem: Problem, values: Mapping[str, float]
+) -> tuple["_Family", list[np.ndarray]]:
+    """The linearised model about these values, and coordinates at which it answers about alike."""
+    others: list[np.ndarray] = []
     with np.errstate(all="ignore"):
-        family = _Family(problem, values, names)
-        starts = _starts(family)
-        if not starts:
-            return ()
-        others: list[np.ndarray] = []
-        for start in starts:
-            z = _same_responses(family, start)
+        family = _Family(problem, values, list(values))
+        for start in _starts(family):
+            z = _led_to(family, start)
             if z is not None and not any(np.allclose(z, other, atol=0.02) for other in others):
                 others.append(z)
-    valley, solutions = Valley(problem, at, e), []
-    for z in others:
-        one = _as_good(valley, family, z, optimum)
-        if one is not None:
-            solutions.append(one)
-    return tuple(solutions)
+    return family, others
 
 
 def _responses_of(
@@ -343,7 +336,7 @@ def _responses_of(
 class _Family:
     """The linearised model by coordinates of its free parameters, zero where they are here."""
 
-    def __init__(self, problem: Problem, values: dict[str, float], names: list[str]) -> None:
+    def __init__(self, problem: Problem, values: Mapping[str, float], names: list[str]) -> None:
         self.problem, self.values, self.names = problem, values, names
         flight = problem.training[0]
         self.known = flight.known
@@ -383,6 +376,11 @@ class _Family:
         here = np.array([self.values[n] for n in self.names])
         moved = np.where(self.log, here * np.exp(np.where(self.log, z, 0.0)), here + z * self.size)
         return dict(zip(self.names, map(float, moved), strict=True))
+
+    def admits(self, z: np.ndarray) -> bool:
+        """True where all values lie within their bounds."""
+        free = self.problem.free
+        return all(transforms.inside(free[n], v) for n, v in self.by_name(z).items())
 
     def _at(self, z: np.ndarray):  # a record of the model's Params
         return self.problem.params_with(self.known | self.by_name(z))
@@ -475,7 +473,7 @@ def _slope(family: _Family, here: np.ndarray, step: np.ndarray) -> np.ndarray:
     return np.real(ratio - 1.0) / float(np.sum(step))
 
 
-def _same_responses(family: _Family, start: np.ndarray) -> np.ndarray | None:
+def _led_to(family: _Family, start: np.ndarray) -> np.ndarray | None:
     """Coordinates near a start at which the responses are those at zero; None where there are none,
     or where the way led back."""
     z = _least(family.differences, start)
@@ -525,11 +523,8 @@ def _as_good(
         # Of rows that are sums over frequencies none stays: there the responses have to be the same
         # to rounding, with nothing else that could tell.
         values = family.by_name(z)
-        free = family.problem.free
-        if not family.apart(z) < _EQUAL or not all(
-            transforms.inside(free[n], v) and (free[n].prior is None or z[i] == 0.0)
-            for i, (n, v) in enumerate(values.items())
-        ):
+        held = [i for i, n in enumerate(family.names) if family.problem.free[n].prior is not None]
+        if not (family.apart(z) < _EQUAL and family.admits(z) and np.all(z[held] == 0.0)):
             return None
     here = family.values
     changed = tuple(

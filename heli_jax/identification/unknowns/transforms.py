@@ -94,6 +94,20 @@ def inside(free: Free, value: float) -> bool:
     return bool(low <= value <= high)
 
 
+def coordinate(free: Free, kind: str, value: float) -> float | None:
+    """The coordinate of a value; None where it lies outside the bounds, or has none.
+
+    Args:
+        free: with the bounds.
+        kind: one of `KINDS`.
+        value: in the parameter's unit.
+    """
+    if not inside(free, value):
+        return None
+    z = float(to_coordinate(kind, value, sign_or_scale(free), *limits(free)))
+    return z if math.isfinite(z) else None
+
+
 def at_bound(free: Free, value: float) -> bool:
     """Whether an estimate ended at a bound that was stated.
 
