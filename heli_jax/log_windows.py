@@ -15,7 +15,7 @@ from heli_jax.finding import note
 from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.record_windows import (
     DETERMINES,

@@ -10,8 +10,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import directions
 from heli_jax.identification.result import Signals
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Layout
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.metrics import (
     NO_METRICS,
     Metrics,

@@ -17,14 +17,13 @@ from heli_jax.identification.agreement import (
     signals_of,
     whiteness_of,
 )
-from heli_jax.identification.estimation.arrival import unless_stuck
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
-from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum, unless_stuck
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes, open_directions
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -37,9 +36,8 @@ from heli_jax.identification.uncertainty.estimates import (
     with_limits,
 )
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, scales_of
-from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
     Adequacy,
@@ -52,6 +50,7 @@ from heli_jax.identification.validation.adequacy import (
 from heli_jax.identification.validation.advice import Record, is_unstable
 from heli_jax.identification.validation.aliases import (
     FastMode,
+    aliasing,
     as_good_as_aliases,
     fast_modes,
     measurement_noise,
@@ -496,7 +495,7 @@ def assemble(
         ),
         *(open_directions(run.before, errors.verdict) if astray else ()),
         *limit_notes(errors.limits),
-        *excitation.aliasing(fast),
+        *aliasing(fast),
         *judged.findings,
         *held.findings,
     ]

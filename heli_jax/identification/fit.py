@@ -48,7 +48,7 @@ from heli_jax.identification.identifiability.through_inputs import of_disturbanc
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
-from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
@@ -57,8 +57,7 @@ from heli_jax.identification.unknowns.layout import (
     layout_of,
     scales_of,
 )
-from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.aliases import excitation_notes
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
 from heli_jax.identification.validation.expected_accuracy import (
@@ -171,7 +170,7 @@ def check(problem: Problem) -> Check:
     verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
-    notes = [*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd)]
+    notes = [*cautions(problem), *excitation_notes(problem, runs, guess.noise.sd)]
     feedback = feedback_of(problem)
     notes += feedback_notes(problem, feedback)
     # A parameter that is not identifiable moves by any amount, with another hold too.

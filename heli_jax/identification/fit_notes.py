@@ -22,8 +22,8 @@ from heli_jax.identification.uncertainty.estimates import (
     prior_findings,
     stated_noise_notes,
 )
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Layout, Solution
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.other_hold import other_hold
 
 STOPPED = "search.stopped"

@@ -14,7 +14,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.excitation import ALIASED
+from heli_jax.identification.validation.aliases import ALIASED
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
 from heli_jax.identification.validation.logging_rate import LOGGING_RATE

@@ -8,7 +8,7 @@ import pytest
 
 from heli_jax import Free, Problem, fit
 from heli_jax.identification.estimation import multistart
-from heli_jax.identification.estimation.arrival import gain_left
+from heli_jax.identification.estimation.noise_covariance import gain_left
 from heli_jax.identification.fit_notes import open_directions
 from tests.identification.test_equation_error import ROLL, Params, record
 

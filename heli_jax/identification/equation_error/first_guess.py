@@ -4,6 +4,13 @@ from typing import Literal, NamedTuple
 
 from heli_jax.identification.equation_error.regression import Selection
 
+# The limit of a stepwise regression; in a file of its own, since a configuration states it too.
+
+
+F_ENTER = 20.0
+"""five times the 5 % point of F (Klein and Morelli): terms below it hardly help to predict"""
+
+
 Origin = Literal["equation error", "frequency error", "as stated", "vehicle", "not selected"]
 
 

@@ -9,7 +9,6 @@ from heli_jax.dynamics.model import Disturbance
 from heli_jax.finding import note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.multistart import (
     Search,
     finer_noise_guess,
@@ -23,6 +22,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relaxed_from,
 )
+from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.unknowns.layout import (
     Layout,
     Solution,

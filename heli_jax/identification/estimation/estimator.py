@@ -18,14 +18,14 @@ from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.measured_signals import (
+from heli_jax.identification.estimation.optimiser_step import Nearing
+from heli_jax.identification.estimation.simulated_flights import (
+    Run,
     least_noise,
     measured_count,
     signal_numbers,
     signals,
 )
-from heli_jax.identification.estimation.optimiser_step import Nearing
-from heli_jax.identification.estimation.simulated_flights import Run
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 

@@ -31,12 +31,6 @@ from heli_jax.identification.estimation.kalman import (
     filter_of,
     innovations,
 )
-from heli_jax.identification.estimation.measured_signals import (
-    measured_count,
-    measured_signals,
-    measurement_sd,
-    signals,
-)
 from heli_jax.identification.estimation.noise_scales import (
     free_scales,
     not_attenuating,
@@ -48,8 +42,16 @@ from heli_jax.identification.estimation.noise_scales import (
     with_own_noise,
 )
 from heli_jax.identification.estimation.shared_covariance import innovations_together
-from heli_jax.identification.estimation.simulated_flights import Drive, driven
+from heli_jax.identification.estimation.simulated_flights import (
+    Drive,
+    driven,
+    measured_count,
+    measured_signals,
+    measurement_sd,
+    signals,
+)
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
@@ -59,7 +61,6 @@ from heli_jax.identification.unknowns.layout import (
     scales_of,
     unpack,
 )
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.numerics.white_noise import highest_frequency, without_noise
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate

@@ -37,7 +37,6 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.measured_signals import least_noise, signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
@@ -48,7 +47,13 @@ from heli_jax.identification.estimation.response_weights import (
     outputs_that_forget,
     weighed,
 )
-from heli_jax.identification.estimation.simulated_flights import driven, simulated_at, with_biases
+from heli_jax.identification.estimation.simulated_flights import (
+    driven,
+    least_noise,
+    signals,
+    simulated_at,
+    with_biases,
+)
 from heli_jax.identification.estimation.window_errors import (
     errors_in_windows,
     rows_of_responses,

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import stages
-from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.optimiser_step import (
     SINGLE,
     Compiled,
@@ -30,6 +29,7 @@ from heli_jax.identification.estimation.optimiser_step import (
     trusted_columns,
 )
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
+from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 from heli_jax.numerics.jitted import jitted
 

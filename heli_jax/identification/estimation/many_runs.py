@@ -20,7 +20,6 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     descend,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.measured_signals import measured_counts
 from heli_jax.identification.estimation.optimiser_step import (
     BATCHED,
     Scaling,
@@ -30,7 +29,7 @@ from heli_jax.identification.estimation.optimiser_step import (
 )
 from heli_jax.identification.estimation.output_error import OutputError
 from heli_jax.identification.estimation.residual import differentiate, prior_rows, weak_rows
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import driven, measured_counts
 from heli_jax.identification.unknowns.layout import (
     Data,
     FlightData,

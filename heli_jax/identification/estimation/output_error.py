@@ -11,8 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from heli_jax.identification.estimation.estimator import Estimator, Residuals
-from heli_jax.identification.estimation.measured_signals import measured_signals, signal_numbers
-from heli_jax.identification.estimation.simulated_flights import Run, joined_biases, predict
+from heli_jax.identification.estimation.simulated_flights import (
+    Run,
+    joined_biases,
+    measured_signals,
+    predict,
+    signal_numbers,
+)
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
 

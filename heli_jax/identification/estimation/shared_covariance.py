@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import Innovations, first_covariance
-from heli_jax.identification.estimation.measured_signals import measurement_sd
-from heli_jax.identification.estimation.simulated_flights import Drive, driven
+from heli_jax.identification.estimation.simulated_flights import Drive, driven, measurement_sd
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import between_samples

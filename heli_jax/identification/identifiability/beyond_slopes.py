@@ -27,8 +27,8 @@ from heli_jax.identification.identifiability.sensitivity import unknowns_of, ver
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.initial_guess import weak_unknowns
 from heli_jax.identification.unknowns.layout import Solution, value_of
-from heli_jax.identification.unknowns.nuisances import weak_unknowns
 
 # Where the likelihood along one parameter ends an interval: all others at their best.
 #

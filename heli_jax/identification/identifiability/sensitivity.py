@@ -25,8 +25,8 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.initial_guess import WeakUnknown, can_be_off, weak_unknowns
 from heli_jax.identification.unknowns.layout import Layout
-from heli_jax.identification.unknowns.nuisances import WeakUnknown, can_be_off, weak_unknowns
 
 _NEAR_ZERO = 1e-2
 """part of a parameter's size below which it takes no part in products of powers"""

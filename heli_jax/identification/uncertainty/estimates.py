@@ -12,12 +12,13 @@ from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import combined_deviations, deviations, evaluate
 from heli_jax.identification.estimation.filter_error import innovation_sums
-from heli_jax.identification.estimation.measured_signals import measured_count
+from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.identifiability.sensitivity import references_of, unknowns_of
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
@@ -25,7 +26,6 @@ from heli_jax.identification.unknowns.layout import (
     disturbance_limits,
     unpack,
 )
-from heli_jax.identification.unknowns.nuisances import labels
 
 # How well the sizes of noises are known, where all are told relative to a small one.
 #

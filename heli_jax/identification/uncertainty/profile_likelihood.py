@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.many_runs import optimise_many
-from heli_jax.identification.estimation.measured_signals import measured_count
+from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Solution, value_of

@@ -1,6 +1,6 @@
-"""Where a fit starts: the unknowns at the values that the problem and its records suggest."""
+"""Initial states, biases and offsets: which there are, their names, and where z begins."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,68 @@ from heli_jax import naming
 from heli_jax.analysis.trim import is_full_nonlinear, trim
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, FlightData, Layout
+
+# What the nuisance unknowns are called: initial states, biases, input offsets of every flight.
+
+
+class WeakUnknown(NamedTuple):
+    """An unknown of one flight that has a weak prior of ten times the signal."""
+
+    label: str
+    """as the fit names it: 'flight 1/bias p'"""
+    kind: str
+    """the switch in `Nuisance` that it belongs to"""
+    words: str
+    """as a sentence names it, whichever flight it belongs to: 'the bias of p'"""
+
+
+def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
+    """The unknowns from `layout.first_nuisance` on, in their order."""
+    unknowns = []
+    for i, label in enumerate(labels(problem.training)):
+        unknowns += _of_flight(label, layout, i)
+    size = layout.size - layout.first_nuisance
+    # One that is not listed here is left without a name, not taken for another.
+    if len(unknowns) != size:
+        unknowns = [WeakUnknown(f"nuisance {i + 1}", "", "a nuisance") for i in range(size)]
+    return tuple(unknowns)
+
+
+def _of_flight(label: str, layout: Layout, i: int) -> list[WeakUnknown]:
+    """Those of the i-th flight, in the order in which `layout.unpack` reads them."""
+    unknowns, count = [], layout.windows[i][0]
+    for k in range(count):
+        ending = f" of window {k + 1}" if count > 1 else ""
+        unknowns += [
+            WeakUnknown(f"{label}/initial {n}{ending}", "initial_state", f"the initial {n}")
+            for n in layout.states
+        ]
+    if layout.bias:
+        unknowns += [
+            WeakUnknown(f"{label}/bias {n}", "bias", f"the bias of {n}") for n in layout.outputs[i]
+        ]
+    return unknowns + [
+        WeakUnknown(f"{label}/offset {n}", "input_offset", f"the offset of {n}")
+        for n in layout.offsets
+    ]
+
+
+def can_be_off(problem: Problem, kind: str) -> bool:
+    """Whether the problem would be one without this kind of nuisance: windows need their states."""
+    return bool(kind) and not (kind == "initial_state" and problem.window is not None)
+
+
+def labels(flights: tuple[Flight, ...]) -> list[str]:
+    """What to call each flight; of several with one name the second and further have a number."""
+    names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
+    # Two logs may bear one file name; results are kept by label, so one would hide the other.
+    before = [names[:i].count(name) for i, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
+
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 

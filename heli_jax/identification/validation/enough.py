@@ -7,8 +7,8 @@ from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.identification.validation.excited_band import NOTHING, NOTHING_FOLLOWS, bands

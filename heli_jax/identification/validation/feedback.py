@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.validation.follows_response import (
     LEVEL,
     RATE,

@@ -18,9 +18,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.adequacy import WORSE
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import vaf_text

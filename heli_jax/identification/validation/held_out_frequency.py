@@ -48,9 +48,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import residual_and_
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.response_weights import first_weights
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.excitation_test import (
     LEVEL,
     Followed,

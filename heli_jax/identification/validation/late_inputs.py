@@ -19,7 +19,7 @@ from heli_jax.finding import Finding
 from heli_jax.flights.align import NotAligned, correlations, other_peak
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.metrics import autocorrelation
 from heli_jax.identification.validation.signal_signs import (

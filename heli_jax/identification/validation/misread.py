@@ -19,8 +19,8 @@ from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.flights.table import shown
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.signal_quality import Facts, cut_off, dropout_words
 from heli_jax.identification.validation.signal_signs import rate_against_angle

@@ -19,8 +19,11 @@ from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.measured_signals import signal_numbers, signals
-from heli_jax.identification.identifiability.expected import (
+from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
+from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.validation.expected_accuracy import (
     Sensitivity,
     expected_sd,
     repeated,
@@ -28,9 +31,6 @@ from heli_jax.identification.identifiability.expected import (
     together,
     triangle,
 )
-from heli_jax.identification.identifiability.sensitivity import verdict_of
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.validation.record_windows import DETERMINES
 from heli_jax.simulation.inputs import chirp, multistep_3211
 

@@ -23,21 +23,19 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.measured_signals import signal_numbers
-from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.identifiability.expected import (
+from heli_jax.identification.estimation.simulated_flights import predict, signal_numbers
+from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.identifiability.verdict import Unknown
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import labels, start_vector
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
+from heli_jax.identification.validation.expected_accuracy import (
     Sensitivity,
     expected_sd,
     sensitivity_at,
     together,
     triangle,
 )
-from heli_jax.identification.identifiability.sensitivity import verdict_of
-from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
-from heli_jax.identification.unknowns.nuisances import labels
 
 # Why a window of a record is not to be used: gaps, missing samples, signals at their ends.
 

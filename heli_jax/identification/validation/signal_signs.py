@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
