@@ -304,7 +304,7 @@ def measured_count(data: Data) -> int:
     return int(measured_counts(data))
 
 
-def measured_counts(data: Data) -> np.ndarray:
+def measured_counts(data: Data) -> np.ndarray | np.int64:
     """The same of each record, where all of `data` has leading axes of records."""
     # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
     return np.sum(

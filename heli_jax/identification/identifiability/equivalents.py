@@ -3,7 +3,7 @@
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -341,9 +341,14 @@ class _Family:
         flight = problem.training[0]
         self.known = flight.known
         late = problem.model.delay_parameters
-        # A logarithm keeps the sign; of what is zero, and of delays, which may be, so many samples.
-        self.log = np.array([values[n] != 0.0 and n not in late for n in names])
-        self.size = np.array([flight.dt if n in late else 1.0 for n in names])
+        self.value = np.array([values[n] for n in names])
+        # What is zero has no relative change, nor has a delay, which may be: so many samples.
+        self.relative = np.array([values[n] != 0.0 and n not in late for n in names])
+        units = np.array([flight.dt if n in late else 1.0 for n in names])
+        self.size = np.where(self.relative, self.value, units)
+        # A logarithm keeps the sign.
+        turns = np.array([transforms.changes_sign(problem.free[n]) for n in names])
+        self.log = self.relative & ~turns
         self.about: OperatingPoint = operating_point(
             problem.model,
             self._at(np.zeros(len(names))),
@@ -373,9 +378,8 @@ class _Family:
 
     def by_name(self, z: np.ndarray) -> dict[str, float]:
         """Values at coordinates (q,)."""
-        here = np.array([self.values[n] for n in self.names])
-        moved = np.where(self.log, here * np.exp(np.where(self.log, z, 0.0)), here + z * self.size)
-        return dict(zip(self.names, map(float, moved), strict=True))
+        change = np.where(self.log, np.expm1(np.where(self.log, z, 0.0)), z)
+        return dict(zip(self.names, map(float, self.value + change * self.size), strict=True))
 
     def admits(self, z: np.ndarray) -> bool:
         """True where all values lie within their bounds."""
@@ -441,7 +445,7 @@ def _starts(family: _Family) -> list[np.ndarray]:
     if not pairs:
         return []
     slopes = np.stack([_slope(family, here, _DIFFERENCE * np.eye(q)[a]) for a in range(q)], axis=1)
-    slopes = np.where(family.log & np.isfinite(slopes), slopes, 0.0)
+    slopes = np.where(family.relative & np.isfinite(slopes), slopes, 0.0)
     starts = []
     for i, j in pairs:
         target = math.log((here[j] / here[i]).real) * np.array([1.0, -1.0])
@@ -457,7 +461,7 @@ def _starts(family: _Family) -> list[np.ndarray]:
             z = np.zeros(q)
             z[[a, b]] = np.linalg.solve(E, target)
             if np.max(np.abs(z)) < _REACH:
-                starts.append((each, z))
+                starts.append((each, np.where(family.log, z, np.expm1(z))))
     starts.sort(key=lambda one: -one[0])
     return [z for _, z in starts[:_CANDIDATES]]
 
@@ -476,34 +480,40 @@ def _slope(family: _Family, here: np.ndarray, step: np.ndarray) -> np.ndarray:
 def _led_to(family: _Family, start: np.ndarray) -> np.ndarray | None:
     """Coordinates near a start at which the responses are those at zero; None where there are none,
     or where the way led back."""
-    z = _least(family.differences, start)
+    # Held until the others have followed, or those that exchange the modes would come back.
+    z = _least(family, start, start == 0.0)
+    z = None if z is None else _least(family, z, np.ones(len(start), bool))
     if z is None or not family.apart(z) < _ALIKE:
         return None
-    moved = np.max(np.abs(z[family.log]), initial=0.0)
+    moved = np.max(np.abs(z[family.relative]), initial=0.0)
     return z if moved > _CHANGED else None
 
 
-def _least(rows: Callable[[np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray | None:
-    """By Levenberg and Marquardt; None where rows are not finite."""
-    z, r, damping, q = start, rows(start), 1e-2, len(start)
+def _least(family: _Family, start: np.ndarray, moving: np.ndarray) -> np.ndarray | None:
+    """Coordinates of the least differences, by Levenberg and Marquardt; None where these are not
+    finite. `moving`: which coordinates (q,) may change."""
+    z, r, damping = start, family.differences(start), 1e-2
+    steps, far = np.eye(len(start))[moving], np.where(family.log, 1.0, np.inf)
     if not np.isfinite(r).all():
         return None
-    for _ in range(_RESPONSE_STEPS):
-        J = np.stack([(rows(z + h) - r) / _DIFFERENCE for h in _DIFFERENCE * np.eye(q)], axis=1)
+    for _ in range(_RESPONSE_STEPS if len(steps) else 0):
+        J = [(family.differences(z + _DIFFERENCE * h) - r) / _DIFFERENCE for h in steps]
+        J = np.stack(J, axis=1)
         if not np.isfinite(J).all():
             return None
         before = float(r @ r)
         for _ in range(8):
             scale = damping * np.maximum(np.sum(J**2, axis=0), 1e-12)
-            step = np.linalg.solve(J.T @ J + np.diag(scale), -J.T @ r)
-            then = rows(z + np.clip(step, -1.0, 1.0))
+            step = steps.T @ np.linalg.solve(J.T @ J + np.diag(scale), -J.T @ r)
+            there = z + np.clip(step, -far, far)
+            then = family.differences(there)
             # Negated: what is not finite is no step.
             if float(then @ then) < before:
                 break
             damping *= 8.0
         else:
             return z
-        z, r, damping = z + np.clip(step, -1.0, 1.0), then, 0.2 * damping
+        z, r, damping = there, then, 0.2 * damping
         if before < 1e-14 or before - float(r @ r) < 1e-4 * before < 1e-8:
             break
     return z
@@ -531,7 +541,7 @@ def _as_good(
         n
         for i, (n, v) in enumerate(values.items())
         if abs(v - here[n])
-        > _CHANGED * (max(abs(here[n]), abs(v)) + family.size[i] * ~family.log[i])
+        > _CHANGED * (max(abs(here[n]), abs(v)) + family.size[i] * ~family.relative[i])
     )
     # Along a valley other values are as good anyhow, and it is said what goes together there.
     if not changed or family.open_along(changed) or not _expected(valley, values) > _APART:
