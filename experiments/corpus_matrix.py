@@ -63,8 +63,8 @@ ABLATIONS: tuple[Ablation, ...] = (
     ),
     Ablation(
         "better_of_same_responses",
-        f"{_IDENTIFICATION}.estimation.same_responses:better_of_same_responses",
-        lambda search, optimum: optimum,
+        f"{_IDENTIFICATION}.further_starts:better_of_same_responses",
+        lambda problem, search, optimum: optimum,
     ),
     Ablation(
         "swapped_modes",

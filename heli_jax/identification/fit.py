@@ -31,11 +31,11 @@ from heli_jax.identification.estimation.noise_covariance import (
     first_noise,
     relax_noise_covariance,
 )
-from heli_jax.identification.estimation.same_responses import better_of_same_responses
 from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
 from heli_jax.identification.further_starts import (
     SAID_STABLE,
+    better_of_same_responses,
     better_of_stable,
     explains_little,
     further_starts,
@@ -374,7 +374,7 @@ def _search(
     if disturbed:
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
-        optimum = better_of_same_responses(search, which(search, optimum))
+        optimum = better_of_same_responses(problem, search, which(search, optimum))
     return search, points, optima, optimum
 
 

@@ -8,15 +8,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.finding import note
 from heli_jax.identification.equation_error.start import equation_error_start
+from heli_jax.identification.estimation.disturbance_search import (
+    NO_DISTURBANCE,
+    begun_at,
+    with_noise_guess,
+)
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
-from heli_jax.identification.estimation.multistart import Search, rank
+from heli_jax.identification.estimation.multistart import Search, named_values, rank
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     log_likelihood_of,
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.starts import draw
+from heli_jax.identification.identifiability.equivalents import same_responses
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise, unpack
@@ -124,6 +131,74 @@ def better_of_stable(
     if not second > first:
         return optimum._replace(trace=(*optimum.trace, *other.trace))
     return other.after(optimum)
+
+
+_MOST_PARAMETERS = 8
+"""of which equal responses are sought: more take long"""
+_OTHERS = 2
+"""other values that a filter is begun from"""
+_BETTER = 0.1
+"""log-likelihood by which an optimum is better than another"""
+
+
+def better_of_same_responses(
+    problem: Problem, search: Search, optimum: RelaxedOptimum
+) -> RelaxedOptimum:
+    """The best of a filter's optimum and of those that it finds from other values with the same
+    responses to the inputs; of linear models with one disturbance.
+
+    Two modes may exchange their parts: a heave mode and an inflow with a slow damping and a quick
+    lag answer a collective like one with a quick damping and a slow lag. A disturbance tells them
+    apart, as it acts through one of them alone; but a search that began on the wrong side ends
+    there, with white innovations and a likelihood that lacks a few units.
+
+    Args:
+        problem: what was fitted.
+        search: over it.
+        optimum: where it ended.
+    """
+    layout = search.layout
+    # Where the record shows no disturbance nothing tells such values apart.
+    disturbed = optimum.ratio is None or optimum.ratio > NO_DISTURBANCE
+    if not (
+        bool(optimum.best.converged)
+        and len(layout.sigmas) == 1
+        and disturbed
+        and problem.model.linear
+        and len(layout.free) <= _MOST_PARAMETERS
+    ):
+        return optimum
+    best, likelihood = optimum, _log_posterior(search, optimum)
+    here = named_values(layout, search.data, optimum.best.z)
+    for values in same_responses(problem, here)[:_OTHERS]:
+        z = np.array(optimum.best.z)
+        for i, (name, free) in enumerate(problem.free.items()):
+            z[i] = transforms.coordinate(free, layout.kinds[i], values[name])
+        # Initial states are those of the other values too: from zero they follow.
+        z[layout.first_nuisance :] = 0.0
+        begun = optimum._replace(best=optimum.best._replace(z=jnp.asarray(z)))
+        again = begun_at(search, optimum, with_noise_guess(search, begun))
+        likelier = _log_posterior(search, again) if bool(again.best.converged) else -np.inf
+        if likelier > likelihood + _BETTER:
+            words = (
+                "Other parameter values have the same responses to the inputs: begun from these "
+                f"the filter found a better optimum (log-likelihood {likelier:.1f} for "
+                f"{likelihood:.1f}), and this fit is the better one."
+            )
+            best = again.after(best, note("search.same-responses", words))
+            likelihood = likelier
+    return best
+
+
+def _log_posterior(search: Search, optimum: RelaxedOptimum) -> float:
+    """The log-likelihood, less what priors hold against the free parameters."""
+    values = named_values(search.layout, search.data, optimum.best.z)
+    against = [
+        ((values[n] - f.prior.mean) / f.prior.sd) ** 2
+        for n, f in search.problem.free.items()
+        if f.prior is not None
+    ]
+    return log_likelihood_of(search, optimum) - 0.5 * sum(against)
 
 
 # Any: a record of the model's Params.

@@ -7,13 +7,9 @@ import pytest
 
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.same_responses import same_responses
 from heli_jax.identification.free import Free
+from heli_jax.identification.identifiability.equivalents import same_responses
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import layout_of
 
 ZNU, DT, N = 6.0, 0.02, 2000
 
@@ -93,18 +89,7 @@ def flight():
 
 def asked(flight, free):
     problem = Problem(MODEL, START, [flight], free)
-    layout = layout_of(problem, problem.training)
-    data = data_of(problem, problem.training, layout)
-    here = np.asarray(start_vector(layout, data, problem))[: len(layout.free)]
-    found = same_responses(problem, layout, data, here)
-    limits = (data.sign, data.low, data.high)
-    return [
-        {
-            n: float(transforms.to_value(kind, z[i], *(v[i] for v in limits)))
-            for i, (n, kind) in enumerate(zip(layout.free, layout.kinds, strict=True))
-        }
-        for z in found
-    ]
+    return same_responses(problem, {n: f.start for n, f in free.items()})
 
 
 def test_two_modes_that_change_places_answer_alike(flight):

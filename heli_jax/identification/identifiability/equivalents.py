@@ -256,6 +256,8 @@ _FREQUENCIES = 15
 """at which responses are compared, from the record's length to the samples'"""
 _ALIKE = 0.02
 """relative difference of responses up to which residuals are asked whether they are the same"""
+_THE_SAME = 1e-3
+"""the same, up to which a filter is begun from there"""
 _EQUAL = 1e-6
 """the same, of responses that are one"""
 _OPEN = 1e-4
@@ -302,6 +304,22 @@ def second_solutions(
     valley = Valley(problem, at, e)
     solutions = (_as_good(valley, family, z, optimum) for z in others)
     return tuple(one for one in solutions if one is not None)
+
+
+def same_responses(problem: Problem, values: Mapping[str, float]) -> list[dict[str, float]]:
+    """Other values of the free parameters whose responses to the inputs are the same, and determine
+    them.
+
+    Args:
+        problem: with bounds; its model is linearised.
+        values: of the free parameters, SI.
+    """
+    family, others = _same_responses(problem, values)
+    return [
+        family.by_name(z)
+        for z in others
+        if family.apart(z) < _THE_SAME and family.admits(z) and not family.open_along(family.names)
+    ]
 
 
 def _same_responses(
