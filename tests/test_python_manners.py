@@ -161,3 +161,22 @@ def test_another_kind_is_refused_in_words(call) -> None:
 
 def _sweep(design: Any, reduce: Any) -> None:
     heli_jax.sweep(LINEAR.model, PARAMS, FLIGHT, design, reduce)
+
+
+def test_a_fit_in_single_precision_is_refused() -> None:
+    """A filter's fit to a sound record in a loop ended with exit code 4 there."""
+    code = (
+        "import numpy as np\n"
+        "from heli_jax import Flight, Free, Problem, check, fit, linear_model\n"
+        "linear = linear_model('roll-flybarless')\n"
+        "u = {'lat': np.sin(0.1 * np.arange(200))}\n"
+        "flight = Flight(dt=0.02, inputs=u, outputs={'p': np.zeros(200)})\n"
+        "problem = Problem(linear.model, linear.vehicle().params, [flight], {'Lb': Free(100.0)})\n"
+        "for call in (check, fit):\n"
+        "    try:\n"
+        "        call(problem)\n"
+        "    except ValueError as e:\n"
+        "        print('jax_enable_x64' in str(e))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["True", "True"]

@@ -4,6 +4,7 @@ import dataclasses
 import time
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -149,6 +150,12 @@ def _require_problem(problem: Any) -> None:
         raise TypeError(
             f"problem: expected a heli_jax.Problem, got {type(problem).__name__}; of a "
             "configuration heli_jax.config.problem(heli_jax.load_config(path)) makes it"
+        )
+    # In single precision a filter's likelihood and the rank of a Jacobian are lost in rounding.
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "fit and check need double precision: call jax.config.update('jax_enable_x64', True) "
+            "before the problem is made"
         )
 
 

@@ -79,7 +79,6 @@ def _determined(
     sensitivity: np.ndarray,
     bare: np.ndarray,
     unknowns: tuple[Unknown, ...],
-    null_below: float,
     reported: np.ndarray | None,
     elsewhere: Elsewhere,
 ) -> _Determined:
@@ -94,7 +93,7 @@ def _determined(
     # would lend one to each parameter that a bias or an initial state can take the place of.
     # A prior is a measurement of the parameter itself: a row with one over its sd.
     total = directions(np.vstack([bare, prior]), scale)
-    kept = total.singular > null_below * max(total.singular[0], 1e-300)
+    kept = total.singular > NULL * max(total.singular[0], 1e-300)
     without_weak = covariance_of(total, kept, scale)
     covariance = without_weak
     null = [unit_vector(scale * v) for v in total.right[~kept]]
@@ -127,12 +126,10 @@ class _ByData(NamedTuple):
     rank: int
 
 
-def _by_data(
-    bare: np.ndarray, determined: _Determined, unknowns: tuple[Unknown, ...], null_below: float
-) -> _ByData:
+def _by_data(bare: np.ndarray, determined: _Determined, unknowns: tuple[Unknown, ...]) -> _ByData:
     scale = np.array([u.scale for u in unknowns])
     data = directions(bare, scale)
-    kept = data.singular > null_below * max(data.singular[0], 1e-300)
+    kept = data.singular > NULL * max(data.singular[0], 1e-300)
     covariance = covariance_of(data, kept, scale)
     null = []
     # Without priors this is what has been found already.
@@ -182,7 +179,6 @@ def analyse(
     sensitivity: np.ndarray,
     unknowns: tuple[Unknown, ...],
     remedies: Mapping[str, str] | None = None,
-    null_below: float = NULL,
     without_weak: WithoutWeakPriors | None = None,
     reported: np.ndarray | None = None,
     elsewhere: Elsewhere = NOT_ASKED,
@@ -195,7 +191,6 @@ def analyse(
         unknowns: (q,) what the columns are.
         remedies: by name of an unknown, a further way out that the model offers, such as a run
             with a known inertia.
-        null_below: the part of the largest singular value that counts as zero.
         without_weak: the same without the weak priors, which count as data where it is not given.
         reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
             where it is not that of white residuals: these must not reach further than the factor
@@ -203,10 +198,10 @@ def analyse(
         elsewhere: what is known of other points.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
-    determined = _determined(sensitivity, bare, unknowns, null_below, reported, elsewhere)
-    data = _by_data(bare, determined, unknowns, null_below)
+    determined = _determined(sensitivity, bare, unknowns, reported, elsewhere)
+    data = _by_data(bare, determined, unknowns)
     dead = without_effect_of(sensitivity, unknowns)
-    least = null_below * max(determined.total.singular[0], 1e-300)
+    least = NULL * max(determined.total.singular[0], 1e-300)
     exchange = Exchange(sensitivity, without_weak, least)
     # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
     # number that the prior has put there.

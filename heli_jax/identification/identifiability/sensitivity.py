@@ -305,14 +305,12 @@ def verdict_of(
         )
     unknowns, rows = relative_rows(problem, layout, e)
     unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
-    # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
-    null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     q = len(unknowns)
     # All further work is on the triangle, which holds what the data say in as many rows as columns.
     R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
     S, N = R[:, :q], R[:, q:]
     sensitivity = _with_weak_priors(rows, S, N)
-    without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, null_below)
+    without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, NULL)
     if not around.combined:
         # Initial states of a chance optimum may tell what no input does: at rest they would not.
         without = without._replace(switched_off={})
@@ -322,4 +320,4 @@ def verdict_of(
         reported = reported * np.outer(to_relative, to_relative)
     remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
     elsewhere = Elsewhere(around.second, around.tied, around.null, around.one_sided, around.limits)
-    return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)
+    return analyse(sensitivity, unknowns, remedies, without, reported, elsewhere)
