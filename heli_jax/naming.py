@@ -102,16 +102,20 @@ class Varied:
 
     def __init__(self, record: Record, fields: Iterable[str]) -> None:
         """Take the names of these fields."""
-        self._record, self._dtype = record, jnp.result_type(float)
-        marks = {n: jnp.array(getattr(record, n), self._dtype) for n in fields}
+        self._record, self._fields, self._dtype = record, tuple(fields), jnp.result_type(float)
+        marks = {n: jnp.array(getattr(record, n), self._dtype) for n in self._fields}
         self._leaves, self._structure = jax.tree.flatten(replace(record, **marks))
         at = {n: i for n, mark in marks.items() for i, v in enumerate(self._leaves) if v is mark}
         same = sum(v is own for v, own in zip(self._leaves, jax.tree.leaves(record), strict=True))
         # A class that makes something else of what it is given is asked each time.
         self._at = at if len(at) == len(marks) == len(self._leaves) - same else {}
 
-    def having(self, values: Mapping[str, float]) -> Record:
-        """The record with these values, which are concrete, of fields that change."""
+    # JAX's structure names a class that may have been made on the spot, which pickle cannot find.
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._record, self._fields)
+
+    def having(self, values: Mapping[str, Any]) -> Record:
+        """The record with these values, which are concrete numbers, of fields that change."""
         numbers = {n: np.asarray(v, self._dtype) for n, v in values.items()}
         if not self._at:
             return replace(self._record, **{n: jnp.asarray(v) for n, v in numbers.items()})
