@@ -247,7 +247,9 @@ class Problem:
 
     @functools.cached_property
     def _varied(self) -> naming.Varied:
-        known = (n for f in self.flights for n in f.known)
+        # What is known under a wrong name is refused when its flight is checked, with its place.
+        own = set(naming.names(type(self.vehicle)))
+        known = (n for f in self.flights for n in f.known if n in own)
         return naming.Varied(self.vehicle, dict.fromkeys((*self.free, *known)))
 
     def __repr__(self) -> str:

@@ -10,7 +10,7 @@ from heli_jax import fit, stages
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
-from heli_jax.identification.uncertainty.bootstrap import _records, bootstrap
+from heli_jax.identification.uncertainty.bootstrap import _spectrum_records, bootstrap
 
 
 @pytest.mark.parametrize("N", [7, 100, 101])
@@ -23,7 +23,7 @@ def test_lines_go_back_to_the_samples_they_came_of(N):
 def test_a_record_that_is_drawn_differs_in_its_noise_alone(fitted_by_lines):
     at = fitted_by_lines.reached
     [errors] = jax.device_get(errors_of_lines(at.layout, at.data, at.noise, at.z).errors)
-    drawn, powers = _records(at, np.random.default_rng(1)), []
+    drawn, powers = _spectrum_records(at, np.random.default_rng(1)), []
     for _ in range(40):
         other = next(drawn)
         [y], [before] = (list(d.flights[0].outputs.values()) for d in (other, at.data))
