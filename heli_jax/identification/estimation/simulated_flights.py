@@ -304,17 +304,15 @@ def measured_count(data: Data) -> int:
     return int(measured_counts(data))
 
 
-def measured_counts(data: Data) -> np.ndarray | np.int64:
+def measured_counts(data: Data) -> np.ndarray:
     """The same of each record, where all of `data` has leading axes of records."""
     # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
-    return np.sum(
-        [
-            np.isfinite(np.asarray(y)).sum(axis=-1)
-            for flight in data.flights
-            for y in flight.outputs.values()
-        ],
-        axis=0,
-    )
+    each = [
+        np.isfinite(np.asarray(y)).sum(axis=-1)
+        for flight in data.flights
+        for y in flight.outputs.values()
+    ]
+    return np.asarray(np.sum(each, axis=0))
 
 
 def least_noise(y: np.ndarray) -> float:
