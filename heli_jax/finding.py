@@ -1,12 +1,14 @@
 """Findings about a record, a model or a fit, and the one rule that concludes from them.
 
 A finding is data: a stable code, a severity, its number and limit, and what it does to the
-estimates. Its sentence stands beside these; no code reads it.
+estimates. `messages/` has the words for each code; no code reads them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
+
+from heli_jax.messages import Message, messages, written
 
 Severity = Literal["ok", "note", "doubt", "refuse"]
 """ok: tested, nothing found; note: for information; doubt: something may be wrong; refuse: a fit of
@@ -50,8 +52,9 @@ class Finding(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """What was found, as a heading: the part of the code after the dot."""
-        return self.code.partition(".")[2].replace("-", " ")
+        """What was found, as a heading."""
+        known = messages().get(self.code)
+        return known.title if known else self.code.partition(".")[2].replace("-", " ")
 
     @property
     def bad(self) -> bool:
@@ -68,6 +71,47 @@ class Distrust(NamedTuple):
     shift: float | None
     """how far the misfit moves the estimate [SI]; None where that is not known"""
     brief: str
+
+
+# Any: numbers, names and lists of these, which the sentence shows.
+def found(
+    code: str,
+    severity: Severity = "doubt",
+    *subjects: str,
+    value: float | None = None,
+    shifts: Mapping[str, float] = MappingProxyType({}),
+    denies: bool = False,
+    distrusts: Iterable[str] = (),
+    **numbers: Any,
+) -> Finding:
+    """A finding with the words that `messages/` has for its code.
+
+    Args:
+        code: of a message.
+        severity: as of a Finding.
+        subjects: signals, parameters or flights that it is about.
+        value: its number.
+        shifts: by parameter how far the misfit moves its estimate [SI].
+        denies: whether it shows that the model does not explain the record.
+        distrusts: parameters whose intervals it makes unusable.
+        numbers: what the sentence shows, by the names of its fields; `flight` stands before it.
+    """
+    message: Message = messages()[code]
+    shown = {"value": value, "subjects": subjects, **numbers}
+    whose = f"{numbers['flight']}: " if "flight" in numbers else ""
+    text = " ".join(filter(None, (message.text, message.remedy)))
+    return Finding(
+        code,
+        severity,
+        whose + written(text, shown),
+        value,
+        written(message.measure, shown),
+        subjects,
+        shifts,
+        written(message.brief, shown),
+        denies,
+        tuple(distrusts),
+    )
 
 
 def note(code: str, sentence: str, *subjects: str, value: float | None = None) -> Finding:

@@ -1,0 +1,379 @@
+"""What a diagnostic may ask of: one point of a problem, and what is known there."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.agreement import (
+    correlated_residuals,
+    pooled_metrics,
+    signals_of,
+    whiteness_of,
+)
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Signals, Status
+from heli_jax.identification.uncertainty.estimates import (
+    estimates_of,
+    flight_nuisances,
+    with_limits,
+    without_disturbance,
+)
+from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
+from heli_jax.identification.unknowns.initial_guess import labels
+from heli_jax.identification.unknowns.layout import Solution, scales_of
+from heli_jax.identification.validation.adequacy import (
+    Adequacy,
+    Evidence,
+    assess,
+    explains_nothing,
+    inputs_explain_nothing,
+    is_judged_ahead,
+    joined_metrics,
+)
+from heli_jax.identification.validation.advice import Record, is_unstable
+from heli_jax.identification.validation.aliases import (
+    FastMode,
+    as_good_as_aliases,
+    fast_modes,
+    measurement_noise,
+)
+from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
+    Moved,
+    held_upright,
+    knows_no_gusts,
+    moved_by_feedback,
+)
+from heli_jax.identification.validation.excitation_test import Followed, residual_against_excitation
+from heli_jax.identification.validation.feedback import feedback_of
+from heli_jax.identification.validation.follows_response import Feedback
+from heli_jax.identification.validation.metrics import Metrics, Whiteness
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """A point of a problem, and what is computed there on demand: the start values before a fit, or
+    where the search of a fit ended."""
+
+    problem: Problem
+    at: Solution
+    e: Evaluation
+    """what the point tells"""
+    start: Evaluation
+    """the same at the start values"""
+    before: Verdict
+    """what the data determine at the start values"""
+    optimum: RelaxedOptimum | None = None
+    """where the search ended; None before a fit"""
+    known: Mapping[str, Estimate] = field(default_factory=dict)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the point is where a search ended."""
+        return self.optimum is not None
+
+    @property
+    def arrived(self) -> bool:
+        """Whether it is an optimum."""
+        return self.optimum is not None and bool(self.optimum.best.converged)
+
+    @property
+    def finite(self) -> bool:
+        """Whether the sensitivities are numbers."""
+        return bool(np.all(np.isfinite(self.e.J)))
+
+    @cached_property
+    def flights(self) -> list[tuple[str, Flight]]:
+        """The fitted flights, by what each is called."""
+        training = self.problem.training
+        return list(zip(labels(training), training, strict=True))
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """The free parameters."""
+        return self.at.layout.free
+
+    @property
+    def named(self) -> dict[str, float]:
+        """By unknown of interest its value [SI]."""
+        names = self.at.layout.of_interest
+        return {n: float(v) for n, v in zip(names, self.e.named, strict=True)}
+
+    @cached_property
+    def params(self) -> Any:  # a record of the model's Params, a class of the user's
+        """The vehicle with the values of the free parameters in place."""
+        return self.problem.params_with({n: v for n, v in self.named.items() if n in self.free})
+
+    # What is left of the record.
+
+    @cached_property
+    def signals(self) -> tuple[Signals, ...]:
+        """The fitted flights as measured and as simulated."""
+        return signals_of(self.e, self.problem.training)
+
+    @cached_property
+    def metrics(self) -> dict[str, Metrics]:
+        """Of the simulation, by output."""
+        return pooled_metrics(self.signals)
+
+    @cached_property
+    def whiteness(self) -> dict[str, Whiteness]:
+        """By 'flight/output', of the innovations where there are some, else of the residuals."""
+        return whiteness_of(self.signals, self.e, self.problem.training, self.at.layout)
+
+    @cached_property
+    def correlated(self) -> dict[str, float]:
+        """By pair of outputs the correlation of their residuals."""
+        return correlated_residuals(self.signals)
+
+    @property
+    def white(self) -> bool:
+        """Whether the residuals, or innovations, of each output are white."""
+        return all(w.white for w in self.whiteness.values())
+
+    @property
+    def independent(self) -> bool:
+        """Whether they are white, and those of one output independent of another's."""
+        return self.white and not self.correlated
+
+    # Who moves the inputs.
+
+    @cached_property
+    def feedback(self) -> tuple[Feedback, ...]:
+        """By flight and input, whether it follows the response."""
+        # A late log looks like feedback: each input at the time at which it acted.
+        delays = {n: (e.value, e.sd) for n, e in self.estimates.items()} if self.arrived else {}
+        return feedback_of(self.problem, delays)
+
+    @property
+    def follows(self) -> bool:
+        """Whether an input follows the response."""
+        return any(one.present for one in self.feedback)
+
+    @cached_property
+    def moved(self) -> dict[str, Moved]:
+        """By unknown of interest what feedback may have done to it; empty where nothing is told."""
+        return moved_by_feedback(self.at, np.asarray(self.e.J)) if self.arrived else {}
+
+    @cached_property
+    def instruments(self) -> tuple[str, ...]:
+        """The inputs that are taken by their instrument."""
+        if self.responses is not None:
+            return self.responses.instruments
+        by_instrument = self.at.data.flights[0].by_instrument is not None
+        return instruments_of(self.problem) if by_instrument else ()
+
+    @cached_property
+    def loop(self) -> Loop:
+        """Who closes a loop, as far as it is known."""
+        held = bool(self.moved) and not self.adequacy.by_chance and held_upright(self.at)
+        return Loop(self.feedback, self.instruments, held)
+
+    # Whether the model explains the record.
+
+    @cached_property
+    def responses(self) -> ResponseAgreement | None:
+        """How the model's responses agree with the measured ones, where these are fitted."""
+        if not self.fitted:
+            return None
+        layout, data, noise, z = self.at
+        return layout.estimator.response_agreement(layout, data, noise, z)
+
+    @cached_property
+    def followed(self) -> dict[str, Followed]:
+        """In frequency, by output what of its residual follows the excitation."""
+        estimator = self.at.layout.estimator
+        if not estimator.noise_spectrum or estimator.fits_responses:
+            return {}
+        return residual_against_excitation(self.problem, self.at)
+
+    @cached_property
+    def expected_error(self) -> dict[str, float] | None:
+        """By output the power of the simulation's error over that which the disturbance lets
+        expect; None where the simulation has to explain the record by itself."""
+        layout = self.at.layout
+        # With every disturbance gone it is as with output error.
+        if layout.disturbance and set(layout.disturbance) <= set(self.absent):
+            return None
+        at = self.at
+        return layout.estimator.against_expected(layout, at.data, at.noise, self.e, at.z)
+
+    @cached_property
+    def ahead(self) -> bool:
+        """Whether predictions some seconds ahead are judged, since no simulation follows the
+        record: the model is unstable, or gusts moved it beyond where it is nearly linear."""
+        expected = self.expected_error
+        return expected is not None and (
+            is_unstable(self.problem, self.params)
+            or (not self.problem.model.linear and self.white and misses(expected))
+        )
+
+    @cached_property
+    def adequacy(self) -> Adequacy:
+        """How well the fitted outputs are explained, in time; nothing of what is fitted in
+        frequency."""
+        estimator = self.at.layout.estimator
+        if estimator.noise_spectrum or estimator.fits_responses:
+            return Adequacy(by_chance=bool(self.unrelated))
+        return assess(self.problem, self.params, self._evidence)
+
+    @cached_property
+    def unrelated(self) -> dict[str, float]:
+        """In frequency, by output the probability that it follows the excitation by chance, where
+        that is so of every output; else empty."""
+        if not (self.fitted and self.at.layout.estimator.noise_spectrum):
+            return {}
+        p_values = outputs_against_excitation(self.problem)
+        return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
+
+    @property
+    def _evidence(self) -> Evidence:
+        expected = self.expected_error
+        if self.ahead:
+            return self._predicted
+        records = tuple(
+            Record(s.flight, flight.dt, s.measured, s.simulated)
+            for s, (_, flight) in zip(self.signals, self.flights, strict=True)
+        )
+        innovations = tuple(
+            None if s.innovations is None else dict(s.innovations) for s in self.signals
+        )
+        unknowns = self.at.layout.determined
+        return Evidence(records, self.metrics, self.whiteness, expected, unknowns, innovations)
+
+    @property
+    def _predicted(self) -> Evidence:
+        """Predictions from the filter's states in place of a simulation."""
+        records, error, expected = [], {}, {}
+        for (label, flight), prediction in zip(
+            self.flights, predictions_ahead(self.at), strict=True
+        ):
+            records.append(Record(label, flight.dt, flight.outputs, prediction.predicted))
+            for n, v in prediction.predicted.items():
+                missed = float(np.nansum(np.square(flight.outputs[n] - v)))
+                error[n] = error.get(n, 0.0) + missed
+                expected[n] = expected.get(n, 0.0) + float(np.nansum(prediction.variance[n]))
+        agreement = {n: joined_metrics(n, records) for n in error}
+        against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
+        return Evidence(tuple(records), agreement, self.whiteness, against, ahead=SECONDS)
+
+    # What the estimates are, and how far off they may be.
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """The parameters of disturbances that do not show."""
+        if self.optimum is None:
+            return ()
+        if no_disturbance(self.optimum):
+            return self.at.layout.disturbance
+        return self.optimum.absent
+
+    @cached_property
+    def fast_modes(self) -> list[FastMode]:
+        """By flight the mode that its samples cannot show."""
+        if not self.fitted:
+            return fast_modes(self.problem, {n: f.start for n, f in self.problem.free.items()})
+        noise = measurement_noise(self.problem, self.at.noise.sd)
+        fast = fast_modes(self.problem, self.named, noise)
+        valley = Valley(self.problem, self.at, self.e)
+        return as_good_as_aliases(fast, valley) if self.arrived else fast
+
+    @cached_property
+    def _by_likelihood(self) -> StandardErrors:
+        return standard_errors(
+            self.problem,
+            self.at,
+            self.e,
+            self.before,
+            white=self.white if self.e.innovations else self.independent,
+            aliased=frozenset(n for mode in self.fast_modes for n in mode.undetermined),
+            second=second_solutions(self.problem, self.at, self.e) if self.arrived else (),
+            optimum=self.arrived,
+        )
+
+    @cached_property
+    def errors(self) -> StandardErrors:
+        """How far off the estimates may be; where the model explains nothing they have no
+        intervals."""
+        errors = self._by_likelihood
+        if not self.arrived:
+            return errors
+        verdict = inputs_explain_nothing(self.at, self.e, errors.verdict)
+        verdict, before = explains_nothing(verdict, self.adequacy), verdict
+        return errors._replace(
+            verdict=verdict, limits=errors.limits if verdict is before else {}
+        )
+
+    @property
+    def explains(self) -> bool:
+        """Whether the model explains anything of the record."""
+        return explains_nothing(self._by_likelihood.verdict, self.adequacy) is self._by_likelihood.verdict
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the data determine at the point."""
+        return self.errors.verdict if self.fitted else self.before
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """The parameters that the data do not determine."""
+        return (*self.verdict.undetermined, *self.verdict.without_effect)
+
+    @property
+    def status(self) -> Status:
+        """Whether the search arrived, and whether the data determine what was asked."""
+        if not self.arrived or not self.finite:
+            return "not-converged"
+        return "converged" if self.verdict.identifiable else "not-identifiable"
+
+    @cached_property
+    def estimates(self) -> dict[str, Estimate]:
+        """Free parameters, gains of the inputs and the time shift; none before a fit."""
+        if not self.fitted:
+            return {}
+        errors = self.errors
+        by, quantiles = errors.by or self.e, errors.quantiles
+        found = estimates_of(
+            self.problem, self.at.layout, by, errors.verdict, quantiles, errors.wider
+        )
+        return self._bounded(with_limits(found, errors.limits))
+
+    @cached_property
+    def nuisance(self) -> dict[str, Estimate]:
+        """All other unknowns: the disturbance, initial states, biases, offsets."""
+        layout, errors = self.at.layout, self.errors
+        found = {k: v for k, v in self.estimates.items() if k not in layout.free}
+        # A method that does not see initial states and biases has no interval of them.
+        if layout.estimator.nuisances_in_rows:
+            numbers = (errors.quantiles, errors.wider)
+            found |= self._bounded(flight_nuisances(self.problem, self.at, self.e, *numbers))
+        gone = {n: without_disturbance(found[n], size=n in layout.sigmas) for n in self.absent}
+        return found | gone
+
+    def _bounded(self, estimates: dict[str, Estimate]) -> dict[str, Estimate]:
+        """The estimates; of a search that did not arrive without intervals, since slopes where it
+        stopped bound nothing."""
+        if self.status != "not-converged":
+            return estimates
+        return {n: e.without_interval() for n, e in estimates.items()}
+
+    @cached_property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of the measurement noise as 'flight/output' [SI]."""
+        return noise_by_name(self.problem, self.at.noise, scales_of(self.at.layout, self.at.z))
+
+    @property
+    def rounding(self) -> bool:
+        """Whether the numbers are rounding: a filter of too little noise."""
+        return self.at.layout.estimator.ill_conditioned(self.problem, self.e, self.noise)

@@ -1,0 +1,84 @@
+"""The words of findings: `messages.yaml` has a title, a sentence and a remedy for each code.
+
+A field of a sentence takes Python's format, and what a sentence about a record needs beside it:
+
+- `{p:p}` a probability, `{x:vaf}` a VAF, `{x:%}` a share in per cent
+- `{names}` a list as `a, b and c`, `{names:or}` as `a, b or c`; `{shares:.2g}` each of a list
+- `{names:follows/follow}` a word for one or for several
+- `{lead:? (* s earlier)}` the rest with `*` for the value, nothing where that is empty
+"""
+
+import functools
+import string
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from heli_jax.numbers import p_value, percent, plain_words, vaf_text
+from heli_jax.yaml_file import read_mapping
+
+
+class Message(NamedTuple):
+    """The words for one code."""
+
+    title: str
+    text: str
+    """a sentence, with fields for the finding's numbers"""
+    remedy: str = ""
+    brief: str = ""
+    """the finding in a few words, for the first line of a report"""
+    measure: str = ""
+    """what the finding's value is, and the limit that it is held against"""
+    page: str = ""
+    """of the documentation, without `.md`"""
+
+
+@functools.cache
+def messages() -> Mapping[str, Message]:
+    """By code its words."""
+    content: dict[str, Any] = {}
+    for path in sorted((Path(__file__).parent / "messages").glob("*.yaml")):
+        content |= read_mapping(path)
+    return {code: Message(**words) for code, words in content.items()}
+
+
+def written(template: str, numbers: Mapping[str, Any]) -> str:
+    """A sentence with its numbers.
+
+    Args:
+        template: of `Message`.
+        numbers: by the names of its fields.
+    """
+    return _FORMATTER.vformat(template, (), numbers)
+
+
+def listed(names: Sequence[str], joined: str = "and") -> str:
+    """`a, b and c`."""
+    *first, last = names
+    return f"{', '.join(first)} {joined} {last}" if first else last
+
+
+class _Formatter(string.Formatter):
+    def format_field(self, value: Any, format_spec: str) -> str:
+        several = isinstance(value, list | tuple)
+        if format_spec.startswith("?"):
+            return format_spec[1:].replace("*", self.format_field(value, "")) if value else ""
+        if "/" in format_spec:
+            one, many = format_spec.split("/")
+            count = len(value) if several else value
+            return one if count == 1 else many
+        if several:
+            joined = "or" if format_spec == "or" else "and"
+            spec = "" if format_spec == "or" else format_spec
+            return listed([self.format_field(v, spec) for v in value], joined)
+        if format_spec in _KINDS:
+            return _KINDS[format_spec](value)
+        return super().format_field(value, format_spec)
+
+
+_KINDS = {
+    "p": p_value,
+    "vaf": vaf_text,
+    "%": lambda share: plain_words(percent(share, 0)),
+}
+_FORMATTER = _Formatter()
