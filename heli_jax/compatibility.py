@@ -20,7 +20,7 @@ from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, once
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.estimates import FAR
+from heli_jax.identification.diagnostics.search import FAR
 from heli_jax.numbers import with_sd
 from heli_jax.report.files import SensorAgreement
 from heli_jax.workflow import FitRun, Say
@@ -278,7 +278,10 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
     """What a fit says of itself, and errors that no sensor has."""
     # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
-    notes = once(f for f in run.fit.findings if f not in run.fit.adequacy.findings)
+    of_model = ("adequacy.", "dynamics.", "excitation.")
+    notes = once(
+        f for f in run.fit.findings if f.severity != "ok" and not f.code.startswith(of_model)
+    )
     scales = [
         e
         for e in errors

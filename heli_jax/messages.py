@@ -49,7 +49,18 @@ def written(template: str, numbers: Mapping[str, Any]) -> str:
         template: of `Message`.
         numbers: by the names of its fields.
     """
-    return _FORMATTER.vformat(template, (), numbers)
+    return _FORMATTER.vformat(template, (), numbers).strip()
+
+
+def sentence(code: str, **numbers: Any) -> str:
+    """The text and the remedy of a message.
+
+    Args:
+        code: of the message.
+        numbers: by the names of its fields.
+    """
+    message = messages()[code]
+    return written(" ".join(filter(None, (message.text, message.remedy))), numbers)
 
 
 def listed(names: Sequence[str], joined: str = "and") -> str:

@@ -1,6 +1,7 @@
 """What the commands print and write."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -119,8 +120,7 @@ def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
 def _print_outcome(fit: Fit) -> None:
     """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
     tell(": ".join(fit.outcome))
-    for line in fit.notes:
-        tell(f"! {line}")
+    print_findings(fit.findings)
 
 
 def _print_handling(run: FitRun) -> None:
@@ -220,18 +220,29 @@ def print_check(check: Check) -> None:
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         tell(f"! {sentence}")
-    for note in check.further_notes:
-        tell(f"! {note.sentence}")
-    _print_findings(check.findings)
-
-
-def _print_findings(findings: Sequence[Finding]) -> None:
-    """Whether the log is enough, a line each, what is worst first."""
-    if not findings:
-        return
     tell("\nIs this log enough?")
-    for f in findings:
+    print_findings(check.findings)
+
+
+_IN_FULL = 3
+"""findings that the terminal shows in full"""
+
+
+def print_findings(findings: Sequence[Finding]) -> None:
+    """The most severe findings in full, and the others by their titles.
+
+    Args:
+        findings: the most severe first.
+    """
+    shown = [f for f in findings if f.severity != "ok"][:_IN_FULL]
+    for f in shown:
         tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
+    rest = [f for f in findings if f not in shown]
+    for said, severities in (("also in doubt", ("refuse", "doubt")), ("notes", ("note",)), ("well", ("ok",))):
+        titles = Counter(f.topic for f in rest if f.severity in severities)
+        if titles:
+            each = (t if count == 1 else f"{t} ({count})" for t, count in titles.items())
+            tell(f"  {said}: {', '.join(each)}")
 
 
 _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}

@@ -21,13 +21,12 @@ from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
+from heli_jax.identification.fit import check, fit, rates
 from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose, with_likelier_hold
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
-from heli_jax.identification.validation.enough import judged_again
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.stages import Note, recorded, stage
@@ -159,7 +158,6 @@ def _fit_run(
     config: Experiment | str | Path, progress: Say, began: float, out: str | Path | None
 ) -> FitRun:
     """`run_fit` without its report; before intervals that take long, that of the fit alone."""
-    with_findings = out is not None
     with stage("reading the log", name="reading"):
         config = config if isinstance(config, Experiment) else load_config(config)
         # One fit of it alone would look like the study's result.
@@ -180,12 +178,8 @@ def _fit_run(
         for finding in rates(problem):
             if finding.severity == "refuse":
                 raise ValueError(finding.sentence)
-        # Part of the report, which a script that asks for none need not wait for.
-        with stage("whether the log is enough", name="findings"):
-            guess = first_guess(problem) if with_findings else None
-            enough = findings(problem, guess) if with_findings else ()
         with stage("fit"):
-            fitted = _fitted(problem, options, progress, guess)
+            fitted = _fitted(problem, options, progress)
             problem, fitted = with_likelier_hold(
                 problem, fitted, lambda held: _fitted(held, options, progress)
             )
@@ -200,21 +194,16 @@ def _fit_run(
         if kept is not None:
             shutil.rmtree(kept, ignore_errors=True)
         raise
-    with stage("whether the log was enough", name="findings"):
-        further = further._replace(findings=_at_estimates(problem, fitted, enough))
     return FitRun(config, problem, fitted, rls, further, directory=kept, began=began)
 
 
-def _fitted(
-    problem: Problem, options: FitConfig, progress: Say, guess: FirstGuess | None = None
-) -> Fit:
+def _fitted(problem: Problem, options: FitConfig, progress: Say) -> Fit:
     return fit(
         problem,
         starts=options.starts,
         seed=options.seed,
         max_steps=options.max_steps,
         progress=progress,
-        guess=guess,
     )
 
 
@@ -237,15 +226,6 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
         directory = _written(replace(run, fit=fitted), out, progress).directory
     progress(f"the fit is in {directory}; what else was asked for comes into it")
     return directory
-
-
-def _at_estimates(
-    problem: Problem, fitted: Fit, findings: tuple[Finding, ...]
-) -> tuple[Finding, ...]:
-    """What was found at the start values, judged at the estimates where these are any."""
-    if not findings or fitted.status == "not-converged":
-        return findings
-    return judged_again(problem, findings, fitted.params, fitted.reached.noise.sd)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:

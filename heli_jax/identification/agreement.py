@@ -1,11 +1,7 @@
 """Measured and simulated signals of a fit, and how well they agree."""
 
-from collections.abc import Iterable, Mapping
-
 import numpy as np
 
-from heli_jax.dynamics.disturbance import lacks_disturbance
-from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import directions
@@ -22,12 +18,7 @@ from heli_jax.identification.validation.metrics import (
     whiteness,
     whiteness_in_band,
 )
-from heli_jax.numbers import percent
 
-COLOURED = "noise.residuals-coloured"
-_FAR_TOO_NARROW = 0.2
-"""autocorrelation at one sample from which on intervals that do not allow for it are withdrawn:
-with it they are too narrow by more than a fifth, or the noise is not where the model has it"""
 _SURELY_CORRELATED = 4.5
 """standard deviations from zero at which two residuals are taken for correlated"""
 _WORTH_IT = 0.1
@@ -100,65 +91,6 @@ def whiteness_of(
         else whiteness(error, len(errors), fitted.get(name))
         for name, error in errors.items()
     }
-
-
-def coloured_residuals(
-    whiteness: Mapping[str, Whiteness],
-    layout: Layout,
-    names: Iterable[str],
-    *,
-    allowed_for: bool,
-    converged: bool,
-) -> list[Finding]:
-    """The residuals or innovations that are not white, and what that does to the intervals.
-
-    Args:
-        whiteness: by 'flight/output'.
-        layout: what the unknowns are.
-        names: of the estimates.
-        allowed_for: whether the intervals allow for autocorrelated residuals.
-        converged: whether there are intervals.
-    """
-    not_white = [name for name, w in whiteness.items() if not w.white]
-    if not not_white:
-        return []
-    # By the correlation at one sample, which is the number that the sentence gives.
-    worst = max((whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    estimator, names = layout.estimator, tuple(names)
-    if estimator.noise_spectrum:
-        allow = " and the intervals allow for it" if converged else ""
-        words = (
-            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
-            f"the noise's spectrum is estimated{allow}."
-        )
-        return [note(COLOURED, words, *not_white, value=worst.lag1)]
-    words = (
-        f"The {estimator.errors} of {', '.join(not_white)} are not white (autocorrelation "
-        f"{worst.lag1:+.2f} at one sample, {percent(worst.outside, 0)} of the lags outside the "
-        "99 % band): a disturbance or dynamics that the model lacks is in them."
-    )
-    if converged and not allowed_for:
-        words += " The intervals count every sample as independent and are too narrow."
-        return [
-            Finding(
-                COLOURED,
-                "doubt",
-                words,
-                worst.lag1,
-                f"autocorrelation at one sample, {_FAR_TOO_NARROW:g}",
-                tuple(not_white),
-                brief=f"the {estimator.errors} are not white and the intervals too narrow",
-                distrusts=names if abs(worst.lag1) > _FAR_TOO_NARROW else (),
-            )
-        ]
-    if converged:
-        words += " The intervals allow for the residuals' autocorrelation"
-        words += (
-            ", which filter-error would use for a better estimate."
-            if lacks_disturbance(layout.model)
-            else "."
-        )
-    return [note(COLOURED, words, *not_white, value=worst.lag1)]
 
 
 def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:

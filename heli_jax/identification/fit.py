@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import UNIT_IN_DOUBT, Finding, note
-from heli_jax.flights.instruments import own_instruments, own_said
-from heli_jax.identification.agreement import signals_of
-from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
+from heli_jax.finding import Finding, distrusted
+from heli_jax.identification.agreement import pooled_metrics
+from heli_jax.identification.diagnostics import diagnose
+from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import (
@@ -24,13 +23,19 @@ from heli_jax.identification.estimation.disturbance_search import (
 )
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import FirstGuess, StartRow, first_optima
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
+from heli_jax.identification.estimation.multistart import (
+    FirstGuess,
+    StartRow,
+    first_optima,
+    table,
+)
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     better_of_two_guesses,
     first_noise,
     relax_noise_covariance,
+    unless_stuck,
 )
 from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
 from heli_jax.identification.further_starts import SAID as SAID_FURTHER
@@ -44,40 +49,21 @@ from heli_jax.identification.further_starts import (
 )
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
-from heli_jax.identification.identifiability.sentences import listed
-from heli_jax.identification.identifiability.through_inputs import of_disturbances
+from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
+from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import (
-    Data,
-    Layout,
-    Noise,
-    Solution,
-    layout_of,
-    scales_of,
-)
-from heli_jax.identification.validation.aliases import excitation_notes
-from heli_jax.identification.validation.enough import is_it_enough
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import (
     guessed_gusts,
     starting_at_zero,
     unstated_gusts,
 )
-from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
-from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.misread import doubtful_inputs, record_doubts, scaled_by
-from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
-from heli_jax.identification.validation.signal_signs import (
-    RATE_AGAINST_ANGLE,
-    RATE_SCALE,
-    against_start,
-    sticks_of,
-)
+from heli_jax.messages import sentence
 from heli_jax.stages import stage
 
 __all__ = [
@@ -88,7 +74,6 @@ __all__ = [
     "StartRow",
     "Status",
     "check",
-    "findings",
     "fit",
     "rates",
     "windows",
@@ -169,53 +154,33 @@ def check(problem: Problem) -> Check:
     noise = guess.layout.estimator.as_it_ends(guess.layout, guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
-    # At the start values, since nothing else is known yet: where these are far off, what is
-    # determined there may differ from what is at the optimum, for which the fit asks again.
-    at = Solution(*guess[:4])
-    second = second_solutions(problem, at, guess.e, optimum=False)
-    around = Around(second=second, valley=Valley(problem, at, guess.e))
-    verdict = verdict_of(problem, guess.layout, guess.e, around=around)
-    # What the model does at the start values says whether the record can show it in this noise.
-    runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
-    notes = [*cautions(problem), *excitation_notes(problem, runs, guess.noise.sd)]
-    feedback = feedback_of(problem)
-    notes += feedback_notes(problem, feedback)
-    # A parameter that is not identifiable moves by any amount, with another hold too.
-    not_identifiable = (*verdict.undetermined, *verdict.without_effect)
-    notes += of_disturbances(guess.layout, guess.e)
-    notes += other_hold(problem, at, guess.e, skip=not_identifiable)
-    notes += guessed_gusts(problem, at)
-    guessed = tuple(
-        f"{label}/{name}"
-        for label, flight in zip(labels(problem.training), problem.training, strict=True)
-        for name in flight.outputs
-        if name not in flight.sd
-    )
-    sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
-    findings = is_it_enough(problem, at, guess.e, feedback)
+    c = context_of(problem, guess)
+    findings, verdict = diagnose(c), c.verdict
     # Sensitivities are those of the model, whatever moved what was measured.
-    for nothing in [f for f in findings if f.code == NOTHING_FOLLOWS and f.severity == "refuse"]:
-        names = listed(verdict.names, "or")
-        verdict = verdict.nothing(f"The data do not determine {names}: {nothing.sentence}")
-    slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
-    findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
-    return Check(verdict, sds, tuple(notes), guessed, findings, starting_at_zero(problem))
+    if any(f.code == NOTHING_FOLLOWS and f.severity == "refuse" for f in findings):
+        words = sentence("verdict.nothing-follows", names=verdict.names)
+        verdict = verdict.nothing(words)
+    guessed = tuple(
+        f"{label}/{name}" for label, f in c.flights for name in f.outputs if name not in f.sd
+    )
+    return Check(verdict, c.noise, guessed, findings, starting_at_zero(problem))
 
 
-def findings(problem: Problem, guess: FirstGuess | None = None) -> tuple[Finding, ...]:
-    """Whether the flights are enough for what is asked, at the start values: as `check` says it.
-
-    What missing outputs would tell and what to fly next is compared for output error of linear
-    models alone: others are compiled for each of both, which takes as long as many a fit.
+def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
+    """The problem at its start values, for diagnostics.
 
     Args:
         problem: model, vehicle, flights and what is free.
         guess: of `first_guess`, where it is at hand already.
     """
     guess = guess or first_guess(problem)
-    at, feedback = Solution(*guess[:4]), feedback_of(problem)
-    quick = problem.model.linear and at.layout.estimator.rows_are_samples
-    return is_it_enough(problem, at, guess.e, feedback, compare=quick)
+    # At the start values, since nothing else is known yet: where these are far off, what is
+    # determined there may differ from what is at the optimum, for which the fit asks again.
+    at = Solution(*guess[:4])
+    second = second_solutions(problem, at, guess.e, optimum=False)
+    around = Around(second=second, valley=Valley(problem, at, guess.e))
+    verdict = verdict_of(problem, guess.layout, guess.e, around=around)
+    return Context(problem, at, guess.e, guess.e, verdict)
 
 
 def rates(problem: Problem) -> tuple[Finding, ...]:
@@ -245,10 +210,9 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
-    flights = list(zip(labels(problem.training), problem.training, strict=True))
-    findings = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
     notes = (*ranking.notes, *guessed_gusts(problem, at))
-    return dataclasses.replace(ranking, record=tuple(f for f in findings if f.bad), notes=notes)
+    record = tuple(f for f in diagnose(context_of(problem, guess)) if f.bad)
+    return dataclasses.replace(ranking, record=record, notes=notes)
 
 
 def fit(
@@ -296,36 +260,84 @@ def fit(
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
-    about_record = (*cautions(problem), *record_doubts(problem))
-    optimum = optimum._replace(notes=(*about_record, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        run = OptimizationRun(before, points, optima, seed, timing)
-        estimate = assemble(problem, search, optimum, run)
-        return concluded(_with_doubtful_signals(problem, guess, estimate))
+        c = _where_ended(problem, guess, before, search, optimum)
+        return _result(c, table(search.layout, search.data, points, optima), seed, timing)
 
 
-def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -> Fit:
-    """With the parameters that a signal in a doubtful unit moves, and where the model did not
-    follow from the start values what moved the wrong way there, first of all findings."""
-    # Of an angle that is in other units than its rate that is said already, and is surer.
-    if any(f.code == RATE_AGAINST_ANGLE and f.denies for f in estimate.findings):
-        return estimate
-    flights = list(zip(labels(problem.training), problem.training, strict=True))
-    at_start = (flights, guess.e.simulated, sticks_of(problem.model))
-    doubts = doubtful_inputs(*at_start)
-    if not estimate.adequate:
-        doubts += against_start(*at_start)
-    findings = []
-    for f in (*doubts, *estimate.findings):
-        if estimate.status != "not-converged" and not f.denies:
-            if f.code == UNIT_IN_DOUBT:
-                f = f._replace(distrusts=scaled_by(estimate.reached, f.subjects[0]))
-            elif f.code == RATE_SCALE:
-                # A scale, a unit or the clock is off: each parameter depends on one of them.
-                f = f._replace(distrusts=tuple(estimate.estimates))
-        findings.append(f)
-    return dataclasses.replace(estimate, findings=tuple(findings))
+def _where_ended(
+    problem: Problem,
+    guess: FirstGuess,
+    before: Verdict,
+    search: starting.Search,
+    optimum: RelaxedOptimum,
+) -> Context:
+    """What is known where the search ended."""
+    layout, data = search.layout, search.data
+    e = evaluate(layout, data, optimum.noise, optimum.best.z)
+    optimum = unless_stuck(layout, optimum, e, problem.free)
+
+    def context() -> Context:
+        at = Solution(layout, data, optimum.noise, optimum.best.z)
+        return Context(problem, at, e, guess.e, before, optimum)
+
+    c = context()
+    if c.rounding:
+        # Of rounding no likelihood can be asked, by whatever asks further on.
+        optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
+        c = context()
+    return c
+
+
+def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[str, float]) -> Fit:
+    """All that a fit says."""
+    layout, data, noise, _ = c.at
+    assert c.optimum is not None
+    # AIC and BIC count all that was estimated, and no disturbances that do not show: with sigma_w =
+    # 0 the correlation time has no meaning either.
+    unknowns = layout.determined + layout.estimator.noise_unknowns(layout) - len(c.absent)
+    findings = diagnose(c)
+    estimates = {n: c.estimates[n] for n in layout.free}
+    doubted = distrusted(findings, estimates) if c.status != "not-converged" else {}
+    held = c.held_out
+    return Fit(
+        model=c.problem.model.name,
+        method=c.problem.method,
+        status=c.status,
+        n_samples=measured_count(data),
+        estimates={
+            n: e._replace(lower95=None, upper95=None) if n in doubted else e
+            for n, e in estimates.items()
+        },
+        nuisance=c.nuisance,
+        params=c.params,
+        verdict_before=c.before,
+        verdict=c.verdict,
+        noise=c.noise,
+        log_likelihood=layout.estimator.log_likelihood(layout, data, noise, c.e),
+        unknowns=unknowns,
+        signals=(*c.signals, *held.signals),
+        metrics=c.metrics,
+        validation=pooled_metrics(held.signals),
+        validation_free_run=pooled_metrics(held.free_run),
+        held_out_frequency=held.in_frequency,
+        one_step=pooled_metrics(c.signals, one_step=True),
+        one_step_validation=pooled_metrics(held.signals, one_step=True),
+        whiteness=c.whiteness,
+        adequacy=c.adequacy,
+        coloured=c.errors.coloured,
+        responses=c.responses,
+        starts=starts,
+        steps=sum(s for s, _ in c.optimum.trace),
+        trace=c.optimum.trace,
+        findings=findings,
+        reached=c.at,
+        feedback=c.feedback,
+        instruments=c.instruments,
+        seed=seed,
+        timing=timing,
+    )
 
 
 def _search(
@@ -383,31 +395,3 @@ def _search(
         which = those_that_show if several else disturbance_or_none
         optimum = better_of_same_responses(problem, search, which(search, optimum))
     return search, points, optima, optimum
-
-
-def cautions(problem: Problem) -> tuple[Finding, ...]:
-    """What the logs say of their signals that biases a fit to them; once where flights agree."""
-    flights = tuple(problem.flights)
-    said: dict[str, Finding] = {}
-    for label, flight in zip(labels(flights), flights, strict=True):
-        for caution in flight.source.cautions if flight.source else ():
-            said.setdefault(caution.sentence, caution.of(label))
-    own = own_instruments(problem.training, naming.names(problem.model.Inputs))
-    own = own if problem.instrument is None else ()
-    return (
-        *said.values(),
-        *((note("loop.instrument-unused", f"{own_said(own)}; it is not used."),) if own else ()),
-        *_whole_band(problem),
-    )
-
-
-def _whole_band(problem: Problem) -> tuple[Finding, ...]:
-    """That a band which is stated is none of the fit's."""
-    estimator, band = estimator_of(problem.method), problem.frequency.band
-    if band is None or not estimator.noise_spectrum or estimator.fits_responses:
-        return ()
-    words = (
-        f"frequency.band ({band[0]:g} to {band[1]:g} Hz) is that of the report's responses alone: "
-        "frequency error uses all frequencies of a record. frequency-response fits within a band."
-    )
-    return (note("frequency.band-unused", words),)

@@ -1,7 +1,7 @@
 """What a fit gives: plain data."""
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,10 +14,8 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
-from heli_jax.identification.validation.aliases import ALIASED
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
-from heli_jax.identification.validation.logging_rate import LOGGING_RATE
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:
@@ -44,6 +42,10 @@ class Estimate(NamedTuple):
     """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
     sd_alone: float | None = None
     """the Cramer-Rao sd if all other unknowns were known: Tischler's insensitivity"""
+
+    def without_interval(self) -> "Estimate":
+        """The value alone."""
+        return self._replace(sd=None, lower95=None, upper95=None, sd_white=None, sd_alone=None)
 
 
 class Signals(NamedTuple):
@@ -88,25 +90,15 @@ class Check:
     verdict: Verdict
     noise: dict[str, float]
     """sd assumed for each flight and output"""
-    notes: tuple[Finding, ...]
     guessed: tuple[str, ...] = ()
     """flights and outputs whose noise nobody stated"""
     findings: tuple[Finding, ...] = ()
-    """whether the log is enough: bands, rates, outputs, feedback, what to fly next; worst first"""
+    """what was tested of the record, worst first"""
     at_zero: dict[str, tuple[float, str]] = field(default_factory=dict)
     """by parameter that starts at zero, of which nothing is a part: the size [SI] that its expected
     sd is relative to, and the unit"""
     log_notes: tuple[Finding, ...] = ()
     """what the readers of the logs assumed or did"""
-
-    @property
-    def further_notes(self) -> tuple[Finding, ...]:
-        """The notes without those that a finding says too."""
-        said = {f.sentence for f in self.findings}
-        slow = any(f.code == LOGGING_RATE and f.bad for f in self.findings)
-        notes = (n for n in self.notes if not (slow and n.code == ALIASED))
-        return tuple(n for n in notes if n.sentence not in said)
-
 
 # Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
 
@@ -210,8 +202,8 @@ class Fit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The sentences of the findings."""
-        return tuple(sentences(self.findings))
+        """The sentences of the findings, but of those that only say that all is well."""
+        return tuple(sentences(f for f in self.findings if f.severity != "ok"))
 
     @property
     def exit_code(self) -> int:
@@ -312,19 +304,6 @@ class Fit:
         from heli_jax.exports import estimates_frame
 
         return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
-
-
-def concluded(fit: Fit) -> Fit:
-    """The fit without the intervals that its findings take away.
-
-    Args:
-        fit: with all its findings.
-    """
-    estimates = {
-        n: e._replace(lower95=None, upper95=None) if n in fit.distrusts else e
-        for n, e in fit.estimates.items()
-    }
-    return replace(fit, estimates=estimates)
 
 
 def _warn_renamed(old: str, new: str) -> None:

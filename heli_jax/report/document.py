@@ -412,8 +412,6 @@ class FitFile(TypedDict):
     models: Annotated[CandidatesCompared | None, "supplementary.choice"]
     methods: Annotated[MethodsCompared | None, "supplementary.methods"]
     intervals: Annotated[IntervalsContent | None, "supplementary.intervals"]
-    record: Annotated[list[Finding], "supplementary.findings"]
-    """whether the log is enough"""
     compatibility: Annotated[Compatibility | None, "supplementary.sensors"]
     log_likelihood: Annotated[float, "fit.log_likelihood"]
     unknowns: Annotated[int, "fit.unknowns"]
@@ -442,7 +440,7 @@ class FitFile(TypedDict):
     steps: Annotated[int, "fit.steps"]
     """of the optimiser, to the best optimum"""
     findings: Annotated[list[Finding], "fit.findings"]
-    """about the record, the model and the fit"""
+    """about the record, the model and the fit, the most severe first"""
     timing_s: Annotated[dict[str, float], "fit.timing"]
     """by what was done, and in all"""
     versions: Annotated[dict[str, str], lambda _: versions()]

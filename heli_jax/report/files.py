@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, as_data
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit, Signals
@@ -32,12 +32,10 @@ class SensorAgreement(NamedTuple):
 
 
 class SupplementaryAnalyses(NamedTuple):
-    """What belongs to a fit: model selection, intervals by other methods, what the log is worth."""
+    """What belongs to a fit: model selection, intervals by other methods, responses."""
 
     choice: Choice | None = None
     intervals: Intervals | None = None
-    findings: tuple[Finding, ...] = ()
-    """whether the log is enough, as it was before the fit"""
     methods: MethodComparison | None = None
     """further methods beside the fit's own"""
     responses: FittedResponses | None = None
@@ -82,9 +80,8 @@ def check_json(check: Check) -> dict[str, Any]:
             "verdict": written(VerdictContent, verdict),
             "noise_sd": check.noise,
             "noise_guessed": list(check.guessed),
-            "record": [f._asdict() for f in check.findings],
-            "notes": [f._asdict() for f in check.further_notes],
-            "log_notes": [f._asdict() for f in check.log_notes],
+            "findings": [as_data(f) for f in check.findings],
+            "log_notes": [as_data(f) for f in check.log_notes],
         }
     )
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.agreement import COLOURED
+from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
@@ -35,7 +35,7 @@ def headline(fit: Fit) -> Headline:
 
 def whiteness_note(fit: Fit) -> str:
     """What coloured residuals do to the intervals; empty where the residuals are white."""
-    return next((f.sentence for f in fit.findings if f.code == COLOURED), "")
+    return next((f.sentence for f in fit.findings if f.code in (COLOURED, TOO_NARROW)), "")
 
 
 def model_remark(problem: Problem) -> str:

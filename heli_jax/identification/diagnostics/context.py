@@ -1,20 +1,22 @@
 """What a diagnostic may ask of: one point of a problem, and what is known there."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.agreement import (
     correlated_residuals,
+    free_runs,
     pooled_metrics,
     signals_of,
     whiteness_of,
 )
+from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
@@ -26,6 +28,7 @@ from heli_jax.identification.result import Estimate, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
     estimates_of,
     flight_nuisances,
+    noise_by_name,
     with_limits,
     without_disturbance,
 )
@@ -33,13 +36,14 @@ from heli_jax.identification.uncertainty.standard_errors import StandardErrors, 
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
+    EXPLAINED,
     Adequacy,
     Evidence,
     assess,
     explains_nothing,
     inputs_explain_nothing,
-    is_judged_ahead,
     joined_metrics,
+    misses,
 )
 from heli_jax.identification.validation.advice import Record, is_unstable
 from heli_jax.identification.validation.aliases import (
@@ -52,13 +56,47 @@ from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     Moved,
     held_upright,
-    knows_no_gusts,
     moved_by_feedback,
 )
-from heli_jax.identification.validation.excitation_test import Followed, residual_against_excitation
+from heli_jax.identification.validation.excitation_test import (
+    LEVEL,
+    Followed,
+    outputs_against_excitation,
+    residual_against_excitation,
+)
 from heli_jax.identification.validation.feedback import feedback_of
 from heli_jax.identification.validation.follows_response import Feedback
+from heli_jax.identification.validation.held_out import validate
+from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
+from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
+
+
+def no_disturbance(optimum: RelaxedOptimum) -> bool:
+    """Whether a disturbance was looked for and does not show.
+
+    Args:
+        optimum: where the optimiser ended.
+    """
+    return optimum.ratio is not None and optimum.ratio < NO_DISTURBANCE
+
+
+class HeldOut(NamedTuple):
+    """The flights held out, predicted."""
+
+    signals: tuple[Signals, ...] = ()
+    free_run: tuple[Signals, ...] = ()
+    """with windows: simulated in one piece"""
+    notes: tuple[Finding, ...] = ()
+    in_frequency: HeldOutFrequency | None = None
+
+
+_NEARLY_ALL = 0.9
+"""part explained of each output whose residual follows the inputs, from which on a wrong optimum is
+the less likely cause"""
+_DIVERGED = -10.0
+"""VAF of a simulation below which it has left the record"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +114,6 @@ class Context:
     """what the data determine at the start values"""
     optimum: RelaxedOptimum | None = None
     """where the search ended; None before a fit"""
-    known: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def fitted(self) -> bool:
@@ -164,7 +201,9 @@ class Context:
     @cached_property
     def moved(self) -> dict[str, Moved]:
         """By unknown of interest what feedback may have done to it; empty where nothing is told."""
-        return moved_by_feedback(self.at, np.asarray(self.e.J)) if self.arrived else {}
+        if not self.arrived or self.unrelated:
+            return {}
+        return moved_by_feedback(self.at, np.asarray(self.e.J))
 
     @cached_property
     def instruments(self) -> tuple[str, ...]:
@@ -174,10 +213,17 @@ class Context:
         by_instrument = self.at.data.flights[0].by_instrument is not None
         return instruments_of(self.problem) if by_instrument else ()
 
+    @property
+    def stated_instruments(self) -> tuple[str, ...]:
+        """The inputs whose excitation is logged and named."""
+        return tuple(instruments_of(self.problem))
+
     @cached_property
     def loop(self) -> Loop:
         """Who closes a loop, as far as it is known."""
-        held = bool(self.moved) and not self.adequacy.by_chance and held_upright(self.at)
+        wrong = self.astray and not self.nearly
+        asked = bool(self.moved) and not (self.unrelated or wrong)
+        held = asked and held_upright(self.at)
         return Loop(self.feedback, self.instruments, held)
 
     # Whether the model explains the record.
@@ -197,6 +243,30 @@ class Context:
         if not estimator.noise_spectrum or estimator.fits_responses:
             return {}
         return residual_against_excitation(self.problem, self.at)
+
+    @property
+    def failed(self) -> dict[str, Followed]:
+        """Of `followed` what is more than chance makes."""
+        level = LEVEL / max(len(self.followed), 1)
+        return {n: f for n, f in self.followed.items() if f.p_value < level}
+
+    @property
+    def left_record(self) -> list[str]:
+        """In frequency, the outputs whose simulation in time leaves the record."""
+        return [n for n, m in self.metrics.items() if self.followed and not m.vaf >= _DIVERGED]
+
+    @property
+    def astray(self) -> bool:
+        """In frequency, whether the residual follows the inputs and the simulation leaves the
+        record: of an unstable model that is excused only where nothing else speaks against it."""
+        bad = any(not f.explained >= EXPLAINED for f in self.failed.values())
+        return bool(self.left_record and self.failed) and not (bad or self.instruments)
+
+    @property
+    def nearly(self) -> bool:
+        """Whether nearly all that follows the excitation is explained, so that a wrong optimum is
+        the less likely cause."""
+        return all(f.explained >= _NEARLY_ALL for f in self.failed.values())
 
     @cached_property
     def expected_error(self) -> dict[str, float] | None:
@@ -220,11 +290,21 @@ class Context:
         )
 
     @cached_property
+    def unmodelled(self) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
+        """What the residuals follow beyond chance, and other values that the inputs ask for; asked
+        of an optimum whose simulation follows the record, where no input follows the response."""
+        asked = self.arrived and self.explains and not (self.instruments or self.ahead)
+        if not asked or self.follows:
+            return [], (1.0, {})
+        coloured = self.errors.coloured and not self.at.layout.estimator.noise_spectrum
+        names = [label for label, _ in self.flights]
+        return unmodelled(self.at, self.e, names, coloured=coloured)
+
+    @cached_property
     def adequacy(self) -> Adequacy:
-        """How well the fitted outputs are explained, in time; nothing of what is fitted in
+        """How well the fitted outputs are explained, in time; nothing of what is judged in
         frequency."""
-        estimator = self.at.layout.estimator
-        if estimator.noise_spectrum or estimator.fits_responses:
+        if self.responses is not None or self.followed or self.unrelated:
             return Adequacy(by_chance=bool(self.unrelated))
         return assess(self.problem, self.params, self._evidence)
 
@@ -238,6 +318,11 @@ class Context:
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
 
     @property
+    def records(self) -> tuple[Record, ...]:
+        """What is compared by flight: measured with simulated, or with predicted ahead."""
+        return self._evidence.records
+
+    @cached_property
     def _evidence(self) -> Evidence:
         expected = self.expected_error
         if self.ahead:
@@ -372,6 +457,21 @@ class Context:
     def noise(self) -> dict[str, float]:
         """Standard deviation of the measurement noise as 'flight/output' [SI]."""
         return noise_by_name(self.problem, self.at.noise, scales_of(self.at.layout, self.at.z))
+
+    @cached_property
+    def held_out(self) -> HeldOut:
+        """The flights held out, with their own initial states and biases."""
+        problem, at = self.problem, self.at
+        flights = tuple(f for f in problem.flights if f.hold_out)
+        if not flights or not self.fitted:
+            return HeldOut()
+        checked = validate(problem, at.layout, at.z, at.noise, flights)
+        free_run = free_runs(flights, checked.free_run)
+        in_frequency = None
+        if self.arrived:
+            feedback = (self.loop.held or self.follows) and not self.instruments
+            in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
+        return HeldOut(signals_of(checked.e, flights), free_run, checked.notes, in_frequency)
 
     @property
     def rounding(self) -> bool:

@@ -1,0 +1,127 @@
+"""Do inputs follow the response, and what does that do to the estimates?"""
+
+from collections.abc import Iterator, Sequence
+
+from heli_jax.dynamics.model import axes_of
+from heli_jax.finding import Finding, found
+from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.estimation.frequency_instrument import STRONG
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.advice import is_unstable
+from heli_jax.identification.validation.closed_loop_trust import (
+    MAY_BE,
+    knows_no_gusts,
+    untrusted,
+    weak_by_instrument,
+)
+from heli_jax.identification.validation.feedback import untested, why_untested
+from heli_jax.identification.validation.follows_response import LEVEL, SEEN, Feedback
+
+FEEDBACK = "loop.feedback"
+_HELD = 1.0
+"""a mode that grows by e to this over a record shows that its vehicle is held"""
+
+
+def feedback_tested(c: Context) -> Iterator[Finding]:
+    """Whether feedback was asked for, and of which outputs it was not."""
+    why = None if c.feedback else why_untested(c.problem)
+    if why is not None:
+        # Steps that somebody commanded follow nothing; of the rest nothing is known.
+        severity = "note" if why.programmed or c.fitted else "doubt"
+        yield found("loop.not-tested", severity, reason=why.reason)
+    for names, flights in untested(c.problem).items():
+        yield found("loop.output-not-tested", "note", *names, flights=flights, missing=1.0 - SEEN)
+
+
+def inputs_follow_response(c: Context) -> Iterator[Finding]:
+    """A closed loop, and what it does to estimates by this method."""
+    present = [one for one in c.feedback if one.present]
+    estimator, names = estimator_of(c.problem.method), tuple(c.estimates)
+    harmed = c.arrived and not c.independent and knows_no_gusts(c.problem)
+    if not present:
+        if harmed and is_unstable(c.problem, c.params, _HELD):
+            yield found("loop.held", "doubt", distrusts=names)
+        elif c.feedback:
+            least = min(c.feedback, key=lambda one: one.p_value)
+            yield found("loop.no-feedback", "ok", least.input, value=least.p_value, level=LEVEL)
+        return
+    # With disturbances in the model and white innovations the noise model is right, and the direct
+    # estimate is unbiased in a closed loop too.
+    if estimator.process_noise and c.fitted and c.white:
+        return
+    code = "loop.feedback-filtered" if estimator.process_noise else FEEDBACK
+    # Before a fit it is a doubt about the record; after one the residuals say whether it harms.
+    severity = "note" if c.fitted and not harmed else "doubt"
+    inputs = tuple(dict.fromkeys(one.input for one in present))
+    if estimator.by_instrument and set(inputs) <= set(c.stated_instruments):
+        code, severity = "loop.excitation-logged", "ok"
+    sure = min(present, key=lambda one: one.p_value)
+    late = list(dict.fromkeys(one.input for one in present if not one.delay_known))
+    yield found(
+        code,
+        severity,
+        *inputs,
+        value=sure.p_value,
+        distrusts=names if harmed else (),
+        inputs=inputs,
+        flight=sure.flight,
+        sure=sure.input,
+        output=sure.output,
+        correlation=sure.correlation,
+        lag=sure.lag[0] if sure.lag[0] == sure.lag[1] else list(sure.lag),
+        earlier=f"{sure.earlier:.2g} s" if sure.earlier else "",
+        late=" and ".join(late),
+        free=_frees_a_delay(c.problem, late),
+        method=c.problem.method,
+        advised=_advised(c.problem, present),
+        level=LEVEL,
+    )
+
+
+def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
+    """What to free to tell inputs that are logged late from a closed loop."""
+    own = dict(problem.model.delays)
+    asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
+    return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"
+
+
+def _advised(problem: Problem, present: Sequence[Feedback]) -> str:
+    """Filter error with a disturbance where the response that is followed is disturbed."""
+    axes, outputs = axes_of(problem.model), {one.output for one in present}
+    own = [axis.name for axis in axes if outputs & {axis.rate, axis.angle}]
+    if not axes:
+        return "method: filter-error and process noise"
+    if len(axes) == 1 or len(own) == 1:
+        name = own[0] if own else axes[0].name
+        return f"method: filter-error with disturbance: {{axis: {name}, poles: 1}}"
+    named = ", ".join(own or [axis.name for axis in axes])
+    return f"method: filter-error with a disturbance of each axis that gusts move ({named})"
+
+
+def moved_by_feedback(c: Context) -> Iterator[Finding]:
+    """Parameters that feedback may have moved in frequency, where no excitation was logged."""
+    if not (c.moved and c.loop.closed):
+        return
+    doubted = untrusted(c.moved, c.loop)
+    shares = {n: c.moved[n].part for n in doubted or c.moved}
+    yield found(
+        "loop.no-instrument" if doubted else "loop.no-instrument-harmless",
+        "doubt" if doubted else "note",
+        *c.loop.inputs,
+        value=max(shares.values()),
+        distrusts=doubted,
+        of=" and ".join(c.loop.inputs) if c.instruments else "",
+        inputs=c.loop.inputs if c.instruments else ["the inputs"],
+        held="" if c.follows else "the vehicle is held",
+        names=list(shares),
+        shares=list(shares.values()),
+        limit=MAY_BE,
+    )
+
+
+def weak_instruments(c: Context) -> Iterator[Finding]:
+    """Parameters of which the logged excitation tells too little."""
+    names = weak_by_instrument(c.problem, c.at, c.e.J) if c.arrived else ()
+    if names:
+        yield found("loop.weak-instrument", "doubt", *names, distrusts=names, limit=STRONG)

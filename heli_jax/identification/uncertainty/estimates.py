@@ -4,11 +4,12 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import sensor_noise
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import combined_deviations, deviations, evaluate
 from heli_jax.identification.estimation.filter_error import innovation_sums
@@ -20,10 +21,9 @@ from heli_jax.identification.result import Estimate
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
-    Data,
     Layout,
+    Noise,
     Solution,
-    disturbance_limits,
     unpack,
 )
 
@@ -154,22 +154,6 @@ def _searched(name: str, ends: tuple[float, float]) -> tuple[float, float]:
     return low, high
 
 
-def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[Finding]:
-    """Which intervals are those of the likelihood, by name lower and upper end."""
-    if not limits:
-        return []
-    those = (
-        "interval of " + ", ".join(limits) + " is"
-        if len(limits) == 1
-        else ("intervals of " + ", ".join(limits) + " are")
-    )
-    words = (
-        f"The {those} by the profile likelihood: it is not quadratic here, and the standard "
-        "deviations alone would claim too much. More excitation would make them narrower."
-    )
-    return [note("uncertainty.profile-interval", words, *limits)]
-
-
 def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
     """The standard deviation of each unknown if all others were known, over that which it has; 1
     where it is not identifiable."""
@@ -199,32 +183,6 @@ def _unit(problem: Problem, name: str) -> str:
     if name.startswith("gain "):
         return problem.gain_units.get(name.removeprefix("gain "), "1")
     return naming.unit(problem.model.Params, name) or ""
-
-
-def bound_findings(estimates: dict[str, Estimate]) -> list[Finding]:
-    """Estimates that ended at their bounds: all estimates are those of a bound that the data do not
-    bear out."""
-    return [
-        Finding(
-            "fit.at-bound",
-            "doubt",
-            f"{name} ended at its bound: the data want it beyond {estimate.value:.3g}. "
-            + (
-                # No key widens that one.
-                "Mend what makes the data want that: an input or an output of another column or "
-                "sign, or two logs whose clocks differ."
-                if name == "time_shift"
-                else "Widen the bound, or mend what makes the data want that."
-            ),
-            estimate.value,
-            "the bound",
-            (name,),
-            brief=f"{name} is at its bound",
-            distrusts=tuple(estimates),
-        )
-        for name, estimate in estimates.items()
-        if estimate.at_bound
-    ]
 
 
 def delay_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Finding]:
@@ -259,84 +217,32 @@ def delay_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Fin
     return findings
 
 
-FAR = 3.0
-"""standard deviations of a prior at which an estimate contradicts it"""
-
-
-def prior_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Finding]:
-    """Estimates that have left their priors."""
-    findings = []
-    for name, estimate in estimates.items():
-        prior = problem.free[name].prior
-        if prior is None:
-            continue
-        away = abs(estimate.value - prior.mean) / prior.sd
-        if away > FAR:
-            words = (
-                f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and prior "
-                "contradict each other. Check the prior, and what was measured."
-            )
-            findings.append(
-                Finding(
-                    "fit.prior-contradicted",
-                    "doubt",
-                    words,
-                    away,
-                    f"standard deviations of the prior, {FAR:g}",
-                    (name,),
-                    brief=f"{name} contradicts its prior",
-                    distrusts=(name,),
-                )
-            )
-    return findings
-
-
-def extreme_noise_notes(
-    layout: Layout, data: Data, z: Float[Array, " q"], absent: tuple[str, ...] = ()
-) -> list[Finding]:
-    """Where a parameter of the disturbance ran to the end of what a record can show.
+def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
+    """The estimate of a disturbance's parameter where no disturbance shows.
 
     Args:
-        layout: of the unknowns.
-        data: whose length and sample time say what can be shown.
-        z: the optimum (q,), with logarithms of the disturbance's parameters.
-        absent: parameters of disturbances that do not show, of which nothing is said here.
+        estimate: of a size or of a correlation time.
+        size: whether it is a size, which is zero then, at its bound; a time means nothing.
     """
-    notes = []
-    limits = disturbance_limits(layout, data)
-    for i, name in enumerate(layout.disturbance):
-        at = float(z[len(layout.of_interest) + i])
-        low, high = (float(v) for v in limits[name])
-        if low < at < high or name in absent:
-            continue
-        value = np.exp(min(max(at, low), high))
-        meaning = {
-            # Shorter than a sample, or longer than the record.
-            (False, True): "in this record the disturbance cannot be told from white noise",
-            (False, False): "in this record the disturbance cannot be told from a random walk",
-        }.get((name in layout.sigmas, at <= low), "the record bounds it to one side at most")
-        unit = naming.unit(layout.model.Params, name) or ""
-        words = f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}."
-        notes.append(note("noise.disturbance-open", words, name))
-    return notes
+    value = 0.0 if size else estimate.value
+    return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=size)
 
 
-def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[Finding]:
-    """Where the estimated noise, sd by 'flight/output', is not the stated one."""
-    notes = []
-    for flight, label in zip(problem.training, labels(problem.training), strict=True):
-        for name, stated in flight.sd.items():
-            ratio = sds[f"{label}/{name}"] / stated
-            if not 0.5 < ratio < 2.0:
-                words = (
-                    f"{label}: the residual of {name} has {ratio:.2g} times the stated noise; the "
-                    "intervals go by the residual."
-                )
-                limit = "residual over stated noise, 0.5 to 2"
-                notes.append(
-                    Finding("noise.not-as-stated", "note", words, ratio, limit, (label, name))
-                )
-    return notes
+def noise_by_name(
+    problem: Problem, noise: Noise, scales: Mapping[str, ArrayLike]
+) -> dict[str, float]:
+    """Standard deviation of the measurement noise as 'flight/output', in the output's SI unit.
+
+    Args:
+        problem: whose flights are named.
+        noise: by flight and output.
+        scales: factors on it by output that are unknowns themselves (filter error); 1 unless named.
+    """
+    return {
+        f"{label}/{n}": float(np.asarray(sd)) * float(np.asarray(scales.get(n, 1.0)))
+        for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
+        for n, sd in by_name.items()
+    }
 
 
 def flight_nuisances(

@@ -21,24 +21,19 @@ import numpy as np
 import scipy.special
 
 from heli_jax import naming
-from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
-    GATE,
     OutputAdequacy,
     Record,
-    advice_for,
     is_unstable,
 )
-from heli_jax.identification.validation.metrics import Metrics, Whiteness
-from heli_jax.numbers import explained_text, percent, vaf_text
+from heli_jax.identification.validation.metrics import Metrics, Whiteness, metrics
+from heli_jax.messages import sentence
 from heli_jax.numerics.white_noise import white_part
 
 # Does a filter predict anything of an output, beyond what its mean or the last sample says?
@@ -71,8 +66,6 @@ def predicts_nothing(flights: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
-NOT_EXPLAINED, UNEXPLAINED = "adequacy.output-not-explained", "adequacy.output-unmoved"
-BY_CHANCE = "adequacy.by-chance"
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
 NEARLY_WHITE = 0.1
@@ -86,20 +79,25 @@ three standard deviations where the disturbance is so slow that the record holds
 
 
 class Adequacy(NamedTuple):
-    """How well the fitted outputs are explained, and what speaks against the model."""
+    """How well the fitted outputs are explained in time."""
 
-    # The names of the fields but `findings` are keys of fit.json.
+    # The names of the first three fields are keys of fit.json.
     judged: tuple[OutputAdequacy, ...] = ()
-    findings: tuple[Finding, ...] = ()
     by_chance: bool = False
     """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
     ahead: float | None = None
     """[s] that is predicted at most where that, and no simulation, was judged"""
+    unmoved: tuple[str, ...] = ()
+    """outputs of which nothing is explained, though what is left may be noise"""
+    still: tuple[str, ...] = ()
+    """outputs that never move, of which nothing is judged"""
+    unstable: bool = False
+    """whether the model is, over the length of the record"""
 
     @property
     def denied(self) -> bool:
-        """True if a finding shows that the model does not explain the record."""
-        return any(f.denies for f in self.findings)
+        """Whether an output is not explained."""
+        return self.by_chance or any(not output.adequate for output in self.judged)
 
 
 class Evidence(NamedTuple):
@@ -123,6 +121,27 @@ class Evidence(NamedTuple):
     simulation: of an unstable model"""
 
 
+def misses(expected: Mapping[str, float]) -> bool:
+    """Whether a simulation misses an output by more than its disturbance lets expect.
+
+    Args:
+        expected: by output the power of its error over that which is expected.
+    """
+    return max(expected.values()) > EXPECTED
+
+
+def joined_metrics(name: str, records: Sequence[Record]) -> Metrics:
+    """Of one output over all records that have it.
+
+    Args:
+        name: the output.
+        records: by flight.
+    """
+    both = [(r.measured[name], r.simulated[name]) for r in records if name in r.measured]
+    measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
+    return metrics(measured, predicted)
+
+
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     """Whether the model is adequate to the fitted flights.
 
@@ -134,81 +153,19 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     disturbed = evidence.error_ratio is not None
     # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
     unstable = disturbed and evidence.ahead is None and is_unstable(problem, params)
+    still = tuple(n for n in evidence.agreement if _still(n, evidence.records))
     outputs = tuple(
         _of_output(name, m, evidence, unstable)
         for name, m in evidence.agreement.items()
-        if not _still(name, evidence.records)
+        if name not in still
     )
     bad = [output for output in outputs if not output.adequate]
     if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
-        return _nothing_shown(outputs)
-    unexplained = [o for o in outputs if o.adequate and _nothing_explained(o, evidence)]
-    doubted = [*bad, *(output for output in outputs if output.doubtful)]
+        outputs = tuple(output._replace(adequate=False) for output in outputs)
+        return Adequacy(outputs, by_chance=True, still=still)
+    unmoved = tuple(o.output for o in outputs if o.adequate and _nothing_explained(o, evidence))
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
-    apart = len(doubted) < len(outputs)
-    findings = []
-    for output in doubted:
-        # One remedy, the most telling.
-        ways = advice_for(problem, output, evidence.records, unstable, apart)[:1]
-        findings.append(_not_explained(output, evidence.ahead, ways))
-    return Adequacy(
-        outputs,
-        (
-            *findings,
-            *_as_expected(outputs, evidence.ahead),
-            *(_unexplained(output) for output in unexplained),
-            *(_stays(n) for n in evidence.agreement if _still(n, evidence.records)),
-        ),
-        ahead=evidence.ahead,
-    )
-
-
-def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
-    """Whether a model is adequate to measured frequency responses: by the squared errors over their
-    variance, which gusts do not change, while a simulation in time knows nothing of gusts.
-
-    Args:
-        agreement: of the model's responses with the measured ones; None where none were fitted.
-    """
-    if agreement is None:
-        return None
-    findings = [note("frequency.left-out", s) for s in agreement.sentences]
-    if agreement.misfit:
-        criterion = f"95 %: {agreement.lower95:.3g} to {agreement.upper95:.3g}"
-        misfit = Finding(
-            "adequacy.response-errors",
-            "doubt" if agreement.doubt else "note",
-            agreement.misfit,
-            agreement.chi_squared,
-            criterion,
-            brief=agreement.doubt,
-            denies=bool(agreement.doubt),
-        )
-        findings.insert(0, misfit)
-    return Adequacy((), tuple(findings))
-
-
-def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[Finding]:
-    """What looks bad and is what the estimated disturbance makes."""
-    if ahead is not None:
-        vafs = ", ".join(f"{output.output} {vaf_text(output.vaf)}" for output in outputs)
-        words = (
-            "No simulation of the model can follow the record, since it is unstable over its "
-            "length or the disturbance moves it beyond where it is nearly linear: it is judged by "
-            f"predictions up to {ahead:g} s ahead from the filter's state (VAF: {vafs})."
-        )
-        return [note("adequacy.judged-ahead", words)]
-    return [
-        note(
-            "adequacy.disturbance-hides",
-            f"Driven by the inputs alone, the model follows {output.output} worse than its mean "
-            f"does (VAF {vaf_text(output.vaf)}), as the estimated disturbance lets expect. If none "
-            "acted, are the columns, signs and units the right ones?",
-            output.output,
-        )
-        for output in outputs
-        if output.disturbed_below_mean
-    ]
+    return Adequacy(outputs, False, evidence.ahead, unmoved, still, unstable)
 
 
 _BY_CHANCE = 1e-3
@@ -249,56 +206,9 @@ def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
     return bool(scipy.special.chdtrc(unknowns, max(gain, 0.0)) >= _BY_CHANCE)
 
 
-def _unexplained(output: OutputAdequacy) -> Finding:
-    name = output.output
-    if output.against_disturbance is not None:
-        words = (
-            f"The model explains nothing of {name}: simulated VAF "
-            f"{vaf_text(output.vaf)}, and one step ahead the filter predicts it hardly "
-            "better than its mean or the sample before. Either nothing moves it, or what "
-            "the log has there is noise or vibration."
-        )
-    else:
-        words = (
-            f"The model explains nothing of {name} (VAF {vaf_text(output.vaf)}), no "
-            "more than as many unknowns explain of noise alone; the other outputs carry the fit. "
-            "Its residuals are white: either the inputs do not move it, or what the log has there "
-            "is no measurement."
-        )
-    return Finding(UNEXPLAINED, "doubt", words, output.vaf, "VAF", (name,))
-
-
-def _stays(name: str) -> Finding:
-    return Finding(
-        "quality.never-moves",
-        "doubt",
-        f"The measured {name} never moves: its VAF is undefined, and nothing of it is judged. Is "
-        "it the right column, and does the sensor work?",
-        subjects=(name,),
-    )
-
-
 def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
     """The measured output (any,), flight after flight."""
     return np.concatenate([r.measured[name] for r in records if name in r.measured])
-
-
-def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
-    words = " and ".join(f"{output.output} (VAF {vaf_text(output.vaf)})" for output in outputs)
-    found = Finding(
-        BY_CHANCE,
-        "refuse",
-        f"The response does not stand out of the noise in {words}: as many unknowns explain "
-        "as much of noise alone. Use larger or more inputs, a longer record, or an output with "
-        "less noise.",
-        max(o.vaf for o in outputs),
-        "VAF",
-        tuple(o.output for o in outputs),
-        brief="noise alone is explained as well",
-        denies=True,
-    )
-    outputs = tuple(output._replace(adequate=False) for output in outputs)
-    return Adequacy(outputs, (found,), by_chance=True)
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
@@ -351,64 +261,10 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
-def _not_explained(output: OutputAdequacy, ahead: float | None, ways: list[str]) -> Finding:
-    vaf = f"VAF of {output.output} is {vaf_text(output.vaf)}"
-    if output.adequate:
-        words = f"{vaf}, below {percent(GATE, 0)}, and its residuals are not white."
-        code, severity = "adequacy.below-gate", "note"
-    else:
-        code, severity, words = NOT_EXPLAINED, "doubt", _reason(output, ahead)
-    return Finding(
-        code,
-        severity,
-        " ".join([words, *ways]),
-        output.vaf,
-        f"VAF, {GATE:g}",
-        (output.output,),
-        brief=f"{vaf}, less than its mean" if output.vaf < 0 else vaf,
-        denies=not output.adequate,
-    )
-
-
-def _reason(output: OutputAdequacy, ahead: float | None) -> str:
-    """Why an output is not explained."""
-    name, vaf, ratio = output.output, output.vaf, output.against_disturbance
-    if ahead is not None:
-        return (
-            f"{name} predicted up to {ahead:g} s ahead misses the measured one by "
-            f"{np.sqrt(ratio or np.nan):.2g} times what the estimated disturbance explains (VAF "
-            f"{vaf_text(vaf)}, autocorrelation of the innovations {output.lag1:+.2f} at one "
-            "sample)."
-        )
-    if not np.isfinite(vaf):
-        return f"The simulated {name} is not finite: nothing of it is explained."
-    if vaf < 0:
-        return (
-            f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
-            f"{vaf_text(vaf)}): its parameters mean little. Are the columns, signs and units the "
-            "right ones, and the start values near?"
-        )
-    if ratio is not None and ratio > EXPECTED:
-        return (
-            f"The simulated {name} misses the measured one by {ratio**0.5:.2g} times what the "
-            f"estimated disturbance explains (VAF {vaf_text(vaf)})."
-        )
-    if ratio is not None:
-        return (
-            f"The innovations of {name} are far from white (autocorrelation {output.lag1:+.2f} "
-            f"at one sample) and its simulation explains little (VAF {vaf_text(vaf)})."
-        )
-    return (
-        f"The model explains {explained_text(output.explained)} of what in {name} is not white "
-        f"noise, expected at least {percent(EXPLAINED, 0)} (VAF {vaf_text(vaf)}); the acceptance "
-        "card asks for a VAF of 90 %."
-    )
-
-
 # A fit whose model explains nothing of what was measured determines nothing of it either.
 
 
-def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
+def explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
     """The verdict; where every output is followed worse than by its mean no parameter is
     determined.
 
@@ -421,13 +277,9 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
     worse = bool(judged) and all(o.vaf < 0 for o in adequacy.judged)
     if not adequacy.denied or adequacy.ahead is not None or not worse:
         return verdict
-    outputs = listed([o.output for o in adequacy.judged])
-    sentence = (
-        f"The data do not determine {listed(verdict.names, 'or')}: the model explains nothing of "
-        f"{outputs} at this optimum. Start nearer, from several points (fit.starts), or from what "
-        "the data say (start: equation-error)."
-    )
-    return verdict.nothing(sentence)
+    outputs = [o.output for o in adequacy.judged]
+    words = sentence("verdict.model-explains-nothing", names=verdict.names, outputs=outputs)
+    return verdict.nothing(words)
 
 
 # Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
@@ -436,7 +288,7 @@ def unless_explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
 # starts, or with another disturbance, it is something else, with an interval as narrow.
 
 
-def unless_inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
+def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
     """The verdict; where the inputs explain nothing that determines no parameter.
 
     Args:
@@ -452,16 +304,14 @@ def unless_inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict)
     # Written so that a gain that is no number changes nothing.
     if not scipy.special.chdtrc(free, max(gain, 0.0)) >= _BY_CHANCE:
         return verdict
-    names = sorted({n for flight in at.data.flights for n in _moving(flight)})
-    sentence = (
-        f"The data do not determine {listed(verdict.names, 'or')}: {listed(names)} "
-        f"{'explain' if len(names) > 1 else 'explains'} nothing of what was measured (twice the "
-        f"log-likelihood gained by the inputs is {max(gain, 0.0):.2g}, chance alone makes up to "
-        f"{scipy.special.chdtri(free, _BY_CHANCE):.2g}), so that the estimates are those of the "
-        "disturbance and the noise. Larger inputs are needed, or other columns: are these the "
-        "signals that move the machine?"
+    words = sentence(
+        "verdict.inputs-explain-nothing",
+        names=verdict.names,
+        inputs=sorted({n for flight in at.data.flights for n in _moving(flight)}),
+        gain=max(gain, 0.0),
+        chance=scipy.special.chdtri(free, _BY_CHANCE),
     )
-    return verdict.nothing(sentence)
+    return verdict.nothing(words)
 
 
 def gain_of_inputs(at: Solution, e: Evaluation) -> float:

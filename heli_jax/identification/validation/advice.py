@@ -1,9 +1,8 @@
 """What to do about an output that the model does not explain."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -13,6 +12,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.validation.metrics import cross_correlation
+from heli_jax.messages import sentence
 from heli_jax.simulation.simulate import simulate
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -73,11 +73,11 @@ class Record(NamedTuple):
 def advice_for(
     problem: Problem,
     output: OutputAdequacy,
-    records: tuple[Record, ...],
+    records: Sequence[Record],
     unstable: bool,
     apart: bool,
-) -> list[str]:
-    """What fits the case, most telling first; only what this problem can do.
+) -> str:
+    """What to do about an output that is not explained: the most telling that this problem can do.
 
     Args:
         problem: what was fitted: what it has switched on already is no advice.
@@ -87,24 +87,40 @@ def advice_for(
         apart: whether other outputs are followed well: then this one's sensor is at fault, not the
             inputs, which all outputs share.
     """
-    wrong_sign, ways = _sign_or_lag(problem, output.output, records, apart)
-    ways += _windows(problem, _diverges(output.output, records), unstable)
-    # With the sign turned the whole response is left over, and that is slow too.
-    output_error = not estimator_of(problem.method).process_noise
-    if output.lag1 > FAR_FROM_WHITE and output_error and not wrong_sign:
-        ways.append(_slow_residual(problem, output))
-    if not ways and output.vaf >= 0:
-        ways.append(
-            "Are the columns, signs and units the right ones, and the start values near? Several "
-            "starts (fit.starts) tell a poor optimum from a poor model."
+    name, filtered = output.output, estimator_of(problem.method).process_noise
+    correlation, at_start, lag = _agreement(problem, name, records)
+    if min(correlation, at_start) < AGAINST:
+        inputs = naming.names(problem.model.Inputs)
+        code = "advice.sign" if correlation < AGAINST else "advice.sign-at-start"
+        return sentence(code, output=name, inputs=inputs)
+    # The lag of signals that hardly agree anywhere is one of chance.
+    if lag and correlation > -AGAINST and not problem.nuisance.time_shift:
+        # A shift is shared by all outputs, and windows leave no room for one.
+        code = "advice.lag" if apart or problem.window is not None else "advice.lag-of-all"
+        later = "later" if lag > 0 else "earlier"
+        return sentence(code, output=name, seconds=abs(lag), later=later)
+    diverged = _diverges(name, records)
+    if problem.window is not None and diverged:
+        return sentence("advice.shorter-windows")
+    # Filter error corrects its states at every sample, and needs no windows.
+    if problem.window is None and (diverged or unstable) and not filtered:
+        return sentence(
+            "advice.windows",
+            state="" if problem.nuisance.initial_state else "fit.nuisance.initial_state",
+            shift="fit.nuisance.time_shift" if problem.nuisance.time_shift else "",
         )
-    return ways
+    if output.lag1 > FAR_FROM_WHITE and not filtered:
+        axes = disturbable(problem.model)
+        code = "advice.disturbance" if axes else "advice.other-model"
+        return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
+    return sentence("advice.columns") if output.vaf >= 0 else ""
 
 
-def _sign_or_lag(
-    problem: Problem, name: str, records: tuple[Record, ...], apart: bool
-) -> tuple[bool, list[str]]:
-    """Whether an output moves against the measured one, and what to do about that or its lag."""
+def _agreement(
+    problem: Problem, name: str, records: Sequence[Record]
+) -> tuple[float, float, float]:
+    """Correlation of an output with the simulated one, the same at the start values, and the lag of
+    the first [s]."""
     # The longest record tells most.
     i = max(
         (i for i, r in enumerate(records) if name in r.measured),
@@ -114,66 +130,14 @@ def _sign_or_lag(
     correlation, lag = _alignment(measured, records[i].simulated[name], dt)
     # A parameter that keeps its sign shrinks until nothing moves: the start still tells.
     at_start = _alignment(measured, _at_start(problem, problem.training[i], name), dt)[0]
-    if min(correlation, at_start) < AGAINST:
-        inputs = " and ".join(naming.names(problem.model.Inputs))
-        the = "The" if correlation < AGAINST else "At the start values the"
-        return True, [
-            f"{the} simulated {name} moves against the measured one: check the signs "
-            f"and columns of {name} and {inputs}, and the signs of the start values."
-        ]
-    # The lag of signals that hardly agree anywhere is one of chance.
-    if abs(lag) > 0 and correlation > -AGAINST and not problem.nuisance.time_shift:
-        late = "later" if lag > 0 else "earlier"
-        # A shift is shared by all outputs, and windows leave no room for one.
-        shift = ", or set fit.nuisance.time_shift: true"
-        remedy = "" if apart or problem.window is not None else shift
-        return False, [
-            f"The simulated {name} agrees better {abs(lag):.3g} s {late}: check the time "
-            f"stamps{remedy}."
-        ]
-    return False, []
-
-
-def _windows(problem: Problem, diverged: bool, unstable: bool) -> list[str]:
-    """Where errors grow along the record: multiple shooting, or shorter windows of it."""
-    if problem.window is not None:
-        if not diverged:
-            return []
-        return ["The simulation diverges within its windows: make them shorter."]
-    # Filter error corrects its states at every sample, and needs no windows.
-    if not (diverged or unstable) or estimator_of(problem.method).process_noise:
-        return []
-    why = "diverges" if diverged else "is of an unstable model, in which any error grows"
-    needs = "" if problem.nuisance.initial_state else ", fit.nuisance.initial_state on"
-    needs += ", fit.nuisance.time_shift off" if problem.nuisance.time_shift else ""
-    return [
-        f"The simulation {why}: simulate in windows with initial states of their own "
-        f"(multiple shooting; fit.shooting: {{window: 2.0}}{needs})."
-    ]
-
-
-def _slow_residual(problem: Problem, output: OutputAdequacy) -> str:
-    slow = (
-        f"What is left of {output.output} is slow (autocorrelation {output.lag1:+.2f} at one "
-        "sample): "
-    )
-    axes = disturbable(problem.model)
-    if not axes:
-        return slow + (
-            "dynamics, inputs or a disturbance that the model lacks; it has no axis to "
-            "disturb, so the remedy is a model that has them."
-        )
-    return slow + (
-        "a disturbance, or dynamics that the model lacks. For the first, method: "
-        f"filter-error with disturbance: {{axis: {axes[0]}, poles: 1}}."
-    )
+    return correlation, at_start, lag
 
 
 def _at_start(problem: Problem, flight: Flight, name: str) -> np.ndarray:
     """The output (N,) simulated at the start values from the model's own initial state."""
     # In one piece even where the fit has windows: the sign of a response shows from its beginning.
-    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    params = naming.replace(problem.start_params(), **known)
+    start = {n: free.start for n, free in problem.free.items()}
+    params = problem.params_with(start | flight.known)
     run = simulate(problem.model, params, flight, substeps=problem.substeps)
     return np.asarray(getattr(run.outputs, name))
 
@@ -201,7 +165,7 @@ def _alignment(measured: np.ndarray, simulated: np.ndarray, dt: float) -> tuple[
     return float(c[best]), (best - lags) * dt
 
 
-def _diverges(name: str, records: tuple[Record, ...]) -> bool:
+def _diverges(name: str, records: Sequence[Record]) -> bool:
     """Whether in some flight the simulation leaves what was measured by far."""
     for r in records:
         if name not in r.measured:

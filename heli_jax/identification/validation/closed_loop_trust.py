@@ -36,7 +36,6 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.finding import Finding
 from heli_jax.identification.estimation.frequency_instrument import (
     PART,
     STRONG,
@@ -54,7 +53,6 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.follows_response import Feedback
 
-CLOSED_LOOP = "loop.no-instrument"
 TRUSTED = 1.4
 """stated standard deviations by which feedback may have moved an estimate that is trusted: its
 interval then covers two thirds of the time"""
@@ -379,51 +377,6 @@ def information(
     return J.T @ J
 
 
-def feedback_trust(moved: Mapping[str, Moved], loop: Loop) -> list[Finding]:
-    """The parameters that feedback may have moved; nothing where no loop is closed.
-
-    Args:
-        moved: of `moved_by_feedback`.
-        loop: who closes it.
-    """
-    if not (loop.closed and moved):
-        return []
-    doubted = untrusted(moved, loop)
-    of = f" for {' and '.join(loop.inputs)}" if loop.instruments else ""
-    if not any(one.present for one in loop.found):
-        of += " (the model is unstable, and the record does not grow: somebody holds the vehicle)"
-    brief = "closed loop without an instrument"
-    criterion = f"part of the input that feedback may have brought in, {MAY_BE:g}"
-    most = max(m.part for m in (moved[n] for n in doubted or moved))
-    if not doubted:
-        share = f"up to {100 * most:.0f}" if most >= 0.01 else "less than 1"
-        words = (
-            f"Closed loop without an instrument{of}: {share} % of the input may be "
-            "gusts that feedback brought in, where these parameters show; no interval allows for "
-            "that. Nothing shows that it moved them, and nothing that it did not."
-        )
-        return [Finding(CLOSED_LOOP, "note", words, most, criterion, tuple(loop.inputs))]
-    each = ", ".join(f"{n} ({100 * moved[n].part:.0f} %)" for n in doubted)
-    inputs = " and ".join(loop.inputs) if loop.instruments else "the inputs"
-    words = (
-        f"Closed loop without an instrument{of}: so much of {inputs} may be gusts that feedback "
-        f"brought in, where these parameters show: {each}. Log the excitation and name it "
-        "(signals.instruments), or use method: filter-error with a disturbance."
-    )
-    return [
-        Finding(
-            CLOSED_LOOP,
-            "doubt",
-            words,
-            most,
-            criterion,
-            tuple(loop.inputs),
-            brief=brief,
-            distrusts=doubted,
-        )
-    ]
-
-
 # Which estimates by instrument are not to be trusted: the excitation is weak where they show.
 #
 # An input follows its excitation only where that has power. Elsewhere the estimate leans on what
@@ -490,28 +443,6 @@ def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " 
     hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
     weak = np.interp(at.noise.whitening.windows.hz, hz, F) < STRONG
     return mean_share(by_line.sum(axis=0))(by_line[weak].sum(axis=0))
-
-
-def weak_note(names: Sequence[str]) -> list[Finding]:
-    """What a fit says of them.
-
-    Args:
-        names: of `weak_by_instrument`.
-    """
-    if not names:
-        return []
-    words = (
-        f"Weak instrument: {', '.join(names)} show at frequencies at which the inputs hardly "
-        f"follow the excitation (F below {STRONG:g}, all inputs together). They may be off by "
-        "many of their standard deviations. Fly a sweep that begins at lower frequencies or is "
-        "stronger there, or longer records."
-    )
-    brief, names = "weak instrument", tuple(names)
-    return [
-        Finding(
-            "loop.weak-instrument", "doubt", words, None, "", names, brief=brief, distrusts=names
-        )
-    ]
 
 
 def _followed(

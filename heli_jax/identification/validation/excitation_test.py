@@ -11,7 +11,7 @@ Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System 
 (1999), 16.6, for residuals against inputs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -19,31 +19,17 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import EXPLAINED, Adequacy
-from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import p_value
 
-WRONG_OPTIMUM, FOLLOWS = "search.wrong-optimum", "dynamics.residual-follows-excitation"
-NO_ANSWER = "excitation.no-output-follows"
-_NEARLY_ALL = 0.9
-"""part explained of each output whose residual follows the inputs, from which on a wrong optimum is
-the less likely cause"""
-_SURE = 1e-4
-"""p value below which a residual that follows the excitation takes all intervals away"""
 LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
 """lines of the lowest band, and how much wider the next one is"""
-_DIVERGED = -10.0
-"""VAF of a simulation below which it has left the record"""
-
 
 class Followed(NamedTuple):
     """What of an output's residual follows the excitation."""
@@ -53,93 +39,6 @@ class Followed(NamedTuple):
     """part of the output's power that follows the excitation which the model explains"""
     by_chance: float = 0.0
     """standard deviation of that part"""
-
-
-def _in_words(followed: Followed) -> str:
-    part = f"{100 * followed.explained:.0f} % explained"
-    # No share of anything: with no model at all less would be left.
-    part = part if followed.explained >= 0.0 else "the model is worse there than none"
-    return f"p {p_value(followed.p_value)}, {part}"
-
-
-def by_excitation(
-    problem: Problem, at: Solution, agreement: Mapping[str, Metrics]
-) -> Adequacy | None:
-    """Whether a model fitted in frequency is adequate; None of a method that is judged in time.
-
-    Args:
-        problem: with the flights, their inputs and instruments.
-        at: where the fit ended.
-        agreement: of the simulation in time, by output.
-    """
-    estimator = at.layout.estimator
-    if not estimator.noise_spectrum or estimator.fits_responses:
-        return None
-    followed = residual_against_excitation(problem, at)
-    if not followed:
-        return None
-    failed = {n: f for n, f in followed.items() if f.p_value < LEVEL / len(followed)}
-    bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
-    diverged = _diverged(agreement)
-    if not failed:
-        return Adequacy((), tuple(diverged))
-    direct = at.data.flights[0].by_instrument is None
-    what = "the inputs" if direct else "the excitation"
-    numbers = ", ".join(f"{n} ({_in_words(f)})" for n, f in failed.items())
-    words = f"The residual still follows {what} in {numbers}: the model, or its estimates, are "
-    code, remedy = FOLLOWS, "wrong there, and no interval allows for that."
-    # An unstable model fits at its frequencies whatever the ends of the record let it: that its
-    # simulation leaves the record is excused only where nothing else speaks against it.
-    astray = bool(diverged) and direct and not bad
-    if astray:
-        nearly = all(f.explained >= _NEARLY_ALL for f in failed.values())
-        code = FOLLOWS if nearly else WRONG_OPTIMUM
-        remedy = (
-            "wrong there. Feedback made it, or it is a wrong optimum: log the excitation "
-            "(signals.instruments), or start with other signs or from several points (fit.starts)."
-        )
-    least = min(f.p_value for f in failed.values())
-    found = Finding(
-        code,
-        "doubt",
-        words + remedy,
-        least,
-        f"probability of as much by chance, {LEVEL / len(followed):.2g}",
-        tuple(failed),
-        brief=f"the residual of {' and '.join(failed)} follows {what}",
-        denies=bool(bad) or astray,
-        distrusts=at.layout.of_interest if least < _SURE else (),
-    )
-    return Adequacy((), (found, *diverged))
-
-
-def unless_unrelated(problem: Problem, adequacy: Adequacy) -> Adequacy:
-    """The adequacy of a fit in frequency, none where no output follows what excites the vehicle.
-
-    Residuals that do not follow the excitation are no merit where the output does not either.
-
-    Args:
-        problem: with the flights, their inputs and instruments.
-        adequacy: as judged by the residuals alone.
-    """
-    p_values = outputs_against_excitation(problem)
-    if not p_values or min(p_values.values()) < LEVEL / len(p_values):
-        return adequacy
-    what = "excitation" if instruments_of(problem) else "inputs"
-    numbers = ", ".join(f"{n} (p {p_value(p)})" for n, p in p_values.items())
-    found = Finding(
-        NO_ANSWER,
-        "refuse",
-        f"No output follows the {what} beyond chance: {numbers}. So these data say nothing of the "
-        "model. Is it the right column, and the same clock? Else use larger or more inputs, or a "
-        "longer record.",
-        min(p_values.values()),
-        f"p value, {LEVEL / len(p_values):.2g}",
-        tuple(p_values),
-        brief=f"no output follows the {what}",
-        denies=True,
-    )
-    return Adequacy((), (found,), by_chance=True)
 
 
 def outputs_against_excitation(problem: Problem) -> dict[str, float]:
@@ -176,18 +75,6 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
 def _between_ends(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     """A signal less the straight line from its first sample to its last."""
     return y - np.linspace(y[0], y[-1], y.size)
-
-
-def _diverged(agreement: Mapping[str, Metrics]) -> list[Finding]:
-    names = [n for n, m in agreement.items() if not m.vaf >= _DIVERGED]
-    if not names:
-        return []
-    words = (
-        f"Simulated in time from its initial state the model leaves the record in "
-        f"{', '.join(names)}: it is unstable, or nearly, and an error of its start grows. The fit "
-        "simulates nothing, and is judged at its frequencies."
-    )
-    return [note("adequacy.simulation-leaves-record", words, *names)]
 
 
 def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:

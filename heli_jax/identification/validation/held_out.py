@@ -1,6 +1,5 @@
 """Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,9 +19,6 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
-from heli_jax.identification.validation.adequacy import WORSE
-from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import vaf_text
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -131,30 +127,6 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     # As long as one window that holds them all.
     windows = tuple((1, count * m) for count, m in layout.windows)
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
-
-
-def worse_than_mean(agreement: Mapping[str, Metrics]) -> list[Finding]:
-    """Outputs of flights held out that the model follows worse than their mean, by more than chance
-    makes of one that does not respond.
-
-    Args:
-        agreement: by output, over all flights held out.
-    """
-    return [
-        Finding(
-            "held-out.worse-than-mean",
-            "doubt",
-            f"Held out: the model follows {name} worse than its mean does (VAF {vaf_text(m.vaf)}): "
-            "it does not predict flights that it was not fitted to.",
-            m.vaf,
-            f"VAF, {WORSE:g}",
-            (name,),
-            brief=f"held out, VAF of {name} is {vaf_text(m.vaf)}",
-            denies=True,
-        )
-        for name, m in agreement.items()
-        if not m.vaf >= WORSE
-    ]
 
 
 def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Finding]:

@@ -31,8 +31,8 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.late_inputs import LATE
 from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
-from heli_jax.identification.validation.unmodelled import LAG
 
+LAG = "dynamics.residual-follows-input"
 _CLEAR = 5.0
 """sds from zero, from which on a shift is spoken of; of twice the log-likelihood the square"""
 _FARTHEST = 0.5

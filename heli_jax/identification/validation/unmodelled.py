@@ -12,7 +12,7 @@ constant takes up.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
-from heli_jax.finding import HALF_INTERVAL, Finding
+from heli_jax.finding import HALF_INTERVAL
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate, simulated_outputs
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -38,7 +38,6 @@ from heli_jax.identification.validation.score_test import (
     step_to_least,
     strongest,
 )
-from heli_jax.numbers import p_value
 
 # An output that is slower than the grid at its own samples, for what needs a row of them.
 
@@ -322,8 +321,6 @@ def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
     return out
 
 
-LAG = "dynamics.residual-follows-input"
-"""the code of what answers an input later than the model, or beside it"""
 LEVEL, IN_COLOUR = 0.01, 1e-3
 """of all outputs and questions together; and where residuals in time are autocorrelated, as in
 strong gusts: what whitens them is then too short to leave nothing"""
@@ -335,33 +332,53 @@ _ENOUGH = 1.0
 """of twice the log-likelihood, by which a further step says nothing else"""
 
 
+class Unmodelled(NamedTuple):
+    """What the residual of an output follows beyond chance."""
+
+    output: str
+    kind: Literal["input", "amplitude", "flights", "time"]
+    """an input, later or beside the model; what is not linear of the motion; parameters that differ
+    between flights, or change over the record"""
+    of: tuple[str, ...]
+    """the input, or the flights"""
+    gain: float
+    """of twice the log-likelihood"""
+    p_value: float
+    frequency: float | None
+    """[rad/s] of a mode that is missing; None where the answer has none"""
+    shifts: dict[str, float]
+    """by unknown of interest how far this moves it [SI]"""
+    far: tuple[str, ...] = ()
+    """of amplitude: the unknowns that it moves by more than noise leaves of their intervals"""
+
+
 def unmodelled(
-    at: Solution,
-    e: Evaluation,
-    *,
-    coloured: bool = False,
-    flights: Sequence[str] = (),
-) -> tuple[Finding, ...]:
-    """Findings of what the residuals follow beyond chance, at most one an output.
+    at: Solution, e: Evaluation, flights: Sequence[str], *, coloured: bool = False
+) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
+    """What the residuals follow beyond chance, at most one an output; and the probability that the
+    answer to the inputs asks for other values by chance, with the step to these [SI].
+
+    Output error takes slow drift for slow modes; filter error learns also from how its disturbance
+    goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
 
     An output that is slower than the grid is asked at its own samples. Of others with gaps, of a
     simulation that left the record, of windows and of sensors compared with each other nothing is
-    asked. Whoever asks has seen to it that inputs do not follow the
-    response: through a loop disturbances are in the inputs, and any residual follows these.
+    asked. Whoever asks has seen to it that inputs do not follow the response: through a loop
+    disturbances are in the inputs, and any residual follows these.
 
     Args:
         at: where the fit ended.
         e: what that tells.
-        coloured: whether the residuals in time are autocorrelated.
         flights: what each is called.
+        coloured: whether the residuals in time are autocorrelated.
     """
-    layout = at.layout
+    layout, nothing = at.layout, ([], (1.0, {}))
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
-        return ()
+        return nothing
     looked_at = longest(at)
     names = sorted({n for i in looked_at for n in layout.outputs[i] if usable(at, e, i, n)})
     if not names:
-        return ()
+        return nothing
     level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
     lacking, J = [], sensitivities(at, e)
     lines = {name: _lines(at, e, name, J) for name in names}
@@ -369,42 +386,15 @@ def unmodelled(
         asked = _of_output(at, lines[name])
         one = None if asked is None else _where_least(at, asked, name, level)
         if one is not None and one.strong.p_value < level:
-            lacking.append(_said(at, e, name, one, J, flights))
+            lacking.append(_told(at, e, name, one, J, flights))
     each = [[one for _, one in lines[name]] for name in names if lines[name]]
-    return (*lacking, *_asked_otherwise(at, e, each))
-
-
-def _asked_otherwise(
-    at: Solution, e: Evaluation, outputs: Sequence[Sequence[Lines]]
-) -> list[Finding]:
-    """A finding where the whitened answer to the inputs asks for other values of the parameters.
-
-    Output error takes slow drift for slow modes; filter error learns also from how its disturbance
-    goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
-    """
-    k = len(at.layout.of_interest)
-    chances = [pulled_away(lines, k) for lines in outputs]
-    if not chances or min(chances) * len(chances) > IN_COLOUR:
-        return []
-    p = min(1.0, min(chances) * len(chances))
-    shifts = step_to_least([one for lines in outputs for one in lines])[:k] * np.asarray(e.slopes)
-    words = (
-        f"The answer to the inputs asks for other values (p {p_value(p)}): a disturbance, drift or "
-        "the assumed place or spectrum of the gusts has moved the estimates. Compare method: "
-        "frequency-error (fit.also), or another disturbance (on, poles)."
-    )
-    return [
-        Finding(
-            "agreement.inputs-ask-otherwise",
-            "doubt",
-            words,
-            p,
-            f"probability of as much by chance, {IN_COLOUR:g}",
-            tuple(at.layout.of_interest),
-            dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
-            "the answer to the inputs asks for other values",
-        )
-    ]
+    k = len(layout.of_interest)
+    chances = [pulled_away(records, k) for records in each]
+    p = min(1.0, min(chances) * len(chances)) if chances else 1.0
+    if p > IN_COLOUR:
+        return lacking, (p, {})
+    step = step_to_least([one for records in each for one in records])[:k] * np.asarray(e.slopes)
+    return lacking, (p, dict(zip(layout.of_interest, step.tolist(), strict=True)))
 
 
 class _Asked(NamedTuple):
@@ -499,16 +489,16 @@ def _of_output(at: Solution, those: Sequence[tuple[int, Lines]]) -> _Asked | Non
     return _Asked(best, by_amplitude, over, float(deviance), odd, asked, before)
 
 
-def _said(
+def _told(
     at: Solution,
     e: Evaluation,
     name: str,
     one: _Asked,
     J: Mapping[tuple[int, str], np.ndarray],
     flights: Sequence[str],
-) -> Finding:
-    strong, moving, slopes = one.strong, moving_inputs(at), np.asarray(e.slopes)
-    k = slopes.size
+) -> Unmodelled:
+    strong, slopes = one.strong, np.asarray(e.slopes)
+    k, far = slopes.size, tuple[str, ...]()
     shifts = strong.shift[:k] * slopes
     if one.over_time or one.odd is not None:
         # The drive is the sensitivity of one parameter, which is off by the change itself as well.
@@ -516,58 +506,31 @@ def _said(
         change = strong.amount * slopes[changed]
         there = shifts[changed] + change
         shifts[changed] = max((shifts[changed], there, -change), key=abs)
-    first, own = of_one_clock(at, e, name)[0]
-    frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
-    where = f" near {frequency:.2g} rad/s" if strong.damping < 1.0 else ""
-    distrusts: tuple[str, ...] = ()
-    chance = f"twice the log-likelihood gains {strong.statistic:.3g}, p {p_value(strong.p_value)}"
+    kind: Literal["input", "amplitude", "flights", "time"] = "input"
+    of: tuple[str, ...] = ()
     if one.by_amplitude:
-        shifts = _by_amplitude(at, e, name, J) * slopes
+        kind, of, shifts = "amplitude", (), _by_amplitude(at, e, name, J) * slopes
         # The shift is a lower bound. It is held against the interval that noise alone leaves: one
         # that allows for coloured residuals is wide by what was found here.
-        by_noise = deviations(e.J)[:k] * np.abs(slopes)
-        far = np.abs(shifts) > HALF_INTERVAL * by_noise
-        distrusts = tuple(n for n, one in zip(at.layout.of_interest, far, strict=True) if one)
-        code, subjects = "dynamics.depends-on-amplitude", (name,)
-        brief = f"the response of {name} depends on amplitude"
-        remedy = (
-            "a saturation, a rate limit, a deadband, play, friction or another nonlinearity is "
-            "missing"
-        )
+        beyond = np.abs(shifts) > HALF_INTERVAL * deviations(e.J)[:k] * np.abs(slopes)
+        far = tuple(n for n, one in zip(at.layout.of_interest, beyond, strict=True) if one)
     elif one.odd is not None:
-        between = _between(one, flights)
-        code, subjects = "dynamics.flights-differ", (name, *between)
-        brief = f"the response of {name} differs between {' and '.join(between)}"
-        remedy = (
-            "mass, rotor speed or speed does, or the scale, sign or clock of a column. Fit the "
-            "flights by themselves, and compare (heli-jax compare)"
-        )
+        kind, of = "flights", _between(one, flights)
     elif one.over_time:
-        code, subjects = "dynamics.changes-over-record", (name,)
-        brief = f"the response of {name} changes over the record"
-        remedy = (
-            "rotor speed, mass or speed did, or the log's clock. Fit shorter windows, and compare "
-            "(heli-jax compare)"
-        )
+        kind, of = "time", ()
     else:
-        drive = moving[strong.drive]
-        code, subjects = LAG, (name, drive)
-        brief = f"the residual of {name} still follows {drive}{where}"
-        what = "a mode or a lag" if strong.damping < 1.0 else "dynamics"
-        remedy = (
-            f"the model lacks {what}, a constant that is held has another value (free it), or this "
-            "is a poor optimum (try fit.starts)"
-        )
-    return Finding(
-        code,
-        "doubt",
-        f"{brief[0].upper()}{brief[1:]} ({chance}): {remedy}.",
+        of = (moving_inputs(at)[strong.drive],)
+    first, own = of_one_clock(at, e, name)[0]
+    frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
+    return Unmodelled(
+        name,
+        kind,
+        of,
+        strong.statistic,
         strong.p_value,
-        f"probability of as much by chance, {LEVEL:g} over all outputs",
-        subjects,
+        frequency if strong.damping < 1.0 else None,
         dict(zip(at.layout.of_interest, shifts.tolist(), strict=True)),
-        brief,
-        distrusts=distrusts,
+        far,
     )
 
 

@@ -1,0 +1,49 @@
+"""Does the residual still follow something that is known: an input, the amplitude, the time?"""
+
+from collections.abc import Iterator
+
+from heli_jax.finding import Finding, found
+from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.validation.unmodelled import IN_COLOUR, LEVEL
+
+RESIDUAL_FOLLOWS_INPUT = "dynamics.residual-follows-input"
+_CODES = {
+    "input": RESIDUAL_FOLLOWS_INPUT,
+    "amplitude": "dynamics.depends-on-amplitude",
+    "flights": "dynamics.flights-differ",
+    "time": "dynamics.changes-over-record",
+}
+
+
+def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
+    """What the model lacks: a mode, an answer that depends on amplitude, or one that changes."""
+    for one in c.unmodelled[0]:
+        yield found(
+            _CODES[one.kind],
+            "doubt",
+            one.output,
+            *one.of,
+            value=one.p_value,
+            shifts=one.shifts,
+            distrusts=one.far,
+            output=one.output,
+            of=one.of,
+            gain=one.gain,
+            near=f"{one.frequency:.2g} rad/s" if one.frequency else "",
+            lacks="a mode or a lag" if one.frequency else "dynamics",
+            level=LEVEL,
+        )
+
+
+def inputs_ask_otherwise(c: Context) -> Iterator[Finding]:
+    """Whether the answer to the inputs alone asks for other values than the fit's."""
+    p, shifts = c.unmodelled[1]
+    if shifts:
+        yield found(
+            "agreement.inputs-ask-otherwise",
+            "doubt",
+            *c.at.layout.of_interest,
+            value=p,
+            shifts=shifts,
+            level=IN_COLOUR,
+        )

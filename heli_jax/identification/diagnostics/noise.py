@@ -1,0 +1,94 @@
+"""Are residuals, or innovations, white, and are noise and disturbance what the model says?"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import Finding, found
+from heli_jax.identification.diagnostics.context import Context, no_disturbance
+from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
+from heli_jax.identification.identifiability.through_inputs import of_disturbances
+from heli_jax.identification.unknowns.layout import disturbance_limits
+
+COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
+_FAR_TOO_NARROW = 0.2
+"""autocorrelation at one sample from which on intervals that do not allow for it are withdrawn:
+with it they are too narrow by more than a fifth, or the noise is not where the model has it"""
+
+
+def residuals_white(c: Context) -> Iterator[Finding]:
+    """Residuals or innovations that are not white, and what that does to the intervals."""
+    not_white = [name for name, w in c.whiteness.items() if not w.white] if c.fitted else []
+    if not not_white:
+        return
+    # By the correlation at one sample, which is the number that the sentence gives.
+    worst = max((c.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
+    estimator, converged = c.at.layout.estimator, c.status != "not-converged"
+    allowed = estimator.noise_spectrum or c.errors.coloured
+    narrow = converged and not allowed
+    yield found(
+        TOO_NARROW if narrow else COLOURED,
+        "doubt" if narrow else "note",
+        *not_white,
+        value=worst.lag1,
+        distrusts=c.free if narrow and abs(worst.lag1) > _FAR_TOO_NARROW else (),
+        errors=estimator.errors,
+        outside=worst.outside,
+        limit=_FAR_TOO_NARROW,
+        allowed="the intervals allow for it" if converged and allowed else "",
+    )
+
+
+def residuals_correlated(c: Context) -> Iterator[Finding]:
+    """Residuals of several outputs that go together, for which the intervals allow."""
+    if c.fitted and c.errors.coloured and c.correlated:
+        pairs, rho = list(c.correlated), list(c.correlated.values())
+        yield found("noise.outputs-correlated", "note", *pairs, correlations=rho)
+
+
+def disturbance_shows(c: Context) -> Iterator[Finding]:
+    """Disturbances that were looked for and do not show, or are not determined."""
+    if c.optimum is None:
+        return
+    if no_disturbance(c.optimum):
+        code = "noise.no-disturbance" if c.independent else "noise.other-disturbance"
+        yield found(code, "note", value=c.optimum.ratio)
+    else:
+        yield from _at_ends(c)
+    names = [d.name for d in disturbances_of(c.at.layout.model) if d.sigma in c.optimum.absent]
+    if names:
+        yield found("noise.disturbances-absent", "note", *names, limit=NO_DISTURBANCE)
+
+
+def _at_ends(c: Context) -> Iterator[Finding]:
+    """The parameters of the disturbance that ran to the end of what a record can show."""
+    layout, limits = c.at.layout, disturbance_limits(c.at.layout, c.at.data)
+    for i, name in enumerate(layout.disturbance):
+        at = float(c.at.z[len(layout.of_interest) + i])
+        low, high = (float(v) for v in limits[name])
+        if low < at < high or name in c.absent:
+            continue
+        # A correlation time shorter than a sample, or longer than the record.
+        short, long = (name not in layout.sigmas and end for end in (at <= low, at >= high))
+        meaning = "white noise" if short else "a random walk" if long else ""
+        unit = naming.unit(layout.model.Params, name) or ""
+        value = f"{np.exp(min(max(at, low), high)):.3g} {unit}".rstrip()
+        yield found("noise.disturbance-open", "note", name, ran_to=value, like=meaning)
+
+
+def disturbances_determined(c: Context) -> Iterator[Finding]:
+    """Parameters of several disturbances that the data do not tell apart."""
+    return iter(of_disturbances(c.at.layout, c.e, c.absent))
+
+
+def noise_as_stated(c: Context) -> Iterator[Finding]:
+    """Whether residuals are as large as the stated noise."""
+    for label, flight in c.flights if c.fitted else ():
+        for name, stated in flight.sd.items():
+            ratio = c.noise[f"{label}/{name}"] / stated
+            if not 0.5 < ratio < 2.0:
+                yield found(
+                    "noise.not-as-stated", "note", label, name, flight=label, value=ratio, name=name
+                )

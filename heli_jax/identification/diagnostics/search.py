@@ -1,0 +1,90 @@
+"""Did the search end at an optimum, and within what was stated?"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.finding import Finding, found
+from heli_jax.flights.instruments import own_instruments, own_said
+from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.unknowns.initial_guess import labels
+
+STOPPED = "search.stopped"
+FAR = 3.0
+"""standard deviations of a prior at which an estimate contradicts it"""
+
+
+def at_bound(c: Context) -> Iterator[Finding]:
+    """Estimates at their bounds: all estimates are those of a bound that the data do not bear
+    out."""
+    for name, estimate in c.estimates.items():
+        if estimate.at_bound:
+            # No key widens that of the shift.
+            code = "fit.shift-at-bound" if name == "time_shift" else "fit.at-bound"
+            yield found(code, "doubt", name, value=estimate.value, distrusts=c.estimates)
+
+
+def search_stopped(c: Context) -> Iterator[Finding]:
+    """A search that did not arrive, and what the data leave open where it may go on without end."""
+    # Rounding has a remedy of its own.
+    if c.optimum is None or c.arrived or c.rounding:
+        return
+    layout = c.at.layout
+    windows = sum(count for count, _ in layout.windows) > len(layout.windows)
+    code = "search.stopped-in-windows" if windows and layout.continuity is None else STOPPED
+    yield found(code, "doubt", value=float(sum(s for s, _ in c.optimum.trace)))
+    either = [{*v.undetermined, *v.without_effect} for v in (c.before, c.verdict)]
+    names = [n for n in c.verdict.names if n in either[0] & either[1]]
+    if names and np.all(np.isfinite(c.e.J)):
+        yield found("search.open-directions", "doubt", *names)
+
+
+def search_told(c: Context) -> Iterator[Finding]:
+    """What the search and the method report of how the optimum was reached."""
+    if c.optimum is not None:
+        names = [label for label, _ in c.flights]
+        yield from c.optimum.notes
+        yield from c.at.layout.estimator.notes(c.at, c.e, names, c.rounding)
+
+
+def prior_contradicted(c: Context) -> Iterator[Finding]:
+    """Estimates that have left their priors."""
+    for name, free in c.problem.free.items() if c.fitted else ():
+        if free.prior is not None:
+            away = abs(c.estimates[name].value - free.prior.mean) / free.prior.sd
+            if away > FAR:
+                yield found(
+                    "fit.prior-contradicted",
+                    "doubt",
+                    name,
+                    value=away,
+                    distrusts=(name,),
+                    limit=FAR,
+                )
+
+
+def profile_intervals(c: Context) -> Iterator[Finding]:
+    """Intervals that are those of the profile likelihood."""
+    if c.fitted and c.errors.limits:
+        yield found("uncertainty.profile-interval", "note", *c.errors.limits)
+
+
+def log_cautions(c: Context) -> Iterator[Finding]:
+    """What the logs say of their signals that biases a fit to them; once where flights agree."""
+    said: dict[str, Finding] = {}
+    flights = c.problem.flights
+    for label, flight in zip(labels(flights), flights, strict=True):
+        for caution in flight.source.cautions if flight.source else ():
+            said.setdefault(caution.sentence, caution.of(label))
+    yield from said.values()
+    own = own_instruments(c.problem.training, naming.names(c.problem.model.Inputs))
+    if own and c.problem.instrument is None:
+        yield found("loop.instrument-unused", "note", *own, said=own_said(own))
+
+
+def band_unused(c: Context) -> Iterator[Finding]:
+    """A stated band that is none of the fit's."""
+    estimator, band = c.at.layout.estimator, c.problem.frequency.band
+    if band is not None and estimator.noise_spectrum and not estimator.fits_responses:
+        yield found("frequency.band-unused", "note", low=band[0], high=band[1])
