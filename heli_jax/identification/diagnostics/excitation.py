@@ -4,6 +4,7 @@ from heli_jax.identification.validation.next_flight import missing_outputs, next
 from heli_jax.identification.validation.expected_accuracy import guessed_gusts
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 def _bands(c):
+    if c.fitted and c.status == "converged" and not c.adequacy.denied: return
     for f in bands(c.problem.training):
         if f.code == NOTHING_FOLLOWS and not c.fitted and f.value is not None and f.value < NOTHING:
             p = outputs_against_excitation(c.problem)
