@@ -396,14 +396,15 @@ class Context:
             return errors
         verdict = inputs_explain_nothing(self.at, self.e, errors.verdict)
         verdict, before = explains_nothing(verdict, self.adequacy), verdict
-        return errors._replace(
-            verdict=verdict, limits=errors.limits if verdict is before else {}
-        )
+        return errors._replace(verdict=verdict, limits=errors.limits if verdict is before else {})
 
     @property
     def explains(self) -> bool:
         """Whether the model explains anything of the record."""
-        return explains_nothing(self._by_likelihood.verdict, self.adequacy) is self._by_likelihood.verdict
+        return (
+            explains_nothing(self._by_likelihood.verdict, self.adequacy)
+            is self._by_likelihood.verdict
+        )
 
     @property
     def verdict(self) -> Verdict:

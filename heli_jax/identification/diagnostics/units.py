@@ -1,22 +1,44 @@
 from heli_jax.finding import Finding
 from heli_jax.identification.identifiability.sentences import listed
-from heli_jax.identification.validation.misread import doubtful_inputs, misread, record_doubts, scaled_by
-from heli_jax.identification.validation.signal_signs import (RATE_AGAINST_ANGLE, RATE_SCALE, against_start, rate_against_angle, sticks_of)
+from heli_jax.identification.validation.misread import (
+    doubtful_inputs,
+    misread,
+    record_doubts,
+    scaled_by,
+)
+from heli_jax.identification.validation.signal_signs import (
+    RATE_AGAINST_ANGLE,
+    RATE_SCALE,
+    against_start,
+    rate_against_angle,
+    sticks_of,
+)
 from heli_jax.finding import UNIT_IN_DOUBT
+
+
 def _all(c):
     at_start = (c.flights, c.start.simulated, sticks_of(c.problem.model))
-    for f in misread(c.problem): yield f
+    for f in misread(c.problem):
+        yield f
     for f in rate_against_angle(c.problem):
-        if c.fitted and f.code == RATE_SCALE and c.status != "not-converged": f = f._replace(distrusts=tuple(c.estimates))
+        if c.fitted and f.code == RATE_SCALE and c.status != "not-converged":
+            f = f._replace(distrusts=tuple(c.estimates))
         yield f
     for f in doubtful_inputs(*at_start):
-        if c.fitted and c.status != "not-converged": f = f._replace(distrusts=scaled_by(c.at, f.subjects[0]))
+        if c.fitted and c.status != "not-converged":
+            f = f._replace(distrusts=scaled_by(c.at, f.subjects[0]))
         yield f
     if not c.fitted or c.adequacy.denied:
         yield from against_start(*at_start)
+
+
 def _turned(c):
     return sign_notes(c.problem, c.estimates) if c.arrived else []
+
+
 _NEAR_ZERO = 0.2
+
+
 def sign_notes(problem, estimates):
     """Doubt about parameters that surely have the other sign than they began with, where they began
     with a value and not next to zero: a turned signal fits as well, and the start alone tells.
@@ -44,7 +66,6 @@ def sign_notes(problem, estimates):
         "points the other way (`invert: true`)."
     )
     return [Finding("signs.turned-from-start", "doubt", words, subjects=tuple(turned))]
-
 
 
 DIAGNOSTICS = (_all, _turned)
