@@ -74,6 +74,7 @@ _CONFIG = (
 )
 _OUT = _arg("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 _JSON = _arg("--json", help="everything, for other programs")
+_VERBOSE = _arg("--verbose", help="all findings in full (default: the three most severe)")
 _LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
 _OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
                   help="read as the configuration's first (default: its own)")
@@ -93,14 +94,14 @@ _WORKERS = (
 )
 _COMMANDS = {
     "fit": ("estimate parameters; write a run directory with a report", (
-        *_CONFIG, _OUT, _JSON, _RESUME, *_WORKERS,
+        *_CONFIG, _OUT, _JSON, _VERBOSE, _RESUME, *_WORKERS,
         _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
              help="a study (docs/studies.md): fit with each value, with several keys each "
              "combination; as --set repeated with one KEY, or study in CONFIG"),
         _arg("--reports", help="of a study: write each fit's page too, which takes seconds"),
     )),
     "compatibility": ("do a log's sensors agree? their errors", (*_CONFIG, _OUT)),
-    "check": ("identifiability, sampling and excitation before any fit", (*_CONFIG, _JSON)),
+    "check": ("identifiability, sampling and excitation before any fit", (*_CONFIG, _JSON, _VERBOSE)),
     "windows": ("which parts of a log say most, before any fit", (
         _OTHER_LOG, *_CONFIG,
         _arg("--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"),
@@ -359,7 +360,7 @@ def _fit(options: argparse.Namespace) -> int:
     if options.json and run.directory is not None:
         print((run.directory / "fit.json").read_text(encoding="utf-8"), end="")
     else:
-        output.print_fit(run)
+        output.print_fit(run, verbose=options.verbose)
     if failure is not None:
         raise failure
     return run.fit.exit_code
@@ -424,7 +425,7 @@ def _check(options: argparse.Namespace) -> int:
     if options.json:
         print(files.as_json(files.check_json(check)))
     else:
-        output.print_check(check)
+        output.print_check(check, verbose=options.verbose)
     hopeless = any(f.severity == "refuse" for f in check.findings)
     return DONE if check.verdict.identifiable and not hopeless else NOT_DETERMINED
 

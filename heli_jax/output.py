@@ -37,10 +37,17 @@ from heli_jax.terminal import print_table, tell
 from heli_jax.workflow import FitRun
 
 
-def print_fit(run: FitRun) -> None:
-    """Verdict, estimates, agreement and baseline on standard output."""
+def print_fit(run: FitRun, *, verbose: bool = False) -> None:
+    """Verdict, estimates, agreement and baseline on standard output.
+
+    Args:
+        run: the fit.
+        verbose: whether all findings are shown in full.
+    """
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    _print_outcome(fit)
+    # Did the optimiser arrive; what do the data determine; is the model adequate; doubts.
+    tell(": ".join(fit.outcome))
+    print_findings(fit.findings, verbose=verbose)
     stopped = fit.status == "not-converged"
     head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
     _tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), list(rows)))
@@ -117,12 +124,6 @@ def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
     return common | {n: nuisance[n] for n in most}
 
 
-def _print_outcome(fit: Fit) -> None:
-    """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
-    tell(": ".join(fit.outcome))
-    print_findings(fit.findings)
-
-
 def _print_handling(run: FitRun) -> None:
     """Handling qualities of model and data, and of which axes there are none."""
     if run.supplementary.responses is None:
@@ -193,8 +194,13 @@ def _print_baseline(b: Baseline) -> None:
         tell(f"  ! {sentence}")
 
 
-def print_check(check: Check) -> None:
-    """The identifiability at the initial guess, on standard output."""
+def print_check(check: Check, *, verbose: bool = False) -> None:
+    """The identifiability at the initial guess, on standard output.
+
+    Args:
+        check: what is known before a fit.
+        verbose: whether all findings are shown in full.
+    """
     verdict = check.verdict
     # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
     tell("At the start values (the fit judges at its estimates, which may differ):")
@@ -221,20 +227,21 @@ def print_check(check: Check) -> None:
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         tell(f"! {sentence}")
     tell("\nIs this log enough?")
-    print_findings(check.findings)
+    print_findings(check.findings, verbose=verbose)
 
 
 _IN_FULL = 3
 """findings that the terminal shows in full"""
 
 
-def print_findings(findings: Sequence[Finding]) -> None:
+def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
     """The most severe findings in full, and the others by their titles.
 
     Args:
         findings: the most severe first.
+        verbose: whether all are shown in full.
     """
-    shown = [f for f in findings if f.severity != "ok"][:_IN_FULL]
+    shown = findings if verbose else [f for f in findings if f.severity != "ok"][:_IN_FULL]
     for f in shown:
         tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]

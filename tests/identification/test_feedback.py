@@ -143,11 +143,11 @@ def test_the_delay_that_a_fit_found_is_used(tmp_path):
     (before,) = feedback_of(problem)
     assert before.present
     assert not before.delay_known
-    [said] = feedback_notes(problem, [before])
+    [said] = told(problem, [before], fitted=False)
     assert (said.code, said.severity, said.subjects) == ("loop.feedback", "doubt", ("da",))
     (after,) = feedback_of(problem, {"tau": (-0.0605, 0.001), "time_shift": (0.0, None)})
     assert (after.present, after.delay_known) == (False, True)
-    assert feedback_notes(problem, [after]) == []
+    assert [f.severity for f in told(problem, [after], fitted=False)] == ["ok"]
     # The delay of all inputs is added; one that may be zero moves nothing.
     (both,) = feedback_of(problem, {"tau": (-0.02, 0.001), "time_shift": (-0.0405, 0.001)})
     assert both.earlier == pytest.approx(0.08)

@@ -3,17 +3,14 @@ from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.validation.misread import (
     doubtful_inputs,
     misread,
-    record_doubts,
     scaled_by,
 )
 from heli_jax.identification.validation.signal_signs import (
-    RATE_AGAINST_ANGLE,
     RATE_SCALE,
     against_start,
     rate_against_angle,
     sticks_of,
 )
-from heli_jax.finding import UNIT_IN_DOUBT
 
 
 def _all(c):

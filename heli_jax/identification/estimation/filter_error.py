@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -354,32 +354,14 @@ class FilterError(Estimator):
     def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
         """What is wrong with the filter, and the remedy."""
         if ill:
-            words = _ILL + (_of_noiseless(at.data) or _OF_LITTLE_NOISE)
-            return [Finding("search.ill-conditioned", "doubt", words)]
+            return [found("search.ill-conditioned")]
         if at.layout.concentrated:
             return []
         size = float(np.sqrt(innovation_sums(e, at.noise)[0] / measured_count(at.data)))
         # The intervals are too narrow, or too wide, by the same factor.
         if 0.8 < size < 1.25:
             return []
-        words = (
-            f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
-            "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
-        )
-        brief = "the fixed noise is not that of the record"
-        criterion = "innovations over what is expected, 0.8 to 1.25"
-        everything = at.layout.of_interest
-        return [
-            Finding(
-                "noise.innovations-size",
-                "doubt",
-                words,
-                size,
-                criterion,
-                brief=brief,
-                distrusts=everything,
-            )
-        ]
+        return [found("noise.innovations-size", value=size, distrusts=at.layout.of_interest)]
 
 
 def _is_far(before: Noise, after: Noise) -> bool:
@@ -390,27 +372,6 @@ def _is_far(before: Noise, after: Noise) -> bool:
     ]
     level = abs(float(before.log_variance_ratio - after.log_variance_ratio))
     return bool(2.0 * abs(np.log(max(ratios))) + level > _FELL)
-
-
-_ILL = (
-    "The Kalman filter is ill-conditioned: next to the disturbance the measurement noise is too "
-    "small for the digits of a computer. These numbers are no result. "
-)
-_OF_LITTLE_NOISE = (
-    "State a measurement noise (sd) of at least the log's resolution, or begin with a smaller "
-    "sigma_w."
-)
-
-
-def _of_noiseless(data: Data) -> str:
-    """Why there is no noise to be found, and what to do, of the first flight with outputs that have
-    none; "" where all have some."""
-    for flight in data.flights:
-        outputs = {n: np.asarray(y) for n, y in flight.outputs.items()}
-        if names := noiseless(outputs):
-            words = noiseless_words({n: outputs[n] for n in names}, float(flight.dt))
-            return f"{words}. {REMEDY}"
-    return ""
 
 
 def filtered_flights(

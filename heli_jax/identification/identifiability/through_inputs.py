@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.identifiability.directions import projected
@@ -209,11 +209,7 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
     norms = np.linalg.norm(J[:, at], axis=0)
     shown = norms > _NO_EFFECT
     notes = [
-        note(
-            "identifiability.disturbance-without-effect",
-            f"{n} changes nothing in these data and cannot be estimated.",
-            n,
-        )
+        found("identifiability.disturbance-without-effect", "note", n)
         for n, seen in zip(names, shown, strict=True)
         if not seen
     ]
@@ -242,27 +238,13 @@ def _of_columns(
             tuple(n for n, w in zip(names, v, strict=True) if abs(w) > _TAKES_PART)
             for v in right[open_]
         ]
-        return [
-            note(
-                _EXCHANGEABLE,
-                f"{' and '.join(those)} are exchangeable in these data. Disturb one place less, or "
-                "fix one of them.",
-                *those,
-            )
-            for those in together
-        ]
+        return [found(_EXCHANGEABLE, "note", *those, correlation="") for those in together]
     # The unknowns are logarithms, so these sds are relative and one limit serves sizes and times.
     covariance = (right.T / sizes**2) @ right / np.outer(norms, norms)
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sds, sds)
     return [
-        note(
-            _EXCHANGEABLE,
-            f"{a} and {b} are hardly told apart (correlation {correlation[i, j]:+.2f}): disturb "
-            "one place less, or fix one of them.",
-            a,
-            b,
-        )
+        found(_EXCHANGEABLE, "note", a, b, correlation=f"{correlation[i, j]:+.2f}")
         for i, a in enumerate(names)
         for j, b in enumerate(names[:i])
         if abs(correlation[i, j]) > _TOGETHER and min(sds[i], sds[j]) > _VAGUE

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -130,19 +130,11 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
 
 
 def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Finding]:
-    notes = []
-    for label, simulated in zip(labels(held), e.simulated, strict=True):
-        if not all(np.isfinite(v).all() for v in simulated.values()):
-            words = (
-                f"{label}, held out: with the estimates the model's simulation of it is not "
-                "finite, so no agreement is given."
-            )
-            notes.append(note("held-out.not-finite", words, label))
-    # Where a simulation is not finite no search can end well: the one sentence is enough.
-    if not converged and not notes:
-        words = (
-            "Held out: the initial states, biases and offsets that suit the flights best were not "
-            f"found (after {_STEPS} steps at most), so the agreement given is a lower bound."
-        )
-        notes.append(note("held-out.nuisances-not-found", words))
-    return notes
+    astray = [
+        label
+        for label, simulated in zip(labels(held), e.simulated, strict=True)
+        if not all(np.isfinite(v).all() for v in simulated.values())
+    ]
+    if astray:
+        return [found("held-out.not-finite", "note", *astray)]
+    return [] if converged else [found("held-out.nuisances-not-found", "note")]

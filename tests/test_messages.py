@@ -1,0 +1,61 @@
+"""Every finding has words, and all words are of a finding."""
+
+import ast
+import re
+import string
+from pathlib import Path
+
+import pytest
+
+import heli_jax
+from heli_jax.messages import listed, messages, written
+
+ROOT = Path(heli_jax.__file__).parent
+CODE = re.compile(r"[a-z][a-z-]+\.[a-z][a-z0-9-]+")
+
+
+def strings():
+    """All text constants of the package that may be a code."""
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                if CODE.fullmatch(node.value):
+                    yield node.value
+
+
+def codes_found():
+    """The codes that `found(...)` and `sentence(...)` are called with."""
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                if node.func.id in ("found", "sentence") and node.args:
+                    yield from (
+                        n.value
+                        for n in ast.walk(node.args[0])
+                        if isinstance(n, ast.Constant) and isinstance(n.value, str)
+                    )
+
+
+def test_each_code_has_words_and_all_words_have_a_code():
+    assert {c for c in codes_found() if CODE.fullmatch(c)} <= messages().keys()
+    assert messages().keys() <= set(strings())
+
+
+@pytest.mark.parametrize("code", sorted(messages()))
+def test_words_are_sentences_of_a_known_page(code):
+    message = messages()[code]
+    assert message.title and message.text
+    assert not message.page or (ROOT.parent / "docs" / f"{message.page}.md").is_file()
+    for text in (message.text, message.remedy):
+        list(string.Formatter().parse(text))
+        assert not text or text[-1] in ".}"
+
+
+def test_what_fields_can_say():
+    assert listed(["a", "b", "c"], "or") == "a, b or c"
+    numbers = {"p": 1e-9, "names": ["u", "v"], "vaf": -30.0, "lead": "", "by": "0.1 s", "n": 1}
+    assert written("{p:p}", numbers) == "below 1e-6"
+    assert written("{names} {names:moves/move}, {names:or}", numbers) == "u and v move, u or v"
+    assert written("x{lead:? (* earlier)}{by:? (* earlier)}", numbers) == "x (0.1 s earlier)"
+    assert written("{n} {n:step/steps}", numbers) == "1 step"
+    assert written("{vaf:vaf}", numbers) == "below -1000 %"
