@@ -14,6 +14,7 @@ from heli_jax.finding import Finding, distrusted
 from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics import diagnose
 from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import (
@@ -53,7 +54,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
-from heli_jax.identification.unknowns.initial_guess import labels, start_vector
+from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import (
@@ -61,7 +62,6 @@ from heli_jax.identification.validation.expected_accuracy import (
     starting_at_zero,
     unstated_gusts,
 )
-from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.messages import sentence
 from heli_jax.stages import stage
@@ -189,8 +189,7 @@ def rates(problem: Problem) -> tuple[Finding, ...]:
     Args:
         problem: model, vehicle, flights and what is free.
     """
-    flights = list(zip(labels(problem.training), problem.training, strict=True))
-    return tuple(logging_rate(problem, flights, first_noise(problem, problem.training).sd))
+    return tuple(of_rates(problem, first_noise(problem, problem.training).sd))
 
 
 def windows(problem: Problem, length: float | None = None) -> Ranking:

@@ -13,7 +13,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.table import shown
 from heli_jax.identification.validation.follows_response import feedback
-from heli_jax.identification.validation.late_inputs import led_by
+from heli_jax.identification.validation.shifts import led_by
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, tables, text
 from heli_jax.new_config.guess import Series

@@ -7,9 +7,9 @@ import pytest
 import scipy.signal
 
 from heli_jax.identification.diagnostics.loop import feedback_tested
+from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.fit import context_of
 from heli_jax.identification.validation.excited_band import bands, hardly_moving, seen_parts
-from heli_jax.identification.validation.logging_rate import logging_rate
 from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 
 
@@ -105,13 +105,13 @@ def test_modes_that_do_not_swing_ask_for_a_rate_too():
             sd={"phi": 1e-6},
         )
         asked = replace(model, vehicle=vehicle, flights=(slow,), free=free)
-        [found] = logging_rate(asked, [("one", slow)], [{"phi": 1e-6}])
+        [found] = of_rates(asked, [{"phi": 1e-6}])
         assert found.severity == severity
         assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
         # Guessed noise as large as the motion hides no mode; a stated one does, and it is said.
-        [guessed] = logging_rate(asked, [("one", replace(slow, sd={}))], [{"phi": 1.0}])
+        [guessed] = of_rates(replace(asked, flights=(replace(slow, sd={}),)), [{"phi": 1.0}])
         assert guessed.severity == severity
-        [hidden] = logging_rate(asked, [("one", slow)], [{"phi": 1.0}])
+        [hidden] = of_rates(asked, [{"phi": 1.0}])
         assert (hidden.severity, hidden.value) == ("doubt", None)
 
 

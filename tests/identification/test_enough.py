@@ -12,9 +12,10 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import quantum
+from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, signal_quality
-from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
+from heli_jax.identification.validation.logging_rate import input_rate
 from heli_jax.identification.validation.next_flight import look_at_missing, plan_next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, rails
 from heli_jax.models import with_filters
@@ -263,9 +264,9 @@ def test_a_stick_that_stays_for_equal_times_is_a_slow_channel_unless_its_hold_is
         hold_reason={"u": "it stays for 40 samples at a time and jumps"},
     )
     noise = [{"phi": 1e-3}]
-    (found,) = logging_rate(problem(slow), [("flight", slow)], noise)
+    (found,) = of_rates(problem(slow), noise)
     assert found.severity == "refuse"
-    (stated,) = logging_rate(problem(slow), [("flight", replace(slow, hold_reason={}))], noise)
+    (stated,) = of_rates(problem(replace(slow, hold_reason={})), noise)
     assert stated.severity == "ok"
 
 
@@ -323,5 +324,5 @@ def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
     moved = Flight(DT, inputs, outputs, sd=sd, hold={"u": "linear"}, hold_reason={"u": "moves"})
     filtered = with_filters(SWING, {"p": [Filter("pt1", 40.0)]}, {"p": 0.004})
     asked = Problem(filtered, TRUTH, (moved,), FREE, Nuisance(bias=False))
-    (finding,) = logging_rate(asked, [("flight", moved)], [sd])
+    (finding,) = of_rates(asked, [sd])
     assert finding.severity == "ok"

@@ -110,7 +110,7 @@ def in_a_loop(*, late=0, delayed=0, seed=1):
 
 @pytest.mark.parametrize(
     ("late", "delayed", "code"),
-    [(3, 0, "timing.late-input"), (0, 3, "dynamics.residual-follows-input")],
+    [(3, 0, "timing.late-input"), (0, 3, "timing.late-response")],
 )
 def test_in_a_closed_loop_an_input_at_another_time_takes_the_intervals(late, delayed, code):
     found = in_a_loop(late=late, delayed=delayed)

@@ -13,8 +13,8 @@ from heli_jax import Flight, linear_model, models
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
-from heli_jax.identification.validation.late_inputs import lateness
 from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
+from heli_jax.identification.validation.shifts import lateness
 from heli_jax.identification.validation.signal_quality import cut_off
 from heli_jax.identification.validation.signal_signs import angle_over_rate
 

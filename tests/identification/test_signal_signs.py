@@ -1,16 +1,17 @@
 """Signs, units and clocks of signals that do not go together, and those that do."""
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax import Flight, linear_model
+from heli_jax.identification.diagnostics.timing import inputs_late
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.late_inputs import late_angles, late_inputs, lateness
+from heli_jax.identification.validation.shifts import late_angles, lateness
 from heli_jax.identification.validation.signal_signs import (
     against_start,
     rate_against_angle,
@@ -124,11 +125,17 @@ def test_an_output_before_its_stick_is_said_before_any_fit():
     second = 0.8 * np.roll(u, 5) + 0.2 * np.random.default_rng(4).standard_normal(N)
     good = Flight(dt=DT, inputs={"u": u[cut], "v": second[cut]}, outputs=outputs)
     bad = Flight(dt=DT, inputs={"u": u_late[cut], "v": np.zeros(N - 50)}, outputs=outputs)
-    assert late_inputs([("flight 1", good)], ()) == []
-    [finding] = late_inputs([("flight 1", bad)], ())
-    assert (finding.code, finding.severity) == ("timing.late-input", "doubt")
-    follows = Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)
-    assert late_inputs([("flight 1", bad)], (follows,)) == []
+
+    def said_of(flight, *feedback):
+        c = SimpleNamespace(
+            problem=problem(flight), flights=[("flight 1", flight)], feedback=feedback,
+            fitted=False, at=SimpleNamespace(layout=None),
+        )  # fmt: skip
+        return [(f.code, f.severity) for f in inputs_late(c)]
+
+    assert said_of(good) == []
+    assert said_of(bad) == [("timing.output-leads", "doubt")]
+    assert said_of(bad, Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)) == []
 
 
 def swings(seed, late=0.0, n=1500):
@@ -144,9 +151,8 @@ def swings(seed, late=0.0, n=1500):
 def late_said(phi, p, model=None):
     u = np.zeros(phi.size)
     flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
-    found = late_angles(problem(flight) if model is None else replace(problem(flight), model=model))
-    assert all((f.code, f.severity) == ("timing.late-output", "doubt") for f in found)
-    return [f.value for f in found]
+    found = late_angles(model or SWING, [("flight 1", flight)])
+    return [late.late for *_, late in found]
 
 
 @pytest.mark.parametrize("late", [0.05, 0.1, -0.05])

@@ -10,7 +10,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
 from heli_jax.identification.validation.adequacy import Evidence, _of_noise
 from heli_jax.identification.validation.advice import OutputAdequacy, Record
-from heli_jax.identification.validation.late_inputs import led_by
+from heli_jax.identification.validation.shifts import led_by
 from heli_jax.identification.validation.signal_quality import stuck
 
 RNG = np.random.default_rng(0)

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import sensor_noise
-from heli_jax.finding import Finding
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import combined_deviations, deviations, evaluate
 from heli_jax.identification.estimation.filter_error import innovation_sums
@@ -183,38 +182,6 @@ def _unit(problem: Problem, name: str) -> str:
     if name.startswith("gain "):
         return problem.gain_units.get(name.removeprefix("gain "), "1")
     return naming.unit(problem.model.Params, name) or ""
-
-
-def delay_findings(problem: Problem, estimates: dict[str, Estimate]) -> list[Finding]:
-    """Delays, and the shift of the inputs, that may be none, or are negative.
-
-    A negative one makes up for an input that was logged late: the other estimates are right with
-    it.
-
-    Args:
-        problem: its model says which parameters are delays.
-        estimates: of interest, by name.
-    """
-    findings = []
-    for name in (*problem.model.delay_parameters, "time_shift"):
-        estimate = estimates.get(name)
-        if estimate is None or estimate.lower95 is None or estimate.upper95 is None:
-            continue
-        value, limit = estimate.value, "seconds"
-        if estimate.upper95 < 0:
-            words = (
-                f"{name} is {1e3 * value:.3g} ms: the response comes before the log has its input. "
-                "The input is logged late, or the clocks of inputs and outputs differ (two logs on "
-                "one clock: also.align)."
-            )
-            findings.append(Finding("timing.delay-negative", "note", words, value, limit, (name,)))
-        elif estimate.lower95 <= 0 and name != "time_shift":
-            words = (
-                f"{name} cannot be told from zero: with 95 % probability it is below "
-                f"{estimate.upper95:.3g} s."
-            )
-            findings.append(Finding("timing.delay-near-zero", "note", words, value, limit, (name,)))
-    return findings
 
 
 def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:

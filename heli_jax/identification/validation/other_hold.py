@@ -11,7 +11,6 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -26,8 +25,6 @@ _NULL = 1e-8
 _BEYOND_DOUBT = 20.0
 """of twice the log-likelihood, from which on the other hold is taken where the log leaves it
 open"""
-_MOST = 3
-"""parameters that are named"""
 
 
 def other_hold(
@@ -38,9 +35,9 @@ def other_hold(
     *,
     skip: Collection[str] = (),
     in_doubt: bool = False,
-) -> list[Finding]:
-    """A finding where the other hold of the inputs that move would change an estimate by more
-    than its standard deviation; nothing where it would not.
+) -> dict[str, tuple[float, float]]:
+    """By unknown how far the other hold of the inputs that move would change it [SI], and the same
+    in standard deviations; empty where nothing is told.
 
     Args:
         problem: what is fitted.
@@ -52,9 +49,9 @@ def other_hold(
             at every sample looks the same; and nothing where an input acts on an output directly,
             which would need a program of its own, as long in compiling as that of the fit.
     """
-    moving = [_moving_inputs(problem, f, in_doubt) for f in problem.training]
+    moving = [moving_inputs(problem, f, in_doubt) for f in problem.training]
     if not any(moving) or not np.all(np.isfinite(e.J)):
-        return []
+        return {}
     # Other inputs to the same program in place of another program: compiling costs far more than an
     # evaluation.
     if not feeds_through(problem):
@@ -62,19 +59,18 @@ def other_hold(
     elif not in_doubt:
         other = evaluate(_flipped(at.layout, moving), at.data, at.noise, at.z)
     else:
-        return []
+        return {}
     if not _is_finite(other):
-        return []
+        return {}
     names = at.layout.of_interest
     change = _change(e, other, len(names))
     if sd is None:
         sd = dict(zip(names, _white_sd(e, len(names)).tolist(), strict=True))
-    changes = {
+    return {
         n: (float(c), abs(float(c)) / sd[n])
         for n, c in zip(names, change, strict=True)
         if n not in skip and sd.get(n, 0.0) > 0
     }
-    return _finding(problem.training, moving, at.layout, e, changes)
 
 
 class LikelierHold(NamedTuple):
@@ -110,7 +106,7 @@ def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> Likelie
         at: the optimum.
         wider: by how much autocorrelated residuals widen intervals.
     """
-    moving = [_moving_inputs(problem, f, in_doubt=True) for f in problem.training]
+    moving = [moving_inputs(problem, f, in_doubt=True) for f in problem.training]
     # Before anything is computed: most logs leave nothing open.
     if not any(moving) or feeds_through(problem):
         return None
@@ -154,8 +150,14 @@ def _is_finite(e: Evaluation) -> bool:
     return bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
 
 
-def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]:
-    """The inputs whose hold matters; `in_doubt` those whose log was taken for linear."""
+def moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]:
+    """The inputs whose hold matters.
+
+    Args:
+        problem: names them.
+        flight: says what they do.
+        in_doubt: those alone whose log let a straight line be taken.
+    """
     return {
         n
         for n in naming.names(problem.model.Inputs)
@@ -233,58 +235,3 @@ def pseudoinverse(J: np.ndarray) -> np.ndarray:
     # The triangle has the same singular values, and q rows instead of n.
     Q, R = np.linalg.qr(J / norms[None, :])
     return np.linalg.pinv(R, rcond=_NULL) @ Q.T / norms[:, None]
-
-
-def _finding(
-    flights: tuple[Flight, ...],
-    moving: list[set[str]],
-    layout: Layout,
-    e: Evaluation,
-    changes: dict[str, tuple[float, float]],
-) -> list[Finding]:
-    """What would change; `changes` by name, SI and in sds."""
-    large = sorted((n for n in changes if changes[n][1] > 1.0), key=lambda n: -changes[n][1])
-    if not large:
-        return []
-    values = dict(zip(layout.of_interest, np.asarray(e.named).tolist(), strict=True))
-    words = [_changed(n, values[n], *changes[n]) for n in large[:_MOST]]
-    sentence = (
-        f"Between samples {', '.join(_taken(flights, moving))}: with the other hold "
-        f"{', '.join(words)}. An input that was commanded in steps has hold: zero-order, one "
-        "that was sampled while it moved has hold: linear."
-    )
-    names = tuple(dict.fromkeys(n for of_flight in moving for n in sorted(of_flight)))
-    # Nothing shows that the other hold is the right one: a note, whatever it moves.
-    return [
-        Finding(
-            "timing.other-hold",
-            "note",
-            sentence,
-            changes[large[0]][1],
-            "standard deviations, 1",
-            (*names, *large),
-        )
-    ]
-
-
-def _taken(flights: tuple[Flight, ...], moving: list[set[str]]) -> list[str]:
-    """`lat is taken as linear (it moves at 90 % of the samples)`
-
-    Once of an input and a hold, by what the first flight's log shows: in others it moves at nearly
-    as many samples, and nobody reads twelve shares of three inputs.
-    """
-    taken: dict[str, str] = {}
-    for f, names in zip(flights, moving, strict=True):
-        for n in (n for n in f.inputs if n in names):
-            reason = f"it {f.hold_reason[n]}" if n in f.hold_reason else "as stated"
-            taken.setdefault(f"{n} is taken as {f.hold[n]}", reason)
-    return [f"{words} ({reason})" for words, reason in taken.items()]
-
-
-def _changed(name: str, value: float, change: float, sds: float) -> str:
-    # Relative to a shift of nearly zero a change would be any percentage.
-    if name == "time_shift":
-        share = f"{1e3 * change:+.2g} ms"
-    else:
-        share = f"{100 * change / value:+.2g} %" if value else f"{change:+.2g}"
-    return f"{name} would be about {share} off ({sds:.2g} sd)"
