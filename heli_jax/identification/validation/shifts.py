@@ -2,8 +2,8 @@
 
 - `leads`: no vehicle responds before its input. Where the past of an output and of all inputs
   leaves something of the output unexplained that an input's future explains, that input is logged
-  late, or it follows the output (C. A. Sims, Money, income, and causality, Am. Econ. Rev. 62, 1972).
-  It needs no model.
+  late, or it follows the output (C. A. Sims, Money, income, and causality, Am. Econ. Rev. 62,
+  1972). It needs no model.
 - `late_angles`: an angle is the integral of its rate. Where the two fit together once one of them
   is moved in time, it is logged late.
 - `input_shift`: the likelihood of a fitted model with each input earlier or later by whole samples,
@@ -187,8 +187,8 @@ class _AngleLimits:
     part: float = 0.25
     """of the record, likewise"""
     usual: float = 0.3
-    """[s] to either side: a longer delay has to explain far more, since a motion that nearly repeats
-    itself fits nearly as well one swing later"""
+    """[s] to either side: a longer delay has to explain far more, since a motion that nearly
+    repeats itself fits nearly as well one swing later"""
     step: float = 0.01
     """[s]; samples that come faster tell no more of a delay"""
     least: float = 0.02
@@ -418,7 +418,7 @@ def input_shift(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
         at: the optimum.
         e: the evaluation there.
     """
-    if not in_time(at) or set(problem.free) & set(problem.model.delay_parameters):
+    if not _in_time(at) or set(problem.free) & set(problem.model.delay_parameters):
         return None
     found = {n: _best_place(problem, at, e, n) for n in _moving(problem)}
     found = {n: one for n, one in found.items() if one[1] > SHIFT.clear**2}
@@ -506,12 +506,8 @@ def _is_logged(problem: Problem, name: str) -> bool:
     return logged and not filtered and not feeds_through(problem)
 
 
-def in_time(at: Solution) -> bool:
-    """True if rows are samples in time that inputs move, and no free shift moves the inputs.
-
-    Args:
-        at: says what is fitted.
-    """
+def _in_time(at: Solution) -> bool:
+    """True if rows are samples in time that inputs move, and no free shift moves the inputs."""
     layout = at.layout
     spectral = layout.estimator.noise_spectrum
     return not (is_kinematic(layout.model) or layout.shift or spectral)
@@ -555,7 +551,7 @@ def late_steps(problem: Problem, at: Solution, e: Evaluation) -> tuple[float, di
         e: the evaluation there.
     """
     names = [n for n in stepped(problem.training) if _is_logged(problem, n)]
-    if not (names and in_time(at) and np.all(np.isfinite(e.J))):
+    if not (names and _in_time(at) and np.all(np.isfinite(e.J))):
         return 0.0, {}
     longest = max(
         f.facts[n, "input"].usual for f in problem.training for n in names if n in f.inputs
