@@ -72,7 +72,7 @@ def of_fit(content: Mapping[str, Any], code: int) -> Result:
         content: of its fit.json.
         code: the exit code.
     """
-    findings = [*content["findings"], *(f for f in content["record"] if f["severity"] != "ok")]
+    findings = content["findings"]
     verdict = content["verdict"]
     exits = [] if content["status"] == "converged" else [f"exit {content['status']}"]
     exits += ["exit other solutions"] if verdict["other_solutions"] else []

@@ -101,11 +101,10 @@ def check_config(config: Path, *more: str) -> Result:
     if not ended.out.startswith("{"):
         return refused(ended, names)
     content = json.loads(ended.out)
-    findings = [f for f in content["record"] if f["severity"] != "ok"]
+    findings = [f for f in content["findings"] if f["severity"] != "ok"]
     by = {s: [code_of(f, names) for f in findings if f["severity"] == s] for s in SEVERITIES}
     exits = [] if content["identifiable"] else ["exit not-identifiable"]
-    notes = [f["code"] for f in content["notes"]]
-    notes += [f"log {f['code']}" for f in content["log_notes"]]
+    notes = [f"log {f['code']}" for f in content["log_notes"]]
     return {
         "exit": ended.code,
         "codes": coded([*exits, *by["refuse"]], by["doubt"], [*by["note"], *notes]),

@@ -238,7 +238,11 @@ def print_findings(findings: Sequence[Finding]) -> None:
     for f in shown:
         tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
     rest = [f for f in findings if f not in shown]
-    for said, severities in (("also in doubt", ("refuse", "doubt")), ("notes", ("note",)), ("well", ("ok",))):
+    for said, severities in (
+        ("also in doubt", ("refuse", "doubt")),
+        ("notes", ("note",)),
+        ("well", ("ok",)),
+    ):
         titles = Counter(f.topic for f in rest if f.severity in severities)
         if titles:
             each = (t if count == 1 else f"{t} ({count})" for t, count in titles.items())

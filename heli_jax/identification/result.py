@@ -100,6 +100,7 @@ class Check:
     log_notes: tuple[Finding, ...] = ()
     """what the readers of the logs assumed or did"""
 
+
 # Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
 
 

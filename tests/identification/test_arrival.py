@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from heli_jax import Free, Problem, fit
+from heli_jax.identification.diagnostics.search import search_stopped
 from heli_jax.identification.estimation import multistart
 from heli_jax.identification.estimation.noise_covariance import gain_left
-from heli_jax.identification.fit_notes import open_directions
 from tests.identification.test_equation_error import ROLL, Params, record
 
 RNG = np.random.default_rng(0)
@@ -72,3 +72,20 @@ def test_a_search_along_what_the_data_leave_open_is_told_what_to_fix():
     assert note.subjects == ("Lp", "Lda")
     assert open_directions(open_before, told) == []
     assert open_directions(told, open_before) == []
+
+
+def open_directions(before, verdict):
+    """What is said of a search that stopped."""
+    layout = SimpleNamespace(windows=((1, 200),), continuity=None)
+    stopped = SimpleNamespace(
+        optimum=SimpleNamespace(trace=((9, 1.0),)),
+        arrived=False,
+        rounding=False,
+        at=SimpleNamespace(layout=layout),
+        e=SimpleNamespace(J=J),
+        before=before,
+        verdict=verdict,
+    )
+    stop, *rest = search_stopped(stopped)
+    assert (stop.code, stop.value) == ("search.stopped", 9.0)
+    return rest

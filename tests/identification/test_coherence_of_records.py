@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.identification.validation.enough import _of_feedback
+from heli_jax.identification.diagnostics.loop import feedback_tested
+from heli_jax.identification.fit import context_of
 from heli_jax.identification.validation.excited_band import bands, hardly_moving, seen_parts
-from heli_jax.identification.validation.feedback import feedback_of
 from heli_jax.identification.validation.logging_rate import logging_rate
 from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 
@@ -83,10 +83,10 @@ def test_inputs_of_one_count_or_one_sample_are_doubted():
 
 def test_feedback_that_was_not_tested_is_said():
     short = problem(replace(swept(150), sd={"phi": 0.01}))
-    [found] = _of_feedback(short, feedback_of(short))
+    [found] = feedback_tested(context_of(short))
     assert (found.code, found.severity) == ("loop.not-tested", "doubt")
     jumps = problem(flight(0))
-    [found] = _of_feedback(jumps, feedback_of(jumps))
+    [found] = feedback_tested(context_of(jumps))
     assert (found.code, found.severity) == ("loop.not-tested", "note")
 
 

@@ -1,6 +1,7 @@
 """Feedback: found where a pilot holds the bank angle, not found where nobody does."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import scipy.signal
 from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
-from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
+from heli_jax.identification.diagnostics.loop import inputs_follow_response
+from heli_jax.identification.validation.feedback import feedback_of
 from heli_jax.identification.validation.follows_response import feedback
 from heli_jax.naming import asdict
 from tests.identification.lag import LAG
@@ -198,18 +200,39 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
         ROLL, Params(-4.0, 25.0, 0.0), [flight], {"Lp": Free(-3.0), "Lda": Free(20.0)}
     )
     found = feedback_of(problem)
-    (said,) = feedback_notes(problem, found, white=False)
-    assert (said.severity, said.value) == ("note", found[0].p_value)
+    (said,) = told(problem, found, white=False)
+    assert (said.severity, said.value, said.distrusts) == ("doubt", found[0].p_value, ("Lp",))
+    (said,) = told(problem, found, white=True)
+    assert (said.severity, said.distrusts) == ("note", ())
     opened = tuple(f._replace(p_value=0.5) for f in found)
-    assert feedback_notes(problem, opened) == []
+    assert [f.severity for f in told(problem, opened, white=True)] == ["ok"]
     # Filter error asks for nothing but whiteness.
     axes = replace(ROLL, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
     model = with_disturbance(axes, "roll")
     params = model.Params(**asdict(Params(-4.0, 25.0, 0.0)))
     filtered = Problem(model, params, [flight], {"Lp": Free(-3.0)}, method="filter-error")
-    assert feedback_notes(filtered, found, white=True) == []
-    assert len(feedback_notes(filtered, found, False)) == 1
-    assert feedback_notes(filtered, found)
+    assert told(filtered, found, white=True) == []
+    assert len(told(filtered, found, white=False)) == 1
+    assert told(filtered, found, fitted=False)
+
+
+def told(problem, found, *, white=False, fitted=True):
+    """What a fit that arrived says of inputs that follow the response."""
+    return list(
+        inputs_follow_response(
+            SimpleNamespace(
+                problem=problem,
+                feedback=found,
+                estimates={"Lp": None} if fitted else {},
+                fitted=fitted,
+                arrived=fitted,
+                white=white,
+                independent=white,
+                params=problem.start_params(),
+                stated_instruments=(),
+            )
+        )
+    )
 
 
 def test_a_record_of_less_than_a_block_tells_nothing():
@@ -256,7 +279,11 @@ def test_an_unstable_vehicle_is_held_whatever_a_test_of_its_inputs_says(gust):
     flight = Flight(dt=DT, inputs={"d": d}, outputs={"p": measured})
     free = {"Lp": Free(0.3), "Ld": Free(15.0)}
     found = fit(Problem(LAG, LagParams(0.3, 15.0), [flight], free, method="output-error"))
-    told = [f for f in found.findings if f.code == "loop.feedback" and f.severity == "doubt"]
+    told = [
+        f
+        for f in found.findings
+        if f.code in ("loop.feedback", "loop.held") and f.severity == "doubt"
+    ]
     assert (len(told), found.exit_code) == ((1, 3) if gust else (0, 0))
     assert not told or told[0].value is None
     assert set(found.untrusted) == ({"Lp", "Ld"} if gust else set())

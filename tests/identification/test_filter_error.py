@@ -18,7 +18,7 @@ from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Solution, layout_of, unpack
 from heli_jax.identification.validation.adequacy import (
     gain_of_inputs,
-    unless_inputs_explain_nothing,
+    inputs_explain_nothing,
 )
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
@@ -58,19 +58,19 @@ def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
     gusts = dataclasses.replace(problem, flights=[made(bench30, 1, amplitude=1e-10)[3]])
     at = first.reached._replace(data=data_of(gusts, gusts.training))
     e = evaluate(at.layout, at.data, at.noise, at.z)
-    said = unless_inputs_explain_nothing(at, e, first.verdict)
+    said = inputs_explain_nothing(at, e, first.verdict)
     assert not said.identifiable
     assert said.undetermined == ("Ixx", "If", "kappa")
     # With the stick as it was the verdict stands, and where none moves, as in a free decay.
     assert gain_of_inputs(*point(first)) > 100.0
     assert first.verdict.identifiable
     at, e = point(first)
-    assert unless_inputs_explain_nothing(at, e, first.verdict) is first.verdict
+    assert inputs_explain_nothing(at, e, first.verdict) is first.verdict
     one = at.data.flights[0]
     rest = one._replace(inputs=replace(one.inputs, x_roll=jnp.zeros_like(one.inputs.x_roll)))
     at = at._replace(data=at.data._replace(flights=(rest,)))
     assert np.isnan(gain_of_inputs(at, e))
-    assert unless_inputs_explain_nothing(at, e, first.verdict) is first.verdict
+    assert inputs_explain_nothing(at, e, first.verdict) is first.verdict
 
 
 def point(found):

@@ -1,10 +1,13 @@
 """The spectrum of gusts that come through a machine, and which parameters feedback leaves alone."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.signal
 
+from heli_jax.identification.diagnostics.loop import moved_by_feedback
 from heli_jax.identification.estimation.frequency_noise import (
     Machine,
     smoothed,
@@ -14,7 +17,6 @@ from heli_jax.identification.estimation.frequency_noise import (
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     Moved,
-    feedback_trust,
     untrusted,
 )
 from heli_jax.identification.validation.follows_response import Feedback
@@ -87,15 +89,22 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
     assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
     assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
-    assert feedback_trust(moved, Loop(loops, ("lat", "lon"))) == []
-    [found] = feedback_trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
+    assert trust(moved, Loop(loops, ("lat", "lon"))) == []
+    [found] = trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
     assert (found.code, found.severity) == ("loop.no-instrument", "doubt")
     assert found.distrusts == ("Mm",)
-    [found] = feedback_trust({"Lp": Moved(0.0, 0.003)}, Loop(loops))
+    [found] = trust({"Lp": Moved(0.0, 0.003)}, Loop(loops))
     assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]
     assert untrusted(moved, Loop(open_loop)) == ()
-    assert feedback_trust(moved, Loop(open_loop)) == []
-    [found] = feedback_trust(moved, Loop(open_loop, held=True))
+    assert trust(moved, Loop(open_loop)) == []
+    [found] = trust(moved, Loop(open_loop, held=True))
     assert found.distrusts == ("Mm", "Ll")
+
+
+def trust(moved, loop):
+    """What a fit with such a loop says of its estimates."""
+    follows = any(one.present for one in loop.found)
+    fitted = SimpleNamespace(moved=moved, loop=loop, instruments=loop.instruments, follows=follows)
+    return list(moved_by_feedback(fitted))

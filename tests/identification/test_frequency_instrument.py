@@ -7,6 +7,8 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.identification.diagnostics.loop import inputs_follow_response
+from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
@@ -18,9 +20,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
 )
-from heli_jax.identification.fit import cautions
+from heli_jax.identification.fit import context_of
 from heli_jax.identification.result import Fit
-from heli_jax.identification.validation.enough import _of_feedback
 from heli_jax.identification.validation.excitation_test import _in_bands
 from heli_jax.identification.validation.feedback import feedback_of
 
@@ -143,8 +144,8 @@ def test_a_closed_loop_that_an_instrument_allows_for_is_not_called_open(leaning)
     by_instrument = problem(leaning, [flown(3)])
     found = feedback_of(by_instrument)
     assert found[0].present
-    [line] = _of_feedback(by_instrument, found)
-    assert (line.code, line.severity) == ("loop.feedback", "ok")
+    [line] = inputs_follow_response(context_of(by_instrument))
+    assert (line.code, line.severity) == ("loop.excitation-logged", "ok")
     assert line.value == found[0].p_value
 
 
@@ -173,8 +174,8 @@ def test_a_band_that_the_fit_does_not_keep_to_is_told(leaning):
     band = ResponseOptions(band=(0.2, 5.0))
     for method, said in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
         asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
-        assert sum(f.code == "frequency.band-unused" for f in cautions(asked)) == said
-    assert cautions(problem(leaning, [flown(1, 1000)])) == ()
+        assert len(list(band_unused(context_of(asked)))) == said
+    assert list(band_unused(context_of(problem(leaning, [flown(1, 1000)])))) == []
 
 
 def test_a_response_far_larger_than_the_measured_one_explains_nothing():

@@ -3,6 +3,7 @@
 Records are made by SciPy: its integrators, and the exact response of linear systems.
 """
 
+from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.identification.validation.adequacy import by_responses
+from heli_jax.identification.diagnostics.adequacy import responses_explained
 from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
 from heli_jax.identification.validation.unmodelled import own_samples
 from heli_jax.naming import Scalar
@@ -309,6 +310,7 @@ def test_records_too_short_are_not_asked():
 def test_squared_errors_of_responses_above_their_interval_are_said():
     said = []
     for chi_squared in (1.0, 1.9, 2.1):
-        found = by_responses(ResponseAgreement((), chi_squared, 0.75, 1.3, 100.0, 8.0, (), (), ()))
-        said.append([(f.severity, f.value, f.denies) for f in found.findings])
+        agreement = ResponseAgreement((), chi_squared, 0.75, 1.3, 100.0, 8.0, (), (), ())
+        found = responses_explained(SimpleNamespace(responses=agreement, unrelated={}))
+        said.append([(f.severity, f.value, f.denies) for f in found])
     assert said == [[], [("note", 1.9, False)], [("doubt", 2.1, True)]]

@@ -72,8 +72,13 @@ def diagnose(c: Context) -> tuple[Finding, ...]:
     """
     findings = once(weighed((f for d in DIAGNOSTICS for f in d(c)), c.estimates))
     sure = {f.code for f in findings if f.bad}
-    kept = [f for f in findings if f.denies or not sure & set(MOOT.get(f.code, ()))]
+    kept = [f for f in findings if _counts(f) or not sure & set(MOOT.get(f.code, ()))]
     return tuple(sorted(kept, key=lambda f: _rank(f, c)))
+
+
+def _counts(f: Finding) -> bool:
+    """Whether a finding changes what is concluded of a fit."""
+    return f.denies or bool(f.distrusts)
 
 
 def _rank(f: Finding, c: Context) -> int:

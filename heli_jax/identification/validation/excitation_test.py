@@ -31,6 +31,7 @@ LEVEL = 0.01
 _FIRST, _GROWTH = 12, 1.15
 """lines of the lowest band, and how much wider the next one is"""
 
+
 class Followed(NamedTuple):
     """What of an output's residual follows the excitation."""
 

@@ -19,6 +19,7 @@ from heli_jax.identification.validation.follows_response import (
     tested_at,
 )
 
+
 def why_untested(problem: Problem) -> Untested | None:
     """Why nothing was tested of any flight; None where something was.
 
