@@ -45,8 +45,15 @@ class Limits:
 LIMITS = Limits()
 
 
+def _explained(c: Context) -> bool:
+    """Whether a fit shows by itself that the inputs excite what is asked."""
+    return c.fitted and c.status == "converged" and not c.adequacy.denied
+
+
 def excited_bands(c: Context) -> Iterator[Finding]:
     """The band that each input excites, and the output that follows it there."""
+    if _explained(c):
+        return
     for name, (low, high) in c.excitation.powers.items():
         best = c.excitation.followed.get(name)
         code, severity = "excitation.excited-band", "ok"
@@ -72,6 +79,8 @@ def excited_bands(c: Context) -> Iterator[Finding]:
 
 def nothing_follows(c: Context) -> Iterator[Finding]:
     """Records in which no output follows any input, or no input moves."""
+    if _explained(c):
+        return
     limit, share = LIMITS.nothing, c.excitation.share
     if not c.excitation.powers:
         name, rough = least_rough(c.problem.training)
@@ -92,6 +101,8 @@ def nothing_follows(c: Context) -> Iterator[Finding]:
 
 def inputs_together(c: Context) -> Iterator[Finding]:
     """Inputs that move together, so that their effects cannot be told apart."""
+    if _explained(c):
+        return
     limit = c.excitation.pair_limit
     for i, (names, coherence) in enumerate(c.excitation.pairs):
         if coherence >= limit:

@@ -4,12 +4,11 @@ What a record shows of that by itself is little: degrees fit as well as radians,
 as well as a right one, with estimates that are off by 57 or of the other sign.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax import units
 from heli_jax.dynamics.model import Model
 from heli_jax.finding import UNIT_IN_DOUBT, Finding, found
 from heli_jax.flights.channel_names import no_stick, unit_in_name
@@ -39,8 +38,8 @@ class Limits:
     degrees: float = 1.3
     """factor about 57.3 that is still degrees read as radians"""
     scale: float = 1.12
-    """the same by the 95 % interval: a sensor off by a tenth, and of pitch and heading the cosine of
-    the bank"""
+    """the same by the 95 % interval: a sensor off by a tenth, and of pitch and heading the cosine
+    of the bank"""
     scale_of_roll: float = 1.04
     """of the bank, whose rate is p but for what the tangent of the pitch angle lets in: that goes
     with another motion, and changes no factor by more than a hundredth or two"""
@@ -217,9 +216,9 @@ def outputs_against_start(c: Context) -> Iterator[Finding]:
 
 
 def turned_from_start(c: Context) -> Iterator[Finding]:
-    """Parameters that surely have the other sign than they began with: a turned signal fits as well,
-    and the start alone tells. One whose sign is declared (`Model.positive`, `sign: keep`, bounds)
-    cannot turn."""
+    """Parameters that surely have the other sign than they began with: a turned signal fits as
+    well, and the start alone tells. One whose sign is declared (`Model.positive`, `sign: keep`,
+    bounds) cannot turn."""
     turned = {}
     for name, free in c.problem.free.items() if c.arrived else ():
         e = c.estimates[name]

@@ -1,8 +1,9 @@
 """The band that each input excites, the outputs that follow it, the inputs that move together."""
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -178,7 +179,7 @@ class Excitation(NamedTuple):
     """by input that moves the band [Hz] that holds 90 % of its power"""
     left_out: tuple[str, ...]
     """outputs that were not looked at, for lack of samples"""
-    followed: dict[str, Followed | None] = {}
+    followed: Mapping[str, Followed | None] = MappingProxyType({})
     """by input the widest band in which an output follows it alone, None where there is none; empty
     where records are too short for a coherence"""
     limit: float = COHERENT
@@ -263,18 +264,16 @@ def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
     if length == 0:
         return None
     long = [p for p in parts if p.n_samples >= length]
-    transforms = [segment_transforms(_channels(p, moving, seen.outputs), dt, length) for p in long]
+    channels = [
+        np.stack([*(p.inputs[n] for n in moving), *(p.outputs[n] for n in seen.outputs)])
+        for p in long
+    ]
+    transforms = [segment_transforms(of_part, dt, length) for of_part in channels]
     omega, both = transforms[0][0], np.concatenate([t for _, t in transforms], axis=1)
     # Without zero frequency, which the straight lines took, and Nyquist's.
     inner = slice(1, -1)
     hz, m = omega[inner] / (2.0 * np.pi), len(moving)
     return _Pooled(hz, both[inner, :, :m], both[inner, :, m:])
-
-
-def _channels(
-    part: Part, inputs: Sequence[str], outputs: Sequence[str]
-) -> Float[np.ndarray, "channels n"]:
-    return np.stack([part.inputs[n] for n in inputs] + [part.outputs[n] for n in outputs])
 
 
 def _length(sizes: list[int], segments: int, least: int) -> int:

@@ -1,9 +1,9 @@
 """Signs and units of signals, as far as signals tell them.
 
-Three tests that need no fit. An angle is the integral of its rate, so the two move alike by as much.
-With start values of the right signs and units the simulated outputs move with the measured ones, and
-about as far. And the size of a signal suits one unit better than another: degrees fit as well as
-radians where all outputs are in them, with every estimate off by 57.
+Three tests that need no fit. An angle is the integral of its rate, so the two move alike, and as
+far. With start values of the right signs and units the simulated outputs move with the measured
+ones, and about as far. And the size of a signal suits one unit better than another: degrees fit as
+well as radians where all outputs are in them, with every estimate off by 57.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,8 +41,8 @@ _GAP = 0.3
 class AngleOverRate(NamedTuple):
     """The change of an angle over that of its integrated rate.
 
-    Where both are noisy, the regressions of the one on the other and of the other on the one enclose
-    the factor (Frisch, 1934): it lies between `factor` times and over `|correlation|`.
+    Where both are noisy, the regressions of the one on the other and of the other on the one
+    enclose the factor (Frisch, 1934): it lies between `factor` times and over `|correlation|`.
     """
 
     factor: float
@@ -329,10 +329,10 @@ def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
     return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < _FLOWN
 
 
-# A stick in per cent that is read as plain numbers fits as well as one read right, with its effect a
-# hundredth of what it is. Two things together tell: numbers that are large (or small) for the unit,
-# and a model that at the start values moves its outputs too far (or not far enough) by about as
-# much.
+# A stick in per cent that is read as plain numbers fits as well as one read right, with its effect
+# a hundredth of what it is. Two things together tell: numbers that are large (or small) for the
+# unit, and a model that at the start values moves its outputs too far (or not far enough) by about
+# as much.
 
 
 NEAR = 3.0
