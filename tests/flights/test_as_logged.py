@@ -84,11 +84,6 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     np.testing.assert_array_equal(f.outputs["p"], read(tmp_path, 50.0, p=missing).outputs["p"])
     assert f.source is not None
     assert [n.value for n in f.source.notes if n.code == "samples.marks"] == [11]
-    # Of a part of it those of that part count.
-    facts = [
-        h.source.facts["p", "output"] for h in (part(f, 0, 400), part(f, 400, 600)) if h.source
-    ]
-    assert [one.marks for one in facts] == [((-9999.0, 10),), ((1e10, 1),)]
     with pytest.raises(InputError):
         read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
     # However often: of a sensor at 5 Hz most rows hold nothing else.
