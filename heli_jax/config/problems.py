@@ -27,7 +27,7 @@ from heli_jax.linear_models.read import is_shipped
 from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
-    from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+    from heli_jax.identification.equation_error.start import EquationErrorStart
     from heli_jax.identification.model_selection import Alternatives
 
 

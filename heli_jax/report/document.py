@@ -22,7 +22,7 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
-from heli_jax.identification.equation_error.first_guess import (
+from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
