@@ -16,8 +16,8 @@ from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels
-from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
-from heli_jax.identification.validation.record_windows import (
+from heli_jax.identification.design.accuracy import GUESSED, too_good
+from heli_jax.identification.design.windows import (
     DETERMINES,
     ENOUGH,
     Ranking,

@@ -15,7 +15,7 @@ from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
-from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
+from heli_jax.identification.design.accuracy import GUESSED, too_good
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import (
     WORST,

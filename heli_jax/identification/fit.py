@@ -61,7 +61,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.validation.aliases import excitation_notes
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
-from heli_jax.identification.validation.expected_accuracy import (
+from heli_jax.identification.design.accuracy import (
     guessed_gusts,
     starting_at_zero,
     unstated_gusts,
@@ -71,7 +71,7 @@ from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import doubtful_inputs, record_doubts, scaled_by
 from heli_jax.identification.validation.other_hold import other_hold
-from heli_jax.identification.validation.record_windows import Ranking, rank_windows
+from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
     RATE_AGAINST_ANGLE,
     RATE_SCALE,

@@ -21,7 +21,7 @@ from heli_jax.identification.validation.logging_rate import (
     loop_between_samples,
 )
 from heli_jax.identification.validation.misread import doubtful_inputs, misread
-from heli_jax.identification.validation.next_flight import missing_outputs, next_flight
+from heli_jax.identification.design.next_flight import missing_outputs, next_flight
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
     saturation,

@@ -23,7 +23,7 @@ from heli_jax.identification.estimation.simulated_flights import signal_numbers,
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
-from heli_jax.identification.validation.expected_accuracy import (
+from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     repeated,
@@ -31,7 +31,7 @@ from heli_jax.identification.validation.expected_accuracy import (
     together,
     triangle,
 )
-from heli_jax.identification.validation.record_windows import DETERMINES
+from heli_jax.identification.design.windows import DETERMINES
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
 # What outputs would tell that the model has and the log lacks, by Fisher's information.

@@ -29,7 +29,7 @@ from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
-from heli_jax.identification.validation.expected_accuracy import (
+from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     sensitivity_at,
