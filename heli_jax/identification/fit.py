@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, distrusted
 from heli_jax.identification.agreement import pooled_metrics
+from heli_jax.identification.design.accuracy import starting_at_zero, unstated_gusts
+from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.diagnostics import diagnose
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.excitation import gusts_guessed
@@ -57,9 +59,7 @@ from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
-from heli_jax.identification.validation.expected_accuracy import starting_at_zero, unstated_gusts
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.messages import sentence
 from heli_jax.stages import stage
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.finding import Finding, found
+from heli_jax.identification.design.accuracy import unstated_gusts
+from heli_jax.identification.design.next_flight import look_at_missing, plan_next_flight
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.unknowns.layout import unpack
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, least_rough
-from heli_jax.identification.validation.expected_accuracy import unstated_gusts
-from heli_jax.identification.validation.next_flight import look_at_missing, plan_next_flight
 
 
 @dataclass(frozen=True)

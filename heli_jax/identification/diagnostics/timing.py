@@ -1,9 +1,9 @@
-from heli_jax.identification.validation.logging_rate import logging_rate, loop_between_samples
+from heli_jax.identification.uncertainty.estimates import delay_findings
+from heli_jax.identification.validation.aliases import aliasing, measurement_noise
 from heli_jax.identification.validation.late_inputs import late_angles, late_inputs
 from heli_jax.identification.validation.late_stick import late_stick, slow_sticks
+from heli_jax.identification.validation.logging_rate import logging_rate, loop_between_samples
 from heli_jax.identification.validation.other_hold import other_hold
-from heli_jax.identification.validation.aliases import aliasing, measurement_noise
-from heli_jax.identification.uncertainty.estimates import delay_findings
 
 
 def _late(c):

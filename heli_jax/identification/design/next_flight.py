@@ -16,13 +16,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
-from heli_jax.identification.identifiability.sensitivity import verdict_of
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
-from heli_jax.identification.validation.expected_accuracy import (
+from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     repeated,
@@ -30,7 +24,13 @@ from heli_jax.identification.validation.expected_accuracy import (
     together,
     triangle,
 )
-from heli_jax.identification.validation.record_windows import DETERMINES
+from heli_jax.identification.design.windows import DETERMINES
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
+from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
 # What outputs would tell that the model has and the log lacks, by Fisher's information.
