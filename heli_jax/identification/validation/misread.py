@@ -17,11 +17,10 @@ from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.flights.table import shown
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.signal_quality import Facts, cut_off, dropout_words
 from heli_jax.identification.validation.signal_signs import rate_against_angle
 from heli_jax.vehicle import of_helicopter
