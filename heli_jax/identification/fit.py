@@ -42,8 +42,9 @@ from heli_jax.identification.further_starts import (
     further_starts,
     left_stability,
 )
+from heli_jax.identification.identifiability.analysis import Around
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
-from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.through_inputs import of_disturbances
 from heli_jax.identification.methods import estimator_of
