@@ -50,8 +50,9 @@ from heli_jax.identification.further_starts import (
     further_starts,
     left_stability,
 )
+from heli_jax.identification.identifiability.analysis import Around
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
-from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem

@@ -25,12 +25,12 @@ from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions, evaluate
+from heli_jax.identification.estimation.evaluation import directions, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.late_inputs import LATE
-from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
+from heli_jax.identification.validation.other_hold import feeds_through
 
 LAG = "dynamics.residual-follows-input"
 _CLEAR = 5.0
@@ -41,8 +41,6 @@ _LARGE = 0.1
 """of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
 _LEFT = 1e-3
 """part of the derivative by the shift that has to be left beside the sensitivities"""
-_ROUNDING = 1e-8
-"""part of the largest singular value of the sensitivities below which one is rounding"""
 _BLOCK = 1.0
 """[s] over which rows may be correlated"""
 _MOST = 3
@@ -202,7 +200,7 @@ def _displaced(problem: Problem, at: Solution, e: Evaluation) -> _Samples | None
 
 def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
     """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), takes up."""
-    Q = directions(J, _ROUNDING)
+    Q = directions(J)
     return v - Q @ (Q.T @ v)
 
 

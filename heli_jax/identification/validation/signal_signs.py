@@ -15,10 +15,9 @@ from jaxtyping import Float
 from heli_jax import naming, units
 from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.flights.flight import Flight, Signal
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
-from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.vehicle import of_helicopter
 
 # An angle and the integral of its rate.
