@@ -35,7 +35,7 @@ class Ablation(NamedTuple):
 
 def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
     """What slopes alone say, without a look far from the optimum."""
-    from heli_jax.identification.identifiability.directions import combinations
+    from heli_jax.identification.identifiability.combinations import combinations
 
     return combinations(null, covariance, unknowns)
 

@@ -26,7 +26,7 @@ from heli_jax import Flight, Free, Prior, Problem, c2d, d2c, fit, load_vehicle, 
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.flybar import flapping_rate_gain
 from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.identification.equation_error.baseline import Baseline, baseline
+from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.validation.metrics import Metrics, metrics
 from heli_jax.naming import asdict, replace, unit

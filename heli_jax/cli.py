@@ -101,7 +101,9 @@ _COMMANDS = {
         _arg("--reports", help="of a study: write each fit's page too, which takes seconds"),
     )),
     "compatibility": ("do a log's sensors agree? their errors", (*_CONFIG, _OUT)),
-    "check": ("identifiability, sampling and excitation before any fit", (*_CONFIG, _JSON, _VERBOSE)),
+    "check": ("identifiability, sampling and excitation before any fit", (
+        *_CONFIG, _JSON, _VERBOSE,
+    )),
     "windows": ("which parts of a log say most, before any fit", (
         _OTHER_LOG, *_CONFIG,
         _arg("--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"),

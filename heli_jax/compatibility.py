@@ -19,8 +19,8 @@ from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, once
-from heli_jax.identification.result import Estimate
 from heli_jax.identification.diagnostics.search import FAR
+from heli_jax.identification.result import Estimate
 from heli_jax.numbers import with_sd
 from heli_jax.report.files import SensorAgreement
 from heli_jax.workflow import FitRun, Say

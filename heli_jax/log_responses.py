@@ -134,13 +134,13 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
     shows it."""
     # Not before it is needed: it brings what fits are judged by.
+    from heli_jax.identification.diagnostics.units import in_degrees
     from heli_jax.identification.unknowns.initial_guess import labels
-    from heli_jax.identification.validation.misread import degrees_for_radians
 
     return tuple(
         doubt
         for label, flight in zip(labels(tuple(flights)), flights, strict=True)
-        for doubt in degrees_for_radians(experiment.model, label, flight)
+        for doubt in in_degrees(experiment.model, label, flight)
     )
 
 

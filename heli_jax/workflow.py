@@ -20,7 +20,7 @@ from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
-from heli_jax.identification.equation_error.baseline import Baseline, baseline
+from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.fit import check, fit, rates
 from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose, with_likelier_hold

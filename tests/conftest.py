@@ -36,13 +36,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Left out are modules that are called with other types than their annotations say:
 # flights (beartype cannot check its Table, a Protocol that is not runtime_checkable), the equations
 # (any record with the names of a Helicopter passes for one, such as with_disturbance's),
-# identification.problem (takes a list of flights for a tuple), identification.rls (its symbolic
-# axes name no argument) and analysis.lti (its own errors for wrong arguments are tested).
+# identification.problem (takes a list of flights for a tuple), equation_error.rls and analysis.lti
+# (their own errors for wrong arguments are tested).
 _CHECKED = (
     "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
     "numerics.hoist numerics.matrix_exponential "
-    "analysis.linear identification.unknowns.transforms identification.equation_error.baseline "
-    "identification.validation.metrics "
+    "analysis.linear identification.unknowns.transforms identification.validation.metrics "
     "identification.estimation.residual identification.estimation.simulated_flights"
 )
 jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")

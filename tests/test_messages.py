@@ -18,22 +18,20 @@ def strings():
     """All text constants of the package that may be a code."""
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                if CODE.fullmatch(node.value):
-                    yield node.value
+            text = node.value if isinstance(node, ast.Constant) else None
+            if isinstance(text, str) and CODE.fullmatch(text):
+                yield text
 
 
 def codes_found():
     """The codes that `found(...)` and `sentence(...)` are called with."""
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-                if node.func.id in ("found", "sentence") and node.args:
-                    yield from (
-                        n.value
-                        for n in ast.walk(node.args[0])
-                        if isinstance(n, ast.Constant) and isinstance(n.value, str)
-                    )
+            called = node.func if isinstance(node, ast.Call) else None
+            if isinstance(called, ast.Name) and called.id in ("found", "sentence") and node.args:
+                inside = ast.walk(node.args[0])
+                texts = (n.value for n in inside if isinstance(n, ast.Constant))
+                yield from (t for t in texts if isinstance(t, str))
 
 
 def test_each_code_has_words_and_all_words_have_a_code():
@@ -44,7 +42,8 @@ def test_each_code_has_words_and_all_words_have_a_code():
 @pytest.mark.parametrize("code", sorted(messages()))
 def test_words_are_sentences_of_a_known_page(code):
     message = messages()[code]
-    assert message.title and message.text
+    assert message.title
+    assert message.text
     assert not message.page or (ROOT.parent / "docs" / f"{message.page}.md").is_file()
     for text in (message.text, message.remedy):
         list(string.Formatter().parse(text))

@@ -27,7 +27,7 @@ from heli_jax.linear_models.read import is_shipped
 from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
-    from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+    from heli_jax.identification.equation_error.start import EquationErrorStart
     from heli_jax.identification.model_selection import Alternatives
 
 
@@ -174,8 +174,8 @@ def with_chosen_windows(problem: Problem) -> Problem:
     if not chosen:
         return problem
     # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.design.windows import window_flights
     from heli_jax.identification.fit import windows
-    from heli_jax.identification.validation.record_windows import window_flights
 
     # By what these flights say alone: the others are fitted whatever they say.
     asked = dataclasses.replace(problem, flights=chosen)

@@ -11,7 +11,7 @@ from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, Vibr
 from heli_jax.config.run_sections import SimulateConfig, SweepConfig
 from heli_jax.config.section import Section
 from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
-from heli_jax.identification.equation_error.first_guess import F_ENTER
+from heli_jax.identification.equation_error.start import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 

@@ -76,7 +76,7 @@ def as_logged(
     Raises:
         InputError: an input has marks; it acts all the time, so that none of it may be missing.
     """
-    made, marks, odd, notes = {}, {}, {}, []
+    made, odd, notes = {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = signal.from_si(timed.values)
@@ -89,7 +89,6 @@ def as_logged(
             numbers = signal.from_si(values)
         at = at_marks(numbers)
         sources = of_sources.get(key, {})
-        marks[key] = (Marked(timed.seconds[at], numbers[at]), *sources.values())
         if at.any():
             words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
@@ -113,7 +112,7 @@ def as_logged(
         made[key] = Timed(timed.seconds, values)
     outputs = frozenset(key for key in made if key[1] == "output")
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
-    facts = {key: replace(f, marked=marks[key], strays=odd[key]) for key, f in facts.items()}
+    facts = {key: replace(f, strays=odd[key]) for key, f in facts.items()}
     return AsLogged(made, facts, tuple(notes))
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from heli_jax.flights.marks import Counts, Marked
 from heli_jax.flights.strays import Strays
 
 _PILE = 5.0
@@ -83,8 +82,6 @@ class SignalFacts:
         usual: the usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
         dropouts: where an output jumps to one value from anywhere.
-        marked: samples that stand for no value, such as -9999, of the signal itself and of each
-            channel from which it is computed; they are missing in the flight.
         strays: samples that may stand for none, and are kept.
     """
 
@@ -97,22 +94,12 @@ class SignalFacts:
     usual: float
     stretches: tuple[Stuck, ...] = ()
     dropouts: Rail | None = None
-    marked: tuple[Marked, ...] = ()
     strays: tuple[Strays, ...] = ()
 
     @property
     def stuck(self) -> Stuck | None:
         """The longest time at one value."""
         return self.stretches[0] if self.stretches else None
-
-    @property
-    def marks(self) -> Counts:
-        """Values that stand for none, as the log has them, and how many there were: of several
-        channels as often as where it is most often."""
-        most: dict[float, int] = {}
-        for value, count in (pair for marked in self.marked for pair in marked.counts):
-            most[value] = max(most.get(value, 0), count)
-        return tuple(sorted(most.items()))
 
     @property
     def dropped(self) -> float:
@@ -124,6 +111,17 @@ class SignalFacts:
         """Of the samples at the lower and at the upper rail."""
         n = max(self.size, 1)
         return self.low.times.size / n, self.high.times.size / n
+
+    def rounding(self, dt: float) -> float:
+        """The error of rounding, rms, that is left at a step of `dt` [s].
+
+        Rounding to steps of q adds an error of q / sqrt(12), rms, where the signal moves by more
+        than a step from sample to sample or has noise of that size. It is white then, and the
+        low-pass filter before a lower rate takes its part of it; where a value stays for several
+        samples, their error is one and the same, and nothing is averaged.
+        """
+        run = self.usual / self.moves if self.moves > 0 else dt
+        return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
 
     def within(self, begin: float, end: float) -> "SignalFacts":
         """Of the part from `begin` to `end` [s], whose times count from `begin`; levels and steps
@@ -142,7 +140,6 @@ class SignalFacts:
         drops = None if self.dropouts is None else cut(self.dropouts)
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
-        marked = (m.within(begin, end) for m in self.marked)
         return replace(
             self,
             size=size,
@@ -150,7 +147,6 @@ class SignalFacts:
             high=cut(self.high),
             stretches=stretches,
             dropouts=drops if drops and drops.times.size else None,
-            marked=tuple(m._replace(places=m.places - begin) for m in marked),
             strays=tuple(s for s in strays if s.times.size),
         )
 

@@ -12,8 +12,11 @@ from jaxtyping import Array, Float
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, distrusted
 from heli_jax.identification.agreement import pooled_metrics
+from heli_jax.identification.design.accuracy import starting_at_zero, unstated_gusts
+from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.diagnostics import diagnose
 from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.diagnostics.excitation import gusts_guessed
 from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
@@ -48,8 +51,9 @@ from heli_jax.identification.further_starts import (
     further_starts,
     left_stability,
 )
+from heli_jax.identification.identifiability.analysis import Around
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
-from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -57,12 +61,6 @@ from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
-from heli_jax.identification.validation.expected_accuracy import (
-    guessed_gusts,
-    starting_at_zero,
-    unstated_gusts,
-)
-from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.messages import sentence
 from heli_jax.stages import stage
 
@@ -209,8 +207,9 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
-    notes = (*ranking.notes, *guessed_gusts(problem, at))
-    record = tuple(f for f in diagnose(context_of(problem, guess)) if f.bad)
+    c = context_of(problem, guess)
+    notes = (*ranking.notes, *gusts_guessed(c))
+    record = tuple(f for f in diagnose(c) if f.bad)
     return dataclasses.replace(ranking, record=record, notes=notes)
 
 

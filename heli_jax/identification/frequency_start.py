@@ -8,7 +8,7 @@ import dataclasses
 import time
 from typing import NamedTuple
 
-from heli_jax.identification.equation_error.first_guess import StartValue
+from heli_jax.identification.equation_error.start import StartValue
 from heli_jax.identification.fit import fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status

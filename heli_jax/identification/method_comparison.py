@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from heli_jax.identification.fit import fit
 from heli_jax.identification.diagnostics.search import STOPPED
+from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit

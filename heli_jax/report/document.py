@@ -22,22 +22,22 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
-from heli_jax.identification.equation_error.first_guess import (
+from heli_jax.identification.equation_error.regression import Step
+from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
 )
-from heli_jax.identification.equation_error.regression import Step
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
+from heli_jax.identification.identifiability.profile import Profile
 from heli_jax.identification.identifiability.verdict import Combination, Pair
 from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.model_selection import Candidate, Nested
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status
 from heli_jax.identification.uncertainty.nuts import Convergence
-from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
 from heli_jax.identification.validation.advice import OutputAdequacy
 from heli_jax.identification.validation.follows_response import LEVEL, Feedback

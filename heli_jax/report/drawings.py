@@ -11,7 +11,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.flights.flight import Signal
-from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.numbers import measured, number, percent, vaf_percent

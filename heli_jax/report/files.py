@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax.finding import Finding, as_data
 from heli_jax.flights.write import stacked, write_table
-from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit, Signals
 from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.model_selection import Choice

@@ -29,7 +29,7 @@ from heli_jax.analysis.spectral import (
     without,
 )
 from heli_jax.dynamics.model import Model
-from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
 from heli_jax.simulation.simulate import substeps_for

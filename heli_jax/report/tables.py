@@ -13,8 +13,8 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.origins import in_words
-from heli_jax.identification.equation_error.baseline import Baseline
-from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+from heli_jax.identification.equation_error.rls import Baseline
+from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Z95, Combination
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult

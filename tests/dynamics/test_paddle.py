@@ -13,7 +13,7 @@ from heli_jax.dynamics.flybar import flapping_rate_gain, flybar_time_constant
 from heli_jax.dynamics.model import needed_but_missing, reads
 from heli_jax.dynamics.roll import ratios_from_denominator, roll_transfer_function
 from heli_jax.errors import InputError
-from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.equation_error.rls import baseline
 from tests.identification.bench import BENCH, denominators, record, response, vehicle
 
 C, A = 0.03, 3.4

@@ -1,5 +1,7 @@
 """What is known of signals before they are resampled: rails, steps, marks for no value, turns."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -9,11 +11,11 @@ from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
 from heli_jax.flights.strays import strays as strays_of
-from heli_jax.identification.validation.signal_quality import (
+from heli_jax.identification.diagnostics.quality import (
     quantisation,
     saturation,
     strays,
-    stuck,
+    stuck_outputs,
 )
 
 N, DT = 2000, 0.01
@@ -21,6 +23,12 @@ T = DT * np.arange(N)
 RNG = np.random.default_rng(0)
 STICK = np.repeat(RNG.uniform(-1, 1, N // 50), 50)
 RATE = np.sin(1.7 * T) + np.sin(2.9 * T) + 0.02 * RNG.standard_normal(N)
+
+
+def of(flight, sd=0.0):
+    """What the diagnostics of signals ask for."""
+    noise = {f"one/{n}": sd for n in flight.outputs}
+    return SimpleNamespace(flights=[("one", flight)], noise=noise)
 
 
 def read(tmp_path, rate=None, unit="1", si="1", window=None, u=STICK, **outputs):
@@ -41,8 +49,8 @@ def read(tmp_path, rate=None, unit="1", si="1", window=None, u=STICK, **outputs)
 @pytest.mark.parametrize("rate", [None, 50.0, 33.0])
 def test_flat_tops_are_seen_at_any_rate(tmp_path, rate):
     f = read(tmp_path, rate, p=np.clip(RATE, -1.0, 1.2))
-    (found,) = saturation([("one", f)])
-    assert found.severity == "doubt"
+    (found,) = saturation(of(f))
+    assert (found.code, found.severity, found.denies) == ("quality.saturation", "doubt", True)
     assert found.value == pytest.approx(np.mean((RATE <= -1.0) | (RATE >= 1.2)), abs=1e-6)
     # Of a part of it the share is that of the part.
     half = part(f, 0, f.n_samples // 2)
@@ -56,13 +64,16 @@ def test_flat_tops_are_seen_at_any_rate(tmp_path, rate):
 def test_coarse_steps_and_a_stuck_sensor_are_seen_at_any_rate(tmp_path, rate):
     held = np.where((T > 5) & (T < 9), RATE[500], RATE)
     f = read(tmp_path, rate, p=np.round(RATE / 0.4) * 0.4, q=held, r=RATE)
-    steps = quantisation([("one", f)], [dict.fromkeys("pqr", 0.02)])
-    assert [s.severity for s in steps] == ["doubt"]
-    assert steps[0].value == pytest.approx(0.4 / 12**0.5 / 0.02, rel=1e-6)
-    (found,) = stuck([("one", f)])
+    (steps,) = quantisation(of(f, 0.02))
+    assert (steps.code, steps.severity) == ("quality.quantisation", "doubt")
+    assert steps.value == pytest.approx(0.4 / 12**0.5 / 0.02, rel=1e-6)
+    (fine,) = quantisation(of(f, 0.2))
+    assert (fine.severity, fine.value) == ("ok", pytest.approx(0.1 * steps.value))
+    (found,) = stuck_outputs(of(f))
     assert found.severity == "doubt"
     assert found.value == pytest.approx(4.0, abs=0.03)
-    assert stuck([("one", read(tmp_path, rate, r=RATE))])[0].severity == "ok"
+    (found,) = stuck_outputs(of(read(tmp_path, rate, r=RATE)))
+    assert found.severity == "ok"
 
 
 def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
@@ -73,13 +84,6 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     np.testing.assert_array_equal(f.outputs["p"], read(tmp_path, 50.0, p=missing).outputs["p"])
     assert f.source is not None
     assert [n.value for n in f.source.notes if n.code == "samples.marks"] == [11]
-    assert stuck([("one", f)])[0].severity == "doubt"
-    # Of a part of it those of that part count.
-    facts = [
-        h.source.facts["p", "output"] for h in (part(f, 0, 400), part(f, 400, 600)) if h.source
-    ]
-    assert [one.marks for one in facts] == [((-9999.0, 10),), ((1e10, 1),)]
-    assert stuck([("one", part(f, 0, 300))])[0].severity == "ok"
     with pytest.raises(InputError):
         read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
     # However often: of a sensor at 5 Hz most rows hold nothing else.
@@ -105,8 +109,8 @@ def test_samples_that_no_motion_leads_to_are_said_and_kept(tmp_path):
     assert f.source is not None
     said = [n for n in f.source.notes if n.code == "samples.stray-kept"]
     assert [(n.subjects, n.value) for n in said] == [(("p",), 3)]
-    assert [(s.severity, s.value) for s in strays([("one", f)])] == [("doubt", 3.0)]
-    (found,) = strays([("one", part(f, 0, 400))])
+    assert [(s.severity, s.value) for s in strays(of(f))] == [("doubt", 3.0)]
+    (found,) = strays(of(part(f, 0, 400)))
     assert found.value == 2.0
     # Doublets out of rest, at any rate, in steps of the log or not, and a landing are motions.
     u = np.where((T > 5) & (T < 5.2), 0.3, 0.0) - np.where((T > 5.2) & (T < 5.4), 0.3, 0.0)

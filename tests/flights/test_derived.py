@@ -8,7 +8,6 @@ from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.cut import part
 from heli_jax.flights.derived import body_velocity, euler_angles, with_derived
 from heli_jax.flights.open_log import open_log
 
@@ -68,15 +67,9 @@ def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
     np.testing.assert_allclose(f.outputs["phi"][rest], ANGLES[0, rest], atol=1e-12)
     assert f.source is not None
     assert 10 in [n.value for n in f.source.notes if n.code == "samples.marks"]
-    assert f.source.facts["phi", "output"].marks == ((-9999.0, 10),)
     got = convert_log(path, Selection(signals=(roll,)))
     assert np.isnan(got.columns[roll][50:60]).all()
     assert 10 in [n.value for n in got.notes if n.code == "samples.marks"]
-    # Of a part of it those of that part count.
-    for first, last, left in ((0, 55, ((-9999.0, 5),)), (53, 100, ((-9999.0, 7),)), (60, 200, ())):
-        half = part(f, first, last)
-        assert half.source is not None
-        assert half.source.facts["phi", "output"].marks == left
     # Of another part of the log nothing is said.
     f = read_flight(path, time="t", inputs=inputs, outputs=outputs, window=(1.0, 1.9))
     assert f.source is not None

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Helicopter, models
-from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.equation_error.rls import baseline
 from tests.dynamics.paper import BENCH, matrices
 
 DT, N = 0.02, 4000

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from heli_jax.identification.diagnostics.excitation import excited_bands
 from heli_jax.identification.diagnostics.loop import feedback_tested
 from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.fit import context_of
-from heli_jax.identification.validation.excited_band import bands, hardly_moving, seen_parts
-from tests.identification.test_enough import DT, TRUTH, flight, problem, response
+from heli_jax.identification.validation.excited_band import excitation_of, seen_parts
+from tests.identification.test_enough import DT, TRUTH, flight, found_of, problem, response
 
 
 def swept(n=4000, noise=0.02):
@@ -30,12 +31,8 @@ def without(f, *holes):
     return replace(f, outputs={"phi": y})
 
 
-def band(f):
-    return [x for x in bands([f]) if x.code == "excitation.excited-band"]
-
-
 def severities(f):
-    return [x.severity for x in band(f)]
+    return [x.severity for x in found_of(excited_bands, f)]
 
 
 def test_few_missing_samples_leave_the_band_as_it_is():
@@ -66,19 +63,7 @@ def test_a_line_of_vibration_is_no_band():
     u, y = (line + rng.standard_normal(n) for _ in range(2))
     f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
     assert severities(f) == ["note"]
-    assert "excitation.nothing-follows" in {x.code for x in bands([f])}
-
-
-def test_inputs_of_one_count_or_one_sample_are_doubted():
-    f, n = swept(), 4000
-    spike = np.zeros(n)
-    spike[700] = 0.002
-    count = np.full(n, 0.030)
-    count[700:900] = 0.032
-    pulse = np.where((np.arange(n) > 700) & (np.arange(n) < 760), 0.1, -0.1)
-    for u, doubted in ((spike, 1), (count, 1), (pulse, 0)):
-        moving = replace(f, inputs={"u": u, "v": np.zeros(n)})
-        assert len(hardly_moving([moving], ["u"])) == doubted
+    assert excitation_of([f]).share is not None
 
 
 def test_feedback_that_was_not_tested_is_said():
@@ -128,9 +113,8 @@ def test_a_machine_in_gusts_is_seen_to_follow_at_half_the_rate_too(every):
     record = replace(
         flight(n=n // every), dt=0.01 * every, inputs=signals, outputs={"phi": y[::every]}
     )
-    [found] = band(record)
-    assert found.severity == "ok"
-    assert found.criterion == "partial coherence with an output, 0.60"
+    assert severities(record) == ["ok"]
+    assert excitation_of([record]).limit == 0.6
 
 
 def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_together():
@@ -146,6 +130,6 @@ def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_toget
 
     short = moved(500, 1.0)
     for resting in (0, 8):
-        found = bands([short, *(moved(1500, 0.0) for _ in range(resting))])
-        [together] = [x for x in found if x.code == "excitation.inputs-together"]
-        assert together.severity == "ok"
+        found = excitation_of([short, *(moved(1500, 0.0) for _ in range(resting))])
+        [together] = found.pairs
+        assert together.coherence < found.pair_limit

@@ -12,8 +12,8 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, linear_model, load_config, models
 from heli_jax.config import problem
 from heli_jax.errors import InputError
-from heli_jax.identification.equation_error.records import segments, smoothed, smoothed_input
-from heli_jax.identification.equation_error.regression import Rows, basis_of, covariance, partial_f
+from heli_jax.identification.equation_error.records import segments, smoothed
+from heli_jax.identification.equation_error.regression import Rows, covariance, partial_f
 from heli_jax.identification.equation_error.start import equation_error_start
 from heli_jax.naming import Scalar
 
@@ -81,14 +81,14 @@ def test_smoothing_keeps_polynomials_and_a_held_equation(half):
     assert np.ptp(y - (1.0 + 2.0 * inner - 3.0 * inner**2)) < 1e-9
     flight = record(n=600)
     p = smoothed(flight.outputs["p"], DT, half)
-    da = smoothed_input(flight.inputs["da"], DT, half, held=True)
+    da = smoothed(flight.inputs["da"], DT, half, held=True)
     by_hand = np.linalg.lstsq(np.stack([p[0], da[0]], axis=1), p[1], rcond=None)[0]
     np.testing.assert_allclose(by_hand, [-4.0, 25.0], rtol=0.006)
 
 
 def test_a_delayed_input_is_shifted():
     t = DT * np.arange(300)
-    late = smoothed_input(np.sin(5.0 * t), DT, 8, held=False, late=0.033)[0]
+    late = smoothed(np.sin(5.0 * t), DT, 8, held=False, late=0.033)[0]
     on_time = smoothed(np.sin(5.0 * (t - 0.033)), DT, 8)[0]
     np.testing.assert_allclose(late[5:], on_time[5:], atol=2e-4)
 
@@ -126,7 +126,7 @@ def test_standard_errors_allow_for_residuals_with_a_memory():
         theta = np.linalg.lstsq(X, y, rcond=None)[0]
         rows = Rows(y - X @ theta, -X, np.arange(1500), np.zeros(1500, int))
         off.append((theta - [1.0, -2.0]) / np.sqrt(np.diag(covariance(rows))))
-        assert partial_f(basis_of(X[:, :1]), y, X[:, 1], rows.times) == pytest.approx(
+        assert partial_f(X[:, :1], y, X[:, 1], rows.times) == pytest.approx(
             theta[1] ** 2 / covariance(rows)[1, 1], rel=0.1
         )
     assert 0.8 < np.sqrt(np.mean(np.square(off))) < 1.4

@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight, Signal
 from heli_jax.flights.flight import Source
-from heli_jax.identification.validation.misread import doubtful_inputs
+from heli_jax.identification.validation.signal_signs import inputs_in_other_units
 
 N, DT, FULL = 500, 0.02, 0.5
 
@@ -27,24 +27,24 @@ def doubts(unit, si, per_full, off=1.5, stick="lat"):
     start = off * lagged(read)
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": read}, outputs={"p": p}, source=source)
-    at_start = [("one", flight)], [{"p": start}], {"p": stick}
-    return doubtful_inputs(*at_start)
+    return list(inputs_in_other_units([("one", flight)], [{"p": start}], {"p": stick}))
 
 
 @pytest.mark.parametrize("off", [0.5, 1.5])
 @pytest.mark.parametrize(
-    ("unit", "si", "per_full", "factor"),
+    ("unit", "si", "per_full", "other", "factor"),
     [
-        ("1", "1", 50.0, 0.01), ("%", "1", 0.5, 100.0),
-        ("rad", "rad", np.degrees(FULL), np.pi / 180.0), ("deg", "rad", FULL, 180.0 / np.pi),
+        ("1", "1", 50.0, "%", 0.01), ("%", "1", 0.5, "1", 100.0),
+        ("rad", "rad", np.degrees(FULL), "deg", np.pi / 180.0),
+        ("deg", "rad", FULL, "rad", 180.0 / np.pi),
     ],
 )  # fmt: skip
-def test_a_stick_in_another_unit_is_doubted(unit, si, per_full, factor, off):
+def test_a_stick_in_another_unit_is_doubted(unit, si, per_full, other, factor, off):
     [found] = doubts(unit, si, per_full, off)
-    assert (found.code, found.severity, found.denies) == ("units.in-doubt", "doubt", False)
-    assert found.subjects == ("lat",)
+    assert (found.name, found.stated, found.unit) == ("lat", unit, other)
+    assert found.factor == pytest.approx(factor)
     # How far p moves over what the start values make of the stick as it is read.
-    assert found.value == pytest.approx(factor / off, rel=0.05)
+    assert found.moved == {"p": pytest.approx(factor / off, rel=0.05)}
     # The effect of another stick is no evidence.
     assert doubts(unit, si, per_full, off, stick="lon") == []
 
@@ -65,4 +65,5 @@ def test_counts_that_a_model_is_made_for_are_no_per_cent():
     source = Source("log.csv", "", inputs={"lat": signal})
     flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p}, source=source)
     for off in (0.2, 1.0, 5.0):
-        assert doubtful_inputs([("one", flight)], [{"p": off * p}], {"p": "lat"}) == []
+        at_start = [("one", flight)], [{"p": off * p}], {"p": "lat"}
+        assert list(inputs_in_other_units(*at_start)) == []

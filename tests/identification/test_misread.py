@@ -13,10 +13,9 @@ from heli_jax import Flight, linear_model, models
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
-from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
+from heli_jax.identification.diagnostics import quality, units
 from heli_jax.identification.validation.shifts import lateness
-from heli_jax.identification.validation.signal_quality import cut_off
-from heli_jax.identification.validation.signal_signs import angle_over_rate
+from heli_jax.identification.validation.signal_signs import angle_over_rate, oversized
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
 DT, N = 0.02, 1000
@@ -30,10 +29,6 @@ ROLL_AXES = linear_model("roll-flybarless").model.axes
 
 class Motor(NamedTuple):
     tau: float
-
-
-def facts(problem):
-    return [flight.facts for flight in problem.training]
 
 
 @pytest.fixture
@@ -62,17 +57,33 @@ def load(tmp_path):
     return load
 
 
-def denied(found):
+RECORD_ALONE = (
+    units.rate_against_angle, units.against_file, units.size_of_angles, units.no_sticks,
+    quality.saturation, quality.stuck_outputs,
+)  # fmt: skip
+
+
+def record_doubts(c):
+    return [f for diagnostic in RECORD_ALONE for f in diagnostic(c) if f.bad]
+
+
+def denied(c):
     """(code, subjects) of what shows that no model explains these flights."""
-    return [(f.code, f.subjects) for f in record_doubts(found) if f.denies]
+    return [(f.code, f.subjects) for f in record_doubts(c) if f.denies]
 
 
-IN_DOUBT = ("units.in-doubt", ("p",))
+IN_DOUBT, AGAINST_FILE = ("units.in-doubt", ("p",)), ("units.against-file", ("p",))
 
 
-def of(found):
-    """The parts of a problem that these questions ask for."""
-    return SimpleNamespace(training=found, model=linear_model("roll-flybarless").model)
+def of(flights):
+    """What these diagnostics ask for."""
+    return SimpleNamespace(
+        flights=[(str(i), f) for i, f in enumerate(flights)],
+        problem=SimpleNamespace(model=linear_model("roll-flybarless").model),
+        fitted=False,
+        status="not-converged",
+        estimates={},
+    )
 
 
 def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
@@ -86,13 +97,13 @@ def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
 @pytest.mark.parametrize("size", [1.0, 20.0])
 def test_a_unit_against_that_of_the_file_is_doubted(load, size):
     found = of(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s"))
-    assert [(f.code, f.subjects) for f in misread(found)] == [IN_DOUBT, IN_DOUBT]
+    assert [(f.code, f.subjects) for f in record_doubts(found)] == [AGAINST_FILE, IN_DOUBT]
     assert denied(found) == [IN_DOUBT]
     # What is small either way is doubted, and no reason by itself.
     small = of(load(0.1 * P, unit="deg/s", unit_of_p="rad/s"))
-    [one] = misread(small)
-    assert (one.code, one.severity, one.denies) == ("units.in-doubt", "doubt", False)
-    assert misread(of(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s"))) == []
+    [one] = record_doubts(small)
+    assert (one.code, one.subjects, one.denies) == (*AGAINST_FILE, False)
+    assert record_doubts(of(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s"))) == []
 
 
 def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_is_only_doubted(load):
@@ -105,7 +116,7 @@ def test_a_rate_that_a_helicopter_may_have_and_a_linear_model_may_not_is_only_do
 def test_degrees_that_are_read_as_radians_are_doubted(load):
     found = of(load(np.degrees(P)))
     assert denied(found) == [IN_DOUBT]
-    assert len(misread(found)) == 1
+    assert len(record_doubts(found)) == 1
     assert record_doubts(of(load(P))) == []
 
 
@@ -114,11 +125,9 @@ def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
     found = of(load(p))
     assert denied(found) == [("quality.dropouts", ("p",))]
-    assert len(dropouts(found, facts(found))) == 1
     [flight] = load(p, missing=0)
     assert np.isnan(flight.outputs["p"]).sum() == 20
-    problem = of([flight])
-    assert dropouts(problem, facts(problem)) == []
+    assert record_doubts(of([flight])) == []
 
 
 def test_flat_tops_are_no_measurements(load):
@@ -126,8 +135,7 @@ def test_flat_tops_are_no_measurements(load):
     noisy = P + 0.01 * rng.standard_normal(N)
     for limit, count in ((0.4, 1), (np.inf, 0)):
         problem = of(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s"))
-        assert len(cut_off([("one", *facts(problem))])) == count
-        assert [subjects for _, subjects in denied(problem)] == count * [("p",)]
+        assert denied(problem) == count * [("quality.saturation", ("p",))]
 
 
 @pytest.mark.parametrize("every", [1, 10], ids=["every sample", "a tenth of them"])
@@ -146,8 +154,7 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
             outputs={"p": p * of_rate, "phi": phi},
             source=Source("log.csv", "", outputs=signals),
         )
-        problem = SimpleNamespace(training=[flight], model=linear_model("roll-flybarless").model)
-        [found] = misread(problem)
+        [found] = units.size_of_angles(of([flight]))
         assert found.value == pytest.approx(5.7, rel=0.02)
         assert found.denies is sure
         assert found.code == ("units.in-doubt" if sure else "units.flown-or-degrees")
@@ -160,13 +167,13 @@ def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
     for angle, rate in (("phi", "p"), ("theta", "q"), ("psi", "r")):
         assert lateness(log[angle], log[rate], 0.01) is None
         ratio = angle_over_rate(log[angle], log[rate], 0.01)
-        assert ratio is None or ratio[0] > 0
+        assert ratio is None or ratio.factor > 0
 
 
 def test_the_shaft_of_a_motor_may_turn(load):
     found = of(load(100.0 * P, unit_of_p="rad/s"))
     assert denied(found) == [IN_DOUBT]
-    [flight] = found.training
+    [(_, flight)] = found.flights
     renamed = dataclasses.replace(
         flight,
         outputs={"speed": flight.outputs["p"]},
@@ -174,15 +181,13 @@ def test_the_shaft_of_a_motor_may_turn(load):
     )
     # No attitude and no rate of a fuselage: of how fast it may turn nothing is known.
     motor = dataclasses.replace(models.roll_on_stand, axes=(), Params=Motor)
-    assert misread(SimpleNamespace(training=(renamed,), model=motor)) == []
+    assert list(oversized(motor, renamed)) == []
     # Nor is the angle of a pendulum that goes over the top an attitude, whatever it is called.
     turning = {"phi": Signal("phi", "rad", "rad")}
     flight = Flight(
         dt=DT, inputs={"lat": U}, outputs={"phi": 6.0 * T}, source=Source("a", "", outputs=turning)
     )
     swing = dataclasses.replace(motor, axes=ROLL_AXES, linear=False)
-    assert misread(SimpleNamespace(training=(flight,), model=swing)) == []
+    assert list(oversized(swing, flight)) == []
     helicopter = dataclasses.replace(swing, Params=models.roll_on_stand.Params)
-    assert [f.code for f in misread(SimpleNamespace(training=(flight,), model=helicopter))] == [
-        "units.in-doubt"
-    ]
+    assert [one.certain for one in oversized(helicopter, flight)] == [True]

@@ -1,11 +1,13 @@
 """Outputs that were low-passed before the log are named, those with a sensor's noise are not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.signal_quality import smoothed
+from heli_jax.identification.diagnostics.quality import smoothed
 from heli_jax.numerics.white_noise import highest_frequency
 
 DT, N = 0.01, 3000
@@ -29,7 +31,9 @@ def low_passed(y, hz):
 
 def found_of(process_noise, **outputs):
     flight = Flight(dt=DT, inputs={"lat": np.zeros(N)}, outputs=outputs)
-    return smoothed([("flight 1", flight)], process_noise=process_noise)
+    layout = SimpleNamespace(estimator=SimpleNamespace(process_noise=process_noise))
+    asked = SimpleNamespace(flights=[("flight 1", flight)], at=SimpleNamespace(layout=layout))
+    return list(smoothed(asked))
 
 
 def test_a_low_passed_log_is_named_with_its_band():

@@ -12,9 +12,9 @@ from heli_jax.config import problem as configured
 from heli_jax.errors import InputError
 from heli_jax.flights import Source
 from heli_jax.flights.cut import part
+from heli_jax.identification.design import windows as record_windows
+from heli_jax.identification.design.windows import Exclusions
 from heli_jax.identification.fit import check, windows
-from heli_jax.identification.validation import record_windows
-from heli_jax.identification.validation.record_windows import Exclusions
 from tests.identification.test_enough import DT, problem, response, steps
 
 

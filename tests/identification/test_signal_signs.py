@@ -10,13 +10,10 @@ import scipy.signal
 
 from heli_jax import Flight, linear_model
 from heli_jax.identification.diagnostics.timing import inputs_late
+from heli_jax.identification.diagnostics.units import outputs_against_start, rate_against_angle
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.shifts import late_angles, lateness
-from heli_jax.identification.validation.signal_signs import (
-    against_start,
-    rate_against_angle,
-    sticks_of,
-)
+from heli_jax.identification.validation.signal_signs import against_start, sticks_of
 from heli_jax.models import with_filters
 from tests.identification.test_enough import DT, SWING, problem, response, steps
 
@@ -36,7 +33,10 @@ def moved(seed=0):
 def said(phi, p):
     u = np.zeros(N)
     flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
-    return rate_against_angle(problem(flight))
+    asked = SimpleNamespace(
+        flights=[("one", flight)], problem=problem(flight), status="not-converged", estimates={}
+    )
+    return list(rate_against_angle(asked))
 
 
 def test_an_angle_that_moves_as_its_rate_says_nothing():
@@ -75,6 +75,10 @@ def test_a_rate_that_is_too_large_for_its_angle_is_said():
             assert found.value == pytest.approx(scale, rel=0.05)
 
 
+def against(flight, run, sticks=STICKS):
+    return list(against_start([("flight 1", flight)], [run], sticks))
+
+
 def test_an_output_that_moves_against_the_simulated_one_is_said():
     u, phi, p = moved()
     for sign in (1.0, -1.0):
@@ -85,19 +89,30 @@ def test_an_output_that_moves_against_the_simulated_one_is_said():
         guess = scipy.signal.lfilter(np.ravel(b), a, sign * u)
         run = {"phi": guess, "p": np.gradient(guess, DT)}
         # Both outputs against it: the stick is at fault, in one finding.
-        subjects = [f.subjects for f in against_start([("flight 1", flight)], [run], STICKS)]
-        assert subjects == ([] if sign > 0 else [("phi", "p", "u")])
+        turned = [(*t.correlations, *t.sticks) for t in against(flight, run)]
+        assert turned == ([] if sign > 0 else [("phi", "p", "u")])
     # One of the two: that column is.
     flight = Flight(dt=DT, inputs=inputs, outputs={"phi": -phi, "p": p})
     run = {n: -y for n, y in run.items()}
-    [finding] = against_start([("flight 1", flight)], [run], STICKS)
-    assert finding.subjects == ("phi",)
+    [turned] = against(flight, run)
+    assert (tuple(turned.correlations), turned.sticks) == (("phi",), ())
     # Without another, it may be either.
     alone = Flight(dt=DT, inputs=inputs, outputs={"p": -p})
-    [finding] = against_start([("flight 1", alone)], [run])
-    assert finding.subjects == ("p", "u or v")
-    other = [{"phi": moved(7)[1], "p": moved(7)[2]}]
-    assert against_start([("flight 1", flight)], other) == []
+    [turned] = against(alone, run, {})
+    assert (tuple(turned.correlations), turned.sticks) == (("p",), ("u", "v"))
+    assert against(flight, {"phi": moved(7)[1], "p": moved(7)[2]}, {}) == []
+
+
+def test_a_turned_output_is_a_doubt_before_a_fit_and_after_one_that_explains_little():
+    held, run = swept_and_held()
+    start = SimpleNamespace(simulated=[run])
+    for fitted, denied, count in ((False, False, 1), (True, False, 0), (True, True, 1)):
+        asked = SimpleNamespace(
+            flights=[("held", held)], problem=problem(held), start=start, fitted=fitted,
+            adequacy=SimpleNamespace(denied=denied),
+        )  # fmt: skip
+        found = list(outputs_against_start(asked))
+        assert [f.code for f in found] == count * ["signs.against-start"]
 
 
 def test_the_stick_of_an_output_is_that_of_its_axis():
@@ -234,12 +249,12 @@ def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):
 
 def test_a_stick_that_holds_in_one_flight_and_sweeps_in_another_has_the_right_sign():
     held, swept = swept_and_held(), swept_and_held(1, swept=1.0)
-    [finding] = against_start([("held", held[0])], [held[1]])
+    [turned] = against(*held, {})
     # Alone it may be either, and that is said.
-    assert finding.value < -0.3
+    assert turned.correlations["p"] < -0.3
     flights = [("held", held[0]), ("swept", swept[0])]
-    assert against_start(flights, [held[1], swept[1]]) == []
+    assert list(against_start(flights, [held[1], swept[1]], {})) == []
     # Of two flights that sweep alike one is turned.
     turned = swept_and_held(1, swept=1.0, sign=-1.0)
     flights = [("turned", turned[0]), ("swept", swept[0])]
-    assert len(against_start(flights, [turned[1], swept[1]])) == 1
+    assert len(list(against_start(flights, [turned[1], swept[1]], {}))) == 1

@@ -8,8 +8,8 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.flights.slower import Timed, at_nearest
-from heli_jax.identification.equation_error.baseline import baseline
 from heli_jax.identification.equation_error.records import segments
+from heli_jax.identification.equation_error.rls import baseline
 from heli_jax.identification.validation.feedback import untested
 from heli_jax.identification.validation.metrics import whiteness
 

@@ -1,6 +1,7 @@
 """Late sticks, stuck sensors and dropouts, as they are told of a record at any rate."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,10 +9,10 @@ import scipy.signal
 
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
+from heli_jax.identification.diagnostics.quality import stuck_outputs
 from heli_jax.identification.validation.adequacy import Evidence, _of_noise
 from heli_jax.identification.validation.advice import OutputAdequacy, Record
 from heli_jax.identification.validation.shifts import led_by
-from heli_jax.identification.validation.signal_quality import stuck
 
 RNG = np.random.default_rng(0)
 T = 0.005 * np.arange(6000)
@@ -79,8 +80,9 @@ def test_dropouts_that_hold_the_last_value_are_told_by_what_they_take_together()
     assert len(found.stretches) == 9
     flight = Flight(0.005, inputs={"u": STICK}, outputs={"p": noisy})
     source = Source("a.csv", "", facts={("p", "output"): found})
-    [told] = stuck([("one", replace(flight, source=source))])
+    [told] = stuck_outputs(SimpleNamespace(flights=[("one", replace(flight, source=source))]))
     assert (told.code, told.severity) == ("quality.stuck-output", "doubt")
+    assert told.value == pytest.approx(9 * 0.295)
     # A second of it, and a part that has one of them alone.
     assert len(found.within(1.0, 9.0).stretches) == 3
     assert found.within(3.0, 6.0).stuck is None

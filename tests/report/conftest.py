@@ -7,7 +7,7 @@ import pytest
 from heli_jax import Free, Problem, fit, models
 from heli_jax.finding import note
 from heli_jax.flights.flight import Source
-from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.equation_error.rls import baseline
 from tests.identification.bench import BENCH, record, vehicle
 
 IXX, IF = Free(0.05, 0.001, 1.0), Free(5e-4, 1e-6, 1e-2)

@@ -64,6 +64,7 @@ from heli_jax.identification.validation.excitation_test import (
     outputs_against_excitation,
     residual_against_excitation,
 )
+from heli_jax.identification.validation.excited_band import Excitation, excitation_of
 from heli_jax.identification.validation.feedback import feedback_of
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out import validate
@@ -151,6 +152,11 @@ class Context:
     def params(self) -> Any:  # a record of the model's Params, a class of the user's
         """The vehicle with the values of the free parameters in place."""
         return self.problem.params_with({n: v for n, v in self.named.items() if n in self.free})
+
+    @cached_property
+    def excitation(self) -> Excitation:
+        """What the inputs excite, and which outputs follow them."""
+        return excitation_of(self.problem.training)
 
     # What is left of the record.
 

@@ -1,24 +1,151 @@
-from heli_jax.identification.validation.misread import dropouts
-from heli_jax.identification.validation.signal_quality import (
-    quantisation,
-    saturation,
-    smoothed,
-    strays,
-    stuck,
-    cut_off,
-)
+"""Are signals cut off, stuck, astray, logged in coarse steps or smoothed?
+
+Judged as they were logged, where the flight knows it: what was resampled has no flat tops and no
+steps, and suffers from them all the same.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from heli_jax.finding import Finding, found
+from heli_jax.flights.signal_facts import DROP_SHARE, RAIL_SHARE, STUCK_SECONDS
+from heli_jax.identification.diagnostics.context import Context
+from heli_jax.identification.estimation.filter_error import noiseless
+from heli_jax.numerics.white_noise import highest_frequency, noise_guess
+
+_CUT_OFF = 0.02
+"""part of an output's samples at its rails from which on no model of them is adequate"""
 
 
-def _all(c):
-    yield from dropouts(c.problem, [f.facts for _, f in c.flights])
-    if c.fitted:
-        yield from cut_off([(n, f.facts) for n, f in c.flights])
-    else:
-        yield from saturation(c.flights)
-        yield from stuck(c.flights)
-    yield from strays(c.flights)
-    yield from quantisation(c.flights, c.at.noise.sd)
-    yield from smoothed(c.flights, process_noise=c.at.layout.estimator.process_noise)
+def saturation(c: Context) -> Iterator[Finding]:
+    """Signals that rest at an end of their range."""
+    cut = [
+        (label, name, kind, facts)
+        for label, flight in c.flights
+        for (name, kind), facts in flight.facts.items()
+        if sum(facts.shares) > 0
+    ]
+    for label, name, kind, facts in sorted(cut, key=lambda one: -sum(one[3].shares)):
+        share = sum(facts.shares)
+        ends = zip((facts.low.value, facts.high.value), facts.shares, strict=True)
+        yield found(
+            "quality.saturation" if kind == "output" else "quality.input-saturation",
+            "doubt",
+            name,
+            value=share,
+            denies=kind == "output" and share >= _CUT_OFF,
+            flight=label,
+            ends=[value for value, part in ends if part],
+            percent=100.0 * share,
+            limit=RAIL_SHARE,
+        )
+    if not cut:
+        yield found("quality.no-saturation", "ok", value=0.0, limit=RAIL_SHARE)
 
 
-DIAGNOSTICS = (_all,)
+def stuck_outputs(c: Context) -> Iterator[Finding]:
+    """Outputs that stay at one value while other signals move, or jump to one again and again."""
+    fine = True
+    for label, flight in c.flights:
+        signals = flight.source.outputs if flight.source else {}
+        for (name, _), facts in flight.facts.items():
+            if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
+                value = facts.dropouts.value
+                logged = signals[name].from_si(np.array(value)) if name in signals else value
+                fine = False
+                yield found(
+                    "quality.dropouts",
+                    "doubt",
+                    name,
+                    value=facts.dropped,
+                    denies=True,
+                    flight=label,
+                    at=value,
+                    percent=100.0 * facts.dropped,
+                    logged=float(logged),
+                    limit=DROP_SHARE,
+                )
+            if facts.stuck is not None:
+                fine = False
+                yield found(
+                    "quality.stuck-output",
+                    "doubt",
+                    name,
+                    value=round(sum(s.end - s.begin for s in facts.stretches), 6),
+                    flight=label,
+                    count=len(facts.stretches),
+                    longest=facts.stuck.end - facts.stuck.begin,
+                    begin=facts.stuck.begin,
+                    at=facts.stuck.value,
+                    limit=STUCK_SECONDS,
+                )
+    if fine:
+        yield found("quality.no-stuck-output", "ok", value=0.0, limit=STUCK_SECONDS)
+
+
+def strays(c: Context) -> Iterator[Finding]:
+    """Samples that may stand for no value and are kept."""
+    stray = [
+        (label, name, odd)
+        for label, flight in c.flights
+        for (name, _), facts in flight.facts.items()
+        for odd in facts.strays
+    ]
+    for label, name, odd in stray:
+        yield found(
+            "quality.stray-samples",
+            "doubt",
+            name,
+            value=float(odd.times.size),
+            flight=label,
+            low=odd.values.min(),
+            high=odd.values.max(),
+            first=odd.times[0],
+        )
+    if not stray:
+        yield found("quality.no-stray-samples", "ok", value=0.0)
+
+
+def quantisation(c: Context) -> Iterator[Finding]:
+    """Outputs whose steps are coarse beside the noise that is assumed."""
+    worst = 0.0
+    for label, flight in c.flights:
+        for name in flight.outputs:
+            facts = flight.facts[name, "output"]
+            rounding = facts.rounding(flight.dt) if facts.levels > 1 else 0.0
+            ratio = rounding / c.noise[f"{label}/{name}"]
+            worst = max(worst, ratio)
+            if ratio > 1.0:
+                yield found(
+                    "quality.quantisation",
+                    "doubt",
+                    name,
+                    value=ratio,
+                    flight=label,
+                    step=facts.step,
+                    rounding=rounding,
+                )
+    if worst <= 1.0:
+        yield found("quality.fine-steps", "ok", value=worst)
+
+
+def smoothed(c: Context) -> Iterator[Finding]:
+    """Outputs that have no noise of a sensor."""
+    filtered = c.at.layout.estimator.process_noise
+    for label, flight in c.flights:
+        names = noiseless(flight.outputs)
+        if names:
+            outputs = [flight.outputs[n] for n in names]
+            highest = [highest_frequency(y, flight.dt) or 0.0 for y in outputs]
+            yield found(
+                "quality.smoothed-for-filter" if filtered else "quality.smoothed",
+                "doubt" if filtered else "note",
+                *names,
+                value=max(noise_guess(y) / float(np.nanstd(y)) for y in outputs),
+                flight=label,
+                below=f"{max(highest):.2g} Hz" if max(highest) else "",
+            )
+
+
+DIAGNOSTICS = (saturation, stuck_outputs, strays, quantisation, smoothed)

@@ -1,68 +1,246 @@
-from heli_jax.finding import Finding
-from heli_jax.identification.identifiability.sentences import listed
-from heli_jax.identification.validation.misread import (
-    doubtful_inputs,
-    misread,
-    scaled_by,
-)
+"""Do signals have the signs and units that they are said to have?
+
+What a record shows of that by itself is little: degrees fit as well as radians, and a turned input
+as well as a right one, with estimates that are off by 57 or of the other sign.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from heli_jax.dynamics.model import Model
+from heli_jax.finding import UNIT_IN_DOUBT, Finding, found
+from heli_jax.flights.channel_names import no_stick, unit_in_name
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.table import shown
+from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.signal_signs import (
-    RATE_SCALE,
+    AGAINST,
+    NEAR,
     against_start,
-    rate_against_angle,
+    angle_over_rate,
+    inputs_in_other_units,
+    oversized,
+    rates_and_angles,
+    scaled_by,
     sticks_of,
 )
 
 
-def _all(c):
-    at_start = (c.flights, c.start.simulated, sticks_of(c.problem.model))
-    for f in misread(c.problem):
-        yield f
-    for f in rate_against_angle(c.problem):
-        if c.fitted and f.code == RATE_SCALE and c.status != "not-converged":
-            f = f._replace(distrusts=tuple(c.estimates))
-        yield f
-    for f in doubtful_inputs(*at_start):
-        if c.fitted and c.status != "not-converged":
-            f = f._replace(distrusts=scaled_by(c.at, f.subjects[0]))
-        yield f
-    if not c.fitted or c.adequacy.denied:
-        yield from against_start(*at_start)
+@dataclass(frozen=True)
+class Limits:
+    """From which sizes on signs and units are doubted."""
+
+    factor: float = 1.3
+    """of an angle's change over that of its integrated rate: coupled rotation and sensors that are
+    off by a fifth"""
+    degrees: float = 1.3
+    """factor about 57.3 that is still degrees read as radians"""
+    scale: float = 1.12
+    """the same by the 95 % interval: a sensor off by a tenth, and of pitch and heading the cosine
+    of the bank"""
+    scale_of_roll: float = 1.04
+    """of the bank, whose rate is p but for what the tangent of the pitch angle lets in: that goes
+    with another motion, and changes no factor by more than a hundredth or two"""
+    near_zero: float = 0.2
+    """of an estimate, below which a start says nothing of its sign"""
 
 
-def _turned(c):
-    return sign_notes(c.problem, c.estimates) if c.arrived else []
+LIMITS = Limits()
+_DEGREE = 180.0 / np.pi
+_ROLL = frozenset({"phi", "roll"})
 
 
-_NEAR_ZERO = 0.2
+def rate_against_angle(c: Context) -> Iterator[Finding]:
+    """Angles that do not move as the integral of their rate."""
+    for label, flight in c.flights:
+        for rate, angle in rates_and_angles(c.problem.model):
+            if not {rate, angle} <= flight.outputs.keys():
+                continue
+            ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
+            if ratio is None:
+                continue
+            backward, off = ratio.factor < 0, ratio.off(LIMITS.factor)
+            size = abs(ratio.factor)
+            low, high = ratio.scale
+            most = LIMITS.scale_of_roll if angle in _ROLL else LIMITS.scale
+            numbers = {"flight": label, "rate": rate, "angle": angle}
+            if backward or off:
+                far = max(size, 1.0 / size) / _DEGREE
+                # No model follows an angle that runs against its rate, or is in other units.
+                yield found(
+                    "signs.rate-against-angle",
+                    "doubt",
+                    rate,
+                    angle,
+                    value=ratio.factor,
+                    denies=backward or 1.0 / LIMITS.degrees < far < LIMITS.degrees,
+                    limit=LIMITS.factor,
+                    **numbers,
+                )
+            elif low > most or high < 1.0 / most:
+                # A scale, a unit or the clock is off: each parameter depends on one of them.
+                yield found(
+                    "units.rate-scale",
+                    "doubt",
+                    rate,
+                    angle,
+                    value=1.0 / size,
+                    distrusts=() if c.status == "not-converged" else c.estimates,
+                    low=low,
+                    high=high,
+                    limit=most,
+                    **numbers,
+                )
 
 
-def sign_notes(problem, estimates):
-    """Doubt about parameters that surely have the other sign than they began with, where they began
-    with a value and not next to zero: a turned signal fits as well, and the start alone tells.
+def against_file(c: Context) -> Iterator[Finding]:
+    """Signals of which the file states another unit than the configuration."""
+    for label, flight in c.flights:
+        source = flight.source
+        for name, signal in ({**source.inputs, **source.outputs} if source else {}).items():
+            if signal.contradicted:
+                yield found(
+                    "units.against-file",
+                    "doubt",
+                    name,
+                    distrusts=_scaled(c, name),
+                    flight=label,
+                    unit=signal.unit or "1",
+                    stated=shown(signal.contradicted),
+                    channel=shown(signal.name),
+                )
 
-    One whose sign is declared (`Model.positive`, `sign: keep`, bounds) cannot turn.
+
+def size_of_angles(c: Context) -> Iterator[Finding]:
+    """Angles and rates that are too large for the unit that they are read in."""
+    for label, flight in c.flights:
+        for finding in in_degrees(c.problem.model, label, flight):
+            doubted = finding.code == UNIT_IN_DOUBT and not finding.denies
+            distrusts = _scaled(c, finding.subjects[0]) if doubted else ()
+            yield finding._replace(distrusts=distrusts)
+
+
+def in_degrees(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
+    """Angles and rates of a flight that look like degrees read as radians.
 
     Args:
-        problem: with the starts.
-        estimates: by name.
+        model: whose axes say which outputs are attitudes and rates.
+        label: of the flight.
+        flight: as read from a log.
     """
+    for one in oversized(model, flight):
+        yield found(
+            # What was flown upside down is in its own unit as likely as not.
+            "units.flown-or-degrees" if one.flown else UNIT_IN_DOUBT,
+            "doubt",
+            one.name,
+            value=one.size,
+            denies=one.certain,
+            flight=label,
+            unit=one.signal.unit,
+            degrees=one.signal.unit.replace("rad", "deg"),
+            in_degrees=float(np.degrees(one.size)),
+            limit=one.limit,
+            channel=shown(one.signal.name),
+        )
+
+
+def size_of_inputs(c: Context) -> Iterator[Finding]:
+    """Inputs whose size and effect at the start values suit another unit."""
+    sticks = sticks_of(c.problem.model)
+    for one in inputs_in_other_units(c.flights, c.start.simulated, sticks):
+        signal = next(
+            f.source.inputs[one.name] for n, f in c.flights if n == one.flight and f.source
+        )
+        yield found(
+            "units.input-in-doubt",
+            "doubt",
+            one.name,
+            value=max(one.moved.values()),
+            distrusts=_scaled(c, one.name),
+            flight=one.flight,
+            channel=shown(signal.name),
+            unit=one.unit,
+            stated=one.stated,
+            moved=list(one.moved),
+            times=list(one.moved.values()),
+            factor=one.factor,
+            near=NEAR,
+        )
+
+
+def _scaled(c: Context, name: str) -> tuple[str, ...]:
+    """The parameters that another unit of a signal would change; none before an optimum."""
+    return scaled_by(c.at, name) if c.fitted and c.status != "not-converged" else ()
+
+
+def no_sticks(c: Context) -> Iterator[Finding]:
+    """Inputs that are taken from a channel which by its name is a motion."""
+    for label, flight in c.flights:
+        for name, signal in (flight.source.inputs if flight.source else {}).items():
+            what = no_stick(signal.name, unit_in_name(signal.name), signal.si, sure=True)
+            if what and signal.constant is None:
+                yield found(
+                    "signs.no-stick",
+                    "doubt",
+                    name,
+                    denies=True,
+                    flight=label,
+                    channel=shown(signal.name),
+                    what=what,
+                )
+
+
+def outputs_against_start(c: Context) -> Iterator[Finding]:
+    """Outputs that move against those simulated at the start values; in a fit where the model does
+    not explain the record, since else it found the right sign."""
+    if c.fitted and not c.adequacy.denied:
+        return
+    for one in against_start(c.flights, c.start.simulated, sticks_of(c.problem.model)):
+        names = tuple(one.correlations)
+        yield found(
+            "signs.against-start",
+            "doubt",
+            *names,
+            *one.sticks,
+            value=min(one.correlations.values()),
+            flight=one.flight,
+            outputs=names,
+            correlations=list(one.correlations.values()),
+            # Of one stick the one cause is likelier than that all outputs are turned.
+            suspects=one.sticks if len(names) > 1 else (*names, *one.sticks),
+            limit=AGAINST,
+        )
+
+
+def turned_from_start(c: Context) -> Iterator[Finding]:
+    """Parameters that surely have the other sign than they began with: a turned signal fits as
+    well, and the start alone tells. One whose sign is declared (`Model.positive`, `sign: keep`,
+    bounds) cannot turn."""
     turned = {}
-    for name, free in problem.free.items():
-        e = estimates[name]
+    for name, free in c.problem.free.items() if c.arrived else ():
+        e = c.estimates[name]
         # A delay says by itself what it means to be negative.
-        if name in problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
+        if name in c.problem.model.delay_parameters or e.lower95 is None or e.upper95 is None:
             continue
         surely = e.lower95 * e.upper95 > 0 and e.value * free.start < 0
-        if surely and abs(free.start) > _NEAR_ZERO * abs(e.value):
-            turned[name] = f"{name} ({free.start:.3g} to {e.value:.3g})"
-    if not turned:
-        return []
-    words = (
-        f"{listed(list(turned.values()))} ended with the other sign than the start's: "
-        "where that sign is known, an input or an output has the wrong one in the log, or an axis "
-        "points the other way (`invert: true`)."
-    )
-    return [Finding("signs.turned-from-start", "doubt", words, subjects=tuple(turned))]
+        if surely and abs(free.start) > LIMITS.near_zero * abs(e.value):
+            turned[name] = (free.start, e.value)
+    if turned:
+        starts, ends = zip(*turned.values(), strict=True)
+        yield found(
+            "signs.turned-from-start", "doubt", *turned, starts=list(starts), ends=list(ends)
+        )
 
 
-DIAGNOSTICS = (_all, _turned)
+DIAGNOSTICS = (
+    rate_against_angle,
+    against_file,
+    size_of_angles,
+    size_of_inputs,
+    no_sticks,
+    outputs_against_start,
+    turned_from_start,
+)

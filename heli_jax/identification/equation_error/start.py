@@ -1,4 +1,4 @@
-"""A first guess of a linear model's parameters from the records themselves, without a vehicle.
+"""Start values of a linear model's parameters from the records themselves, without a vehicle.
 
 Equation error: each state's derivative is regressed on states and inputs. It needs no start, but
 measurement noise on the regressors biases it, gusts do (states follow them), and hidden time
@@ -7,42 +7,36 @@ constants are beyond it: a start for a fit, never a result.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.equation_error import records
-from heli_jax.identification.equation_error.first_guess import (
-    Equation,
-    EquationErrorStart,
-    Origin,
-    StartValue,
-)
 from heli_jax.identification.equation_error.records import (
     Structure,
+    coefficients,
     generic,
-    held,
-    matrices,
+    hidden_constants,
+    kernel_width,
+    record,
+    shortest,
     structure,
 )
 from heli_jax.identification.equation_error.regression import (
-    Optimum,
     Regression,
     Rows,
     Selection,
     covariance,
-    finite,
     search,
     select,
 )
 from heli_jax.identification.free import Free
 from heli_jax.vehicle import of_helicopter
 
-# Params is a class of each model, hence Any.
-
+F_ENTER = 20.0
+"""five times the 5 % point of F (Klein and Morelli): terms below it hardly help to predict"""
 _ROUNDS = 3
 """of regression and weights of the equations"""
 _NULL = 1e-5
@@ -50,28 +44,85 @@ _NULL = 1e-5
 _TRIED = (1.0, 0.1, 10.0, 0.01, 100.0, -1.0, -0.1, -10.0)
 """values to begin with where nothing is known, and zero will not do"""
 
+Origin = Literal["equation error", "frequency error", "as stated", "vehicle", "not selected"]
 
-class _Setup(NamedTuple):
-    """What the regressions have in common."""
 
-    model: Model
-    base: dict[str, float]
-    """all parameters by name, those that are free at the values at hand; NaN where there is none"""
-    free: Mapping[str, Free]
-    flights: Sequence[Flight]
-    structures: tuple[Structure, ...]
-    half: int
+class StartValue(NamedTuple):
+    """Where a fit begins with one parameter. The names of the fields are keys of fit.json."""
+
+    value: float
+    sd: float | None
+    """standard error of the regression, without its bias, or that of frequency error; None where
+    the value is from neither, and where several solutions fit as well"""
+    unit: str
+    origin: Origin
+    reason: str
+    """why it is not from the regression or from frequency error; empty where it is"""
+
+
+class Equation(NamedTuple):
+    """One equation as it was regressed."""
+
+    name: str
+    """the state whose derivative it gives, or the output"""
+    r_squared: float
+
+
+class EquationErrorStart(NamedTuple):
+    """Start values, and how they were found."""
+
+    values: dict[str, StartValue]
+    equations: tuple[Equation, ...]
+    half_width: float
+    """of the smoothing kernel [s]"""
+    hidden: tuple[str, ...]
+    """states that nothing measured shows: integrated by their own equations"""
+    selection: Selection | None = None
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was taken from where."""
+        taken = [n for n, v in self.values.items() if v.origin == "equation error"]
+        fits = ", ".join(f"{e.name} {100 * e.r_squared:.0f} %" for e in self.equations)
+        sentences = [
+            f"Start by equation error of {', '.join(taken) or 'nothing'} (variance explained in "
+            f"the equations of {fits}; smoothed over {self.half_width:.2g} s to either side). "
+            "Noise and gusts bias these values: the fit begins there, they are not its result."
+        ]
+        if self.hidden:
+            sentences.append(
+                f"Start: {', '.join(self.hidden)} are not measured and were integrated by their "
+                "own equations."
+            )
+        # One sentence for all that have the same reason: of a whole helicopter there are many.
+        grouped: dict[tuple[str, str], list[str]] = {}
+        for name, v in self.values.items():
+            if v.reason:
+                grouped.setdefault((v.origin, v.reason), []).append(f"{name} {v.value:.4g}")
+        sentences += [
+            f"Start: {', '.join(values)}, {_WHERE[origin]}: {reason}."
+            for (origin, reason), values in grouped.items()
+        ]
+        return tuple(sentences)
+
+
+_WHERE = {
+    "equation error": "moved inside",
+    "as stated": "as stated",
+    "vehicle": "the vehicle's",
+    "not selected": "where it leaves the model as it is",
+}
 
 
 def equation_error_start(
     model: Model,
-    vehicle: Any,
+    vehicle: Any,  # the model's Params
     flights: Sequence[Flight],
     free: Mapping[str, Free],
     *,
     stepwise: tuple[float, float] | None = None,
 ) -> EquationErrorStart:
-    """First guesses of the free parameters of a linear model.
+    """Return start values of the free parameters of a linear model.
 
     Args:
         model: with `linear=True`.
@@ -85,110 +136,123 @@ def equation_error_start(
         ValueError: nothing can be regressed, or a parameter has no start; the sentence says why
             and what to do.
     """
-    setup = _setup(model, vehicle, [f for f in flights if not f.hold_out], free)
-    # Any value will do for what has none: only where a parameter stands is asked.
-    fixed = held(model, {**setup.base, **dict.fromkeys(free, 1.0)}, setup.structures)
-    reasons = {n: _why_held(model, n) for n in free if n in fixed}
-    names = [n for n in free if n not in fixed]
-    if not names or not any(s.rows for s in setup.structures):
-        raise ValueError(_nothing(setup, names))
-    optimum, regression, null = _without_null(setup, names, reasons)
-    selection = None
-    if stepwise is not None:
-        keeps = zip(regression.names, _keeps(setup, regression), strict=True)
-        forced = [
-            n for i, (n, keep) in enumerate(keeps) if keep or _divides(regression, optimum, i)
-        ]
-        selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
-        out = [n for n in regression.names if n not in selection.selected]
-        # Terms that are out are zero from here on, and the others are regressed again: where
-        # regressors go together the values of those that stay move.
-        kept = setup._replace(base={**setup.base, **dict.fromkeys(out, 0.0)})
-        if selection.selected:
-            regression = regression._replace(names=selection.selected, base=kept.base)
-            optimum = _optimum(kept, regression)
-    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
-    coefficients = {
-        n: (float(v), float(s))
-        for n, v, s in zip(regression.names, optimum.values, sd, strict=True)
-        if selection is None or n in selection.selected
-    }
-    values = {n: _value(setup, n, coefficients, {**reasons, **null}, selection) for n in free}
-    hidden = {s.states[i]: None for s in setup.structures for i in s.hidden}
-    return EquationErrorStart(
-        values,
-        _explained(regression, optimum),
-        setup.half * setup.flights[0].dt,
-        tuple(hidden),
-        selection,
-    )
-
-
-def _setup(
-    model: Model, vehicle: Any, flights: Sequence[Flight], free: Mapping[str, Free]
-) -> _Setup:
     if not model.linear:
         raise ValueError(
             f"start: equation-error is for linear models, and {model.name} is none: expected a "
             "start of each free parameter"
         )
-    params = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()}
+    flights = [f for f in flights if not f.hold_out]
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
-    base = {**params, **stated}
-    some = dict(zip(free, generic(len(free)), strict=True))
-    for flight in flights:
-        # Generic numbers stand for what is free, so that NaN is left only where a constant that
-        # somebody has to give is missing.
-        require_constants(model, model.Params(**{**base, **some, **flight.known}))
-    # One structure a flight: what is measured may differ from flight to flight, and with it which
-    # states are shown.
+    base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
+    # What is free has generic numbers: NaN is left only where a constant is missing that somebody
+    # has to give, and only where a parameter stands is asked.
+    some = base | dict(zip(free, generic(len(free)), strict=True))
     structures = []
     for flight in flights:
-        names = list(free)
-        at = matrices(model, {**base, **some, **flight.known}, names, generic(len(names)))
-        depends = (np.abs(at.slope) > 0).any(axis=-1)
-        structures.append(structure(model, at.value, depends, list(flight.outputs)))
-    return _Setup(model, base, free, flights, tuple(structures), records.width(flights))
-
-
-def _regression(setup: _Setup, names: Sequence[str]) -> Regression:
-    """The flights smoothed, inputs as late as the values at hand say."""
-    late = dict(setup.model.delays)
-    made = []
-    for flight, one in zip(setup.flights, setup.structures, strict=True):
-        known = {**setup.base, **flight.known}
-        delays = {u: known[p] for u, p in late.items()}
-        made.append(records.record(setup.model, flight, one, setup.half, delays))
-    made = [one for one in made if one.segments and one.structure.rows]
-    if not made:
+        require_constants(model, model.Params(**{**some, **flight.known}))
+        both = coefficients(model, {**some, **flight.known}, list(free), generic(len(free)))
+        structures.append(structure(model, both, list(flight.outputs)))
+    lags, constants = dict(model.delays), hidden_constants(model, some, structures)
+    reasons = {
+        n: "a delay is found by no regression"
+        if n in lags.values()
+        else "it is a time constant or frequency of states that are not measured"
+        for n in free
+        if n in constants
+    }
+    names = tuple(n for n in free if n not in constants)
+    if not (names and any(s.rows for s in structures)):
+        raise _nothing(flights, structures, names)
+    for n, why in reasons.items():
+        _require_value(base, n, why)
+    half, records = kernel_width(flights), []
+    for flight, shown in zip(flights, structures, strict=True):
+        late = {u: {**base, **flight.known}[p] for u, p in lags.items()}
+        records.append(record(model, flight, shown, half, late))
+    records = tuple(one for one in records if one.segments and one.structure.rows)
+    if not records:
         raise ValueError(
             "start: equation-error: no stretch without missing samples is as long as the "
-            f"smoothing needs ({records.shortest(setup.half)} samples): expected a start of each "
-            "free parameter"
+            f"smoothing needs ({shortest(half)} samples): expected a start of each free parameter"
         )
-    return Regression(setup.model, setup.base, tuple(names), tuple(made))
+    regression = Regression(model, base, names, records)
+    optimum = _optimum(regression, free)
+    # One parameter at a time is left out, and the rest regressed again: of two that are
+    # exchangeable only one has to go, and the other is determined as soon as the first is held.
+    while (out := _undetermined(regression, optimum.rows)) is not None:
+        name, reasons[name] = out
+        _require_value(base, name, reasons[name])
+        regression = regression._replace(names=tuple(n for n in regression.names if n != name))
+        if not regression.names:
+            raise _nothing(flights, structures, names)
+        optimum = _optimum(regression, free)
+    selection = None
+    if stepwise is not None:
+        forced = _forced(regression, free, optimum)
+        selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
+        # Terms that are out are zero from here on, and the others are regressed again: where
+        # regressors are correlated the values of those that stay move.
+        out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
+        regression = regression._replace(names=selection.selected, base={**base, **out})
+        optimum = _optimum(regression, free) if selection.selected else optimum
+    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
+    estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
+    return EquationErrorStart(
+        {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n)) for n in free},
+        _explained(regression, optimum),
+        half * flights[0].dt,
+        tuple(dict.fromkeys(s.states[i] for s in structures for i in s.hidden)),
+        selection,
+    )
 
 
-def _keeps(setup: _Setup, regression: Regression) -> np.ndarray:
-    """Of which parameters the sign is known."""
-    ours = of_helicopter(setup.model.Params)
-    keeps = []
+def _nothing(
+    flights: Sequence[Flight], structures: Sequence[Structure], names: Sequence[str]
+) -> ValueError:
+    remedy = ""
+    if not any(s.shown for s in structures):
+        measured = ", ".join({n: None for f in flights for n in f.outputs})
+        why, remedy = f"no output ({measured}) shows a state by itself", ", or other outputs"
+    elif not names:
+        why = "all that is free are delays, or time constants of states that are not measured"
+    else:
+        why = "no equation of a measured state has a free parameter"
+    return ValueError(
+        f"start: equation-error: nothing can be regressed, since {why}: expected a start of each "
+        f"free parameter{remedy}"
+    )
+
+
+def _require_value(base: Mapping[str, float], name: str, why: str) -> None:
+    if not math.isfinite(base[name]):
+        raise ValueError(f"free.{name}.start: missing, expected a value to begin with: {why}")
+
+
+class _Optimum(NamedTuple):
+    values: np.ndarray
+    rows: Rows
+    weights: dict[str, float]
+
+
+def _keeps_sign(regression: Regression, free: Mapping[str, Free]) -> np.ndarray:
+    """True for parameters of a known sign."""
+    model, keeps = regression.model, []
     for name in regression.names:
-        sign, at_hand = setup.free[name].sign, setup.base[name]
-        known = name in setup.model.positive or (math.isfinite(at_hand) and at_hand != 0)
-        asked = sign == "keep" or (sign is None and (ours or name in setup.model.positive))
-        keeps.append(asked and known)
+        sign, at_hand, positive = free[name].sign, regression.base[name], name in model.positive
+        known = positive or (math.isfinite(at_hand) and at_hand != 0)
+        default = positive or of_helicopter(model.Params)
+        keeps.append(known and (sign == "keep" or (sign is None and default)))
     return np.array(keeps, bool)
 
 
-def _optimum(setup: _Setup, regression: Regression) -> Optimum:
-    """The regression with the equations weighed by their own residuals."""
-    keep = _keeps(setup, regression)
+def _optimum(regression: Regression, free: Mapping[str, Free]) -> _Optimum:
+    """The regression with the equations weighted by their own residuals."""
+    keep = _keeps_sign(regression, free)
     # Equations differ in unit and noise, and share parameters. Before there are residuals each is
-    # weighed by the size of its left-hand side; then by its own residuals, which least squares of
+    # weighted by the size of its left-hand side; then by its own residuals, which least squares of
     # several equations asks for.
-    weights = _sizes(regression)
-    values, rows = _first_search(setup, regression, keep, weights)
+    weights = {n: 1.0 / size for n, size in _sizes(regression).items()}
+    values, rows = _first_search(regression, keep, weights)
     for _ in range(_ROUNDS - 1):
         weights = {
             # The floor keeps an equation that is met exactly from drowning all others.
@@ -199,138 +263,97 @@ def _optimum(setup: _Setup, regression: Regression) -> Optimum:
         if again is None:
             break
         values, rows = again
-    return Optimum(values, rows, weights)
+    return _Optimum(values, rows, weights)
 
 
 def _first_search(
-    setup: _Setup, regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
+    regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
 ) -> tuple[np.ndarray, Rows]:
     """The best of searches from several values."""
-    at_hand = np.array([setup.base[n] for n in regression.names])
+    at_hand = np.array([regression.base[n] for n in regression.names])
     known = np.isfinite(at_hand) & (at_hand != 0)
     # From nothing, and from the values at hand: products of parameters may have two optima.
     starts = [np.where(keep, np.where(known, at_hand, 1.0), 0.0)]
     if known.any():
         starts.append(np.where(known, at_hand, starts[0]))
-    runs = [run for x in starts if (run := search(regression, x, keep, weights)) is not None]
-    if len(runs) < len(starts):
+    runs = [search(regression, x, keep, weights) for x in starts]
+    if None in runs:
         # Something is divided by one of them: begun with any size, and either sign.
         tries = [np.where(keep, np.where(known, at_hand, abs(x)), x) for x in _TRIED]
-        tried = (search(regression, x, keep, weights) for x in tries)
-        runs += [run for run in tried if run is not None]
-    if not runs:
+        runs += [search(regression, x, keep, weights) for x in tries]
+    finite = [run for run in runs if run is not None]
+    if not finite:
         raise ValueError(
             "start: equation-error: the equations are not finite at any value tried of "
             f"{', '.join(regression.names)} (zero, the vehicle's, {_TRIED[0]:g} and others): "
             "expected a start of each free parameter"
         )
-    return min(runs, key=lambda run: run[1].cost)
-
-
-def _divides(regression: Regression, optimum: Optimum, which: int) -> bool:
-    """Whether something is divided by a parameter, by its number, so that it cannot be zero."""
-    values = optimum.values.copy()
-    values[which] = 0.0
-    return finite(lambda: regression.rows(values, optimum.weights)) is None
+    return min(finite, key=lambda run: run[1].cost)
 
 
 def _sizes(regression: Regression) -> dict[str, float]:
-    """One over the size of each equation's left-hand side."""
+    """The standard deviation of each equation's left-hand side."""
     left = {name: [] for name in regression.equations}
     for one in regression.records:
         for k, name in enumerate(one.structure.equations):
             left[name] += [s.left[k] - s.left[k].mean() for s in one.segments]
-    return {n: 1.0 / max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
+    return {n: max(float(np.std(np.concatenate(v))), 1e-300) for n, v in left.items()}
 
 
-def _without_null(
-    setup: _Setup, names: Sequence[str], reasons: Mapping[str, str]
-) -> tuple[Optimum, Regression, dict[str, str]]:
-    """The regression without what it does not determine, and why each was left out."""
-    null: dict[str, str] = {}
-    for n in reasons:
-        if not math.isfinite(setup.base[n]):
-            raise ValueError(
-                f"free.{n}.start: missing, expected a value to begin with: {reasons[n]}"
-            )
-    names = list(names)
-    # One at a time, and regressed again: of two that are exchangeable only one has to go, and the
-    # other is determined as soon as the first is held.
-    while names:
-        regression = _regression(setup, names)
-        optimum = _optimum(setup, regression)
-        out = _undetermined(setup, regression, optimum)
-        if out is None:
-            return optimum, regression, null
-        name, why = out
-        if not math.isfinite(setup.base[name]):
-            raise ValueError(f"free.{name}.start: missing, expected a value to begin with: {why}")
-        null[name] = why
-        names.remove(name)
-    raise ValueError(_nothing(setup, names))
+def _explained(regression: Regression, optimum: _Optimum) -> tuple[Equation, ...]:
+    equations = []
+    for i, (name, size) in enumerate(_sizes(regression).items()):
+        r = optimum.rows.r[optimum.rows.equation == i] / optimum.weights[name]
+        equations.append(Equation(name, 1.0 - float(np.mean(r**2)) / size**2))
+    return tuple(equations)
 
 
-def _undetermined(
-    setup: _Setup, regression: Regression, optimum: Optimum
-) -> tuple[str, str] | None:
+def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
     """A parameter that the regression does not determine, and why."""
-    norms = np.linalg.norm(optimum.rows.J, axis=0)
-    names = regression.names
-    for name, norm in zip(names, norms, strict=True):
-        if norm == 0:
-            return name, "no measured state or output moves with it"
+    norms, names = np.linalg.norm(rows.J, axis=0), regression.names
+    if not norms.all():
+        return names[int(np.argmin(norms))], "no measured state or output moves with it"
     # Columns of one length: units must not decide which direction counts as small.
-    _, sizes, directions = np.linalg.svd(optimum.rows.J / norms, full_matrices=False)
+    _, sizes, directions = np.linalg.svd(rows.J / norms, full_matrices=False)
     if sizes[-1] > _NULL * sizes[0]:
         return None
     part = np.abs(directions[-1])
     involved = [i for i in np.argsort(-part) if part[i] > 0.1]
     # One of them has to stay where it is; one with a value at hand can.
-    with_value = [i for i in involved if math.isfinite(setup.base[names[i]])]
-    first = (with_value or involved)[-1] if len(involved) > 1 else involved[0]
+    first = ([i for i in involved if math.isfinite(regression.base[names[i]])] or involved)[-1]
     others = ", ".join(names[i] for i in involved if i != first)
     return names[first], f"the equations do not tell it from {others}"
 
 
-def _why_held(model: Model, name: str) -> str:
-    if name in dict(model.delays).values():
-        return "a delay is found by no regression"
-    return "it is a time constant or frequency of states that are not measured"
-
-
-def _nothing(setup: _Setup, names: Sequence[str]) -> str:
-    begun = "start: equation-error: nothing can be regressed, since "
-    remedy = "expected a start of each free parameter"
-    if not any(s.shown for s in setup.structures):
-        measured = ", ".join({n: None for f in setup.flights for n in f.outputs})
-        return f"{begun}no output ({measured}) shows a state by itself: {remedy}, or other outputs"
-    if not names:
-        return (
-            f"{begun}all that is free are delays, or time constants of states that are not "
-            f"measured: {remedy}"
-        )
-    return f"{begun}no equation of a measured state has a free parameter: {remedy}"
+def _forced(regression: Regression, free: Mapping[str, Free], optimum: _Optimum) -> list[str]:
+    """The parameters that cannot be zero: of a known sign, or something is divided by them."""
+    keeps, forced = _keeps_sign(regression, free), []
+    for i, name in enumerate(regression.names):
+        values = optimum.values.copy()
+        values[i] = 0.0
+        if keeps[i] or regression.rows(values, optimum.weights) is None:
+            forced.append(name)
+    return forced
 
 
 def _value(
-    setup: _Setup,
+    regression: Regression,
     name: str,
-    coefficients: Mapping[str, tuple[float, float]],
-    reasons: Mapping[str, str],
-    selection: Selection | None,
+    free: Free,
+    estimate: tuple[float, float] | None,
+    reason: str | None,
 ) -> StartValue:
-    unit = naming.unit(setup.model.Params, name) or "1"
-    if name in coefficients:
-        value, sd = coefficients[name]
-        inside = _inside(setup.free[name], value)
+    unit = naming.unit(regression.model.Params, name) or "1"
+    if estimate is not None:
+        value, sd = map(float, estimate)
+        inside = _inside(free, value)
         moved = "" if inside == value else f"{value:.4g} lies outside its bounds"
         return StartValue(inside, sd, unit, "equation error", moved)
-    if selection is not None and name not in reasons:
-        inside = _inside(setup.free[name], 0.0)
+    if reason is None:
+        inside = _inside(free, 0.0)
         return StartValue(inside, None, unit, "not selected", "its term hardly helps to predict")
-    stated = math.isfinite(setup.free[name].start)
-    origin: Origin = "as stated" if stated else "vehicle"
-    return StartValue(setup.base[name], None, unit, origin, reasons[name])
+    origin: Origin = "as stated" if math.isfinite(free.start) else "vehicle"
+    return StartValue(regression.base[name], None, unit, origin, reason)
 
 
 def _inside(free: Free, value: float) -> float:
@@ -343,11 +366,3 @@ def _inside(free: Free, value: float) -> float:
         return value
     span = high - low if math.isfinite(high - low) else max(abs(low if value <= low else high), 1.0)
     return low + 0.01 * span if value <= low else high - 0.01 * span
-
-
-def _explained(regression: Regression, optimum: Optimum) -> tuple[Equation, ...]:
-    sizes, made = _sizes(regression), []
-    for i, name in enumerate(regression.equations):
-        r = optimum.rows.r[optimum.rows.equation == i] / optimum.weights[name]
-        made.append(Equation(name, 1.0 - float(np.mean(r**2)) * sizes[name] ** 2))
-    return tuple(made)

@@ -11,6 +11,9 @@ from heli_jax.identification.estimation.simulated_flights import simulated_at, w
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 
+NULL = 1e-8
+"""part of the largest singular value, of columns of one size, below which the data do not determine
+a direction: the square of that is rounding in float64"""
 _TAKES_PART = 1e-3
 """part of a unit direction without effect from which on a coordinate is lost with it"""
 
@@ -78,7 +81,7 @@ def deviations(J: np.ndarray) -> np.ndarray:
     Infinite for a coordinate without effect, and for those that take part in a direction without:
     what leaves no trace in the rows is not known, rather than known exactly.
     """
-    return combined_deviations(J, np.eye(J.shape[1]), 1e-10, _TAKES_PART)
+    return combined_deviations(J, np.eye(J.shape[1]), NULL, _TAKES_PART)
 
 
 def combined_deviations(
@@ -112,7 +115,7 @@ def combined_deviations(
     return np.where(lost.any(axis=1), np.inf, sds)
 
 
-def directions(J: np.ndarray, least: float = 1e-10) -> np.ndarray:
+def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
     """Orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
 
     Args:
@@ -126,6 +129,16 @@ def directions(J: np.ndarray, least: float = 1e-10) -> np.ndarray:
     _, sizes, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
     seen = sizes > least * max(sizes[0], 1e-300)
     return J @ (right[seen].T / sizes[seen])
+
+
+def pseudoinverse(J: np.ndarray) -> np.ndarray:
+    """Return the pseudoinverse (q, n) of rows (n, q), with columns brought to one size first."""
+    # The cut is on singular values, and units of the unknowns must not decide what it takes.
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    # The triangle has the same singular values, and q rows instead of n.
+    Q, R = np.linalg.qr(np.asarray(J, np.float64) / norms)
+    return np.linalg.pinv(R, rcond=NULL) @ Q.T / norms[:, None]
 
 
 def least_share(part: np.ndarray, J: np.ndarray) -> float:

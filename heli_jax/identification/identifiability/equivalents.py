@@ -3,9 +3,10 @@
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -14,12 +15,96 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.identifiability.directions import combinations, sums
+from heli_jax.identification.estimation.evaluation import named
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.identifiability.combinations import combinations
 from heli_jax.identification.identifiability.verdict import Combination, SecondSolution, Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
+
+# The smallest sum of squares with some coordinates held: how a profile, a valley and the search for
+# the same responses move all other unknowns.
+
+
+class Rows(NamedTuple):
+    """Residuals at a point, whitened, and their derivatives."""
+
+    r: np.ndarray
+    """(n,)"""
+    J: np.ndarray
+    """(n, q)"""
+
+
+def rows_at(at: Solution, z: np.ndarray | jax.Array) -> Rows:
+    """Return the rows of the fit at z (q,)."""
+    made = residual_and_jacobian(at.layout, at.data, at.noise, jnp.asarray(z, at.z.dtype))
+    return Rows(*(np.asarray(v, np.float64) for v in jax.device_get((made.r, made.J))))
+
+
+def squares_of(r: np.ndarray) -> float:
+    """Return the sum of squares; infinite or NaN where one is."""
+    r = np.asarray(r, np.float64)
+    with np.errstate(all="ignore"):
+        return float(r @ r)
+
+
+_RIDGE = 1.0 / 3.0
+"""one over how far a step may go, in coordinates most of which are logarithms, for nothing"""
+_ENOUGH = 0.05
+"""squares that a further step may promise where a search stops"""
+_STEPS = 10
+_HUGE = 1e50
+
+
+def descend(
+    rows: Callable[[np.ndarray], Rows],
+    z: np.ndarray,
+    moving: np.ndarray,
+    *,
+    floor: float = _RIDGE,
+    enough: float = _ENOUGH,
+    steps: int = _STEPS,
+) -> tuple[np.ndarray, float]:
+    """Return the point (q,) of the least squares near z by Levenberg and Marquardt, and the sum
+    there less what a further step promises, infinite where nothing finite is found.
+
+    Args:
+        rows: residuals and Jacobian at a point.
+        z: (q,) where the search begins.
+        moving: (q,) the coordinates that may change.
+        floor: to which the ridge falls: zero where all directions are determined.
+        enough: squares that a further step may promise at the end.
+        steps: at most.
+    """
+    now, ridge, promised = rows(z), _RIDGE, math.inf
+    squares = squares_of(now.r)
+    for _ in range(steps):
+        J = now.J[:, moving]
+        # Past that the squares of a simulation that has diverged are no numbers.
+        if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
+            return z, math.inf
+        Q, R = np.linalg.qr(J)
+        left = -(Q.T @ now.r)
+        damped = np.vstack([R, ridge * np.eye(R.shape[1])])
+        target = np.concatenate([left, np.zeros(R.shape[1])])
+        step = np.zeros(z.size)
+        step[moving] = np.linalg.lstsq(damped, target, rcond=None)[0]
+        promised = float(left @ left - np.sum((left - R @ step[moving]) ** 2))
+        if promised < enough:
+            break
+        then = rows(z + step)
+        gained = squares - squares_of(then.r)
+        # Negated: also what is not finite is no step.
+        if gained > 0:
+            z, now, squares = z + step, then, squares - gained
+            ridge = max(floor, ridge / 10.0)
+        elif ridge > _RIDGE * 1e4:
+            break
+        else:
+            ridge = max(10.0 * ridge, _RIDGE)
+    return z, squares - promised
+
 
 # Points far from an optimum at which the residuals are the same: what is true along all of them.
 #
@@ -32,12 +117,6 @@ SAME = 3.84
 """squares by which a point may be worse and still be as good: the 95 % point of chi-squared"""
 _FACTOR = 1.5
 """by which each unknown is moved, up and down; those tied to it move as far, or change sign"""
-_LITTLE = 0.01 * SAME
-"""squares that are not worth a further step"""
-_STEPS = 5
-"""of Gauss and Newton"""
-_RIDGE = 1.0 / 3.0
-"""one over how far a step may go, in coordinates most of which are logarithms, for nothing"""
 _MOVED = 0.3
 """logarithm by which a combination's own parameters have to move for its staying to tell"""
 _STAYS = 0.02
@@ -90,30 +169,22 @@ class Valley(NamedTuple):
                 return None
             z[names.index(name)] = at
         moving = np.array([i >= len(names) or names[i] not in held for i in range(layout.size)])
-        now, here = self._at(z), self._rows(self.e, priors)[0]
+        # The parameters' priors stand before the nuisances'.
+        last = self.e.r.size - (layout.size - layout.first_nuisance)
+        own = slice(0) if priors else slice(last - len(layout.free), last)
+        here = np.delete(np.asarray(self.e.r, np.float64), own)
         base = here if same else np.zeros(here.size)
-        for _ in range(_STEPS):
-            r, J = self._rows(now, priors)
-            r = r - base
-            if _squares(r) < _LITTLE:
-                break  # there is no more to gain
-            step = np.zeros(layout.size)
-            ridge = _RIDGE * np.eye(int(moving.sum()))
-            left = np.concatenate([-r, np.zeros(len(ridge))])
-            if not (np.isfinite(r).all() and np.isfinite(J).all()):
-                return None
-            step[moving] = np.linalg.lstsq(np.vstack([J[:, moving], ridge]), left, rcond=None)[0]
-            then = self._at(now.z + step)
-            gained = _squares(r) - _squares(self._rows(then, priors)[0] - base)
-            # Negated: also what is not finite is no step.
-            if not gained > 0:
-                break
-            now = then
-            if gained < _LITTLE:
-                break
-        excess = _squares(self._rows(now, priors)[0] - base) - _squares(here - base)
-        values = {n: float(v) for n, v in zip(names, now.named, strict=True)}
-        return Point(values, excess) if math.isfinite(excess) else None
+
+        def rows(z: np.ndarray) -> Rows:
+            r, J = rows_at(self.at, z)
+            return Rows(np.delete(r, own) - base, np.delete(J, own, axis=0))
+
+        z, squares = descend(rows, z, moving)
+        excess = squares - squares_of(here - base)
+        if not math.isfinite(excess):
+            return None
+        values, _ = named(layout, self.at.data, jnp.asarray(z, self.at.z.dtype))
+        return Point({n: float(v) for n, v in zip(names, values, strict=True)}, excess)
 
     def tied(
         self, null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
@@ -132,7 +203,7 @@ class Valley(NamedTuple):
             for u in unknowns
             if u.is_parameter
         }
-        added = sums(null, covariance, unknowns, units)
+        added = combinations(null, covariance, unknowns, units)
         if not (products or added):
             return ()
         points: list[dict[str, float]] = []
@@ -171,25 +242,6 @@ class Valley(NamedTuple):
                         break
             yield points
 
-    def _at(self, z: np.ndarray) -> Evaluation:
-        layout, data, noise, z0 = self.at
-        return evaluate(layout, data, noise, jnp.asarray(z, z0.dtype))
-
-    def _rows(self, e: Evaluation, priors: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals and Jacobian; the parameters' priors stand before the nuisances'."""
-        layout = self.at.layout
-        r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
-        if priors:
-            return r, J
-        last = r.size - (layout.size - layout.first_nuisance)
-        own = slice(last - len(layout.free), last)
-        return np.delete(r, own), np.delete(J, own, axis=0)
-
-
-def _squares(r: np.ndarray) -> float:
-    with np.errstate(all="ignore"):
-        return float(r @ r)
-
 
 def _tangents(
     along: np.ndarray, factor: float, i: int, unknowns: tuple[Unknown, ...]
@@ -207,27 +259,24 @@ def _tangents(
 def _stays(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
 ) -> bool:
-    """Whether a combination is the same at all points, and its parameters are not."""
+    """True if a combination is the same at all points, and its parameters are not."""
     changes = [_change(c, unknowns, point) for point in points]
-    return any(one.moved for one in changes) and all(one.same for one in changes)
+    return any(moved for _, moved in changes) and all(same for same, _ in changes)
 
 
 def _told(
     c: Combination, unknowns: tuple[Unknown, ...], points: Sequence[Mapping[str, float]]
 ) -> bool:
-    """True where the points decide: the combination changed, or its parameters moved."""
-    return any(one.moved or not one.same for one in (_change(c, unknowns, p) for p in points))
+    """True if the points decide: the combination changed, or its parameters moved."""
+    changes = [_change(c, unknowns, point) for point in points]
+    return any(moved or not same for same, moved in changes)
 
 
-class _Change(NamedTuple):
-    """The change of a combination at a point."""
-
-    same: bool
-    moved: bool
-    """whether its own parameters moved far enough for that to tell"""
-
-
-def _change(c: Combination, unknowns: tuple[Unknown, ...], point: Mapping[str, float]) -> _Change:
+def _change(
+    c: Combination, unknowns: tuple[Unknown, ...], point: Mapping[str, float]
+) -> tuple[bool, bool]:
+    """Return whether a combination is the same at a point, and whether its own parameters moved far
+    enough for that to tell."""
     values = {u.name: u.value for u in unknowns}
     if c.kind == "sum":
         parts = [w * (point[n] - values[n]) for n, w in c.exponents.items()]
@@ -235,11 +284,11 @@ def _change(c: Combination, unknowns: tuple[Unknown, ...], point: Mapping[str, f
     else:
         ratios = {n: point[n] / values[n] for n in c.exponents}
         if any(ratio <= 0 for ratio in ratios.values()):
-            return _Change(same=False, moved=True)
+            return False, True
         parts = [w * math.log(ratios[n]) for n, w in c.exponents.items()]
         size, sd = 1.0, c.sd / c.value if c.value else 0.0
     moved = sum(abs(part) for part in parts)
-    return _Change(abs(sum(parts)) <= max(2.0 * sd, _STAYS * moved), moved > _MOVED * size)
+    return abs(sum(parts)) <= max(2.0 * sd, _STAYS * moved), moved > _MOVED * size
 
 
 # Other parameters with the same responses: two real modes that other parameters make.
@@ -258,8 +307,6 @@ _ALIKE = 0.02
 """relative difference of responses up to which residuals are asked whether they are the same"""
 _THE_SAME = 1e-3
 """the same, up to which a filter is begun from there"""
-_EQUAL = 1e-6
-"""the same, of responses that are one"""
 _OPEN = 1e-4
 """part of the largest singular value below which the responses do not tell a direction"""
 _RATIO = 1.1
@@ -270,8 +317,10 @@ _REACH = math.log(300.0)
 """how far a parameter may be put"""
 _CANDIDATES = 12
 """points at most that a search of responses begins from"""
-_RESPONSE_STEPS = 25
+_RESPONSE_STEPS = 40
 """of such a search"""
+_ARRIVED = 1e-14
+"""squares of relative differences at its end"""
 _DIFFERENCE = 1e-5
 """of a parameter's coordinate"""
 _CHANGED = 0.05
@@ -419,15 +468,19 @@ class _Family:
         d = ((self.responses(z) - self.here) / self.gain).ravel()
         return np.concatenate([d.real, d.imag]) / math.sqrt(d.size)
 
+    def rows_at(self, z: np.ndarray) -> Rows:
+        """Return the differences and their derivatives by all coordinates."""
+        r, steps = self.differences(z), _DIFFERENCE * np.eye(z.size)
+        J = [(self.differences(z + h) - r) / _DIFFERENCE for h in steps]
+        return Rows(r, np.stack(J, axis=1))
+
     def apart(self, z: np.ndarray) -> float:
         """Their root mean square."""
         return float(np.linalg.norm(self.differences(z)))
 
     def open_along(self, names: Sequence[str]) -> bool:
         """Whether some of these parameters may move with all responses as they are."""
-        q = len(self.names)
-        steps = _DIFFERENCE * np.eye(q)
-        J = np.stack([self.differences(h) / _DIFFERENCE for h in steps], axis=1)
+        J = self.rows_at(np.zeros(len(self.names))).J
         if not np.isfinite(J).all():
             return True
         size = np.linalg.norm(J, axis=0)
@@ -496,64 +549,32 @@ def _slope(family: _Family, here: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def _led_to(family: _Family, start: np.ndarray) -> np.ndarray | None:
-    """Coordinates near a start at which the responses are those at zero; None where there are none,
-    or where the way led back."""
+    """Return coordinates near a start at which the responses are those at zero; None where there
+    are none, or where the way led back."""
+    z = start
     # Held until the others have followed, or those that exchange the modes would come back.
-    z = _least(family, start, start == 0.0)
-    z = None if z is None else _least(family, z, np.ones(len(start), bool))
-    if z is None or not family.apart(z) < _ALIKE:
-        return None
-    moved = np.max(np.abs(z[family.relative]), initial=0.0)
-    return z if moved > _CHANGED else None
-
-
-def _least(family: _Family, start: np.ndarray, moving: np.ndarray) -> np.ndarray | None:
-    """Coordinates of the least differences, by Levenberg and Marquardt; None where these are not
-    finite. `moving`: which coordinates (q,) may change."""
-    z, r, damping = start, family.differences(start), 1e-2
-    steps, far = np.eye(len(start))[moving], np.where(family.log, 1.0, np.inf)
-    if not np.isfinite(r).all():
-        return None
-    for _ in range(_RESPONSE_STEPS if len(steps) else 0):
-        J = [(family.differences(z + _DIFFERENCE * h) - r) / _DIFFERENCE for h in steps]
-        J = np.stack(J, axis=1)
-        if not np.isfinite(J).all():
+    for moving in (start == 0.0, np.ones(len(start), bool)):
+        z, squares = descend(
+            family.rows_at, z, moving, floor=0.0, enough=_ARRIVED, steps=_RESPONSE_STEPS
+        )
+        if not math.isfinite(squares):
             return None
-        before = float(r @ r)
-        for _ in range(8):
-            scale = damping * np.maximum(np.sum(J**2, axis=0), 1e-12)
-            step = steps.T @ np.linalg.solve(J.T @ J + np.diag(scale), -J.T @ r)
-            there = z + np.clip(step, -far, far)
-            then = family.differences(there)
-            # Negated: what is not finite is no step.
-            if float(then @ then) < before:
-                break
-            damping *= 8.0
-        else:
-            return z
-        z, r, damping = there, then, 0.2 * damping
-        if before < 1e-14 or before - float(r @ r) < 1e-4 * before < 1e-8:
-            break
-    return z
+    moved = np.max(np.abs(z[family.relative]), initial=0.0)
+    return z if family.apart(z) < _ALIKE and moved > _CHANGED else None
 
 
 def _as_good(
     valley: Valley, family: _Family, z: np.ndarray, optimum: bool
 ) -> SecondSolution | None:
     """The solution there, if the residuals are as small and it is another than here."""
-    if optimum or valley.at.layout.estimator.rows_are_samples:
-        # At the start values nothing has been fitted: any step would make the other the better one.
-        point = valley.visit({}, family.by_name(z), same=not optimum, priors=True)
-        if point is None or not point.excess <= SAME:
-            return None
-        values = {n: point.values[n] for n in family.names}
-    else:
-        # Of rows that are sums over frequencies none stays: there the responses have to be the same
-        # to rounding, with nothing else that could tell.
-        values = family.by_name(z)
-        held = [i for i, n in enumerate(family.names) if family.problem.free[n].prior is not None]
-        if not (family.apart(z) < _EQUAL and family.admits(z) and np.all(z[held] == 0.0)):
-            return None
+    # At the start values nothing has been fitted: any step would make the other the better one. Of
+    # rows that are sums over frequencies none stays.
+    if not (optimum or valley.at.layout.estimator.rows_are_samples):
+        return None
+    point = valley.visit({}, family.by_name(z), same=not optimum, priors=True)
+    if point is None or not point.excess <= SAME:
+        return None
+    values = {n: point.values[n] for n in family.names}
     here = family.values
     changed = tuple(
         n

@@ -1,28 +1,15 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
-from collections.abc import Collection, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.identifiability.analysis import NULL, analyse
-from heli_jax.identification.identifiability.directions import (
-    Elsewhere,
-    Tied,
-    WithoutWeakPriors,
-    combinations,
-    projected,
-)
-from heli_jax.identification.identifiability.equivalents import Valley
-from heli_jax.identification.identifiability.verdict import (
-    Combination,
-    SecondSolution,
-    Unknown,
-    Verdict,
-)
+from heli_jax.identification.estimation.evaluation import NULL
+from heli_jax.identification.identifiability.analysis import NOTHING_ELSE, Around, analyse
+from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
+from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import WeakUnknown, can_be_off, weak_unknowns
@@ -148,21 +135,6 @@ class Rows(NamedTuple):
     """(w, k) the weak priors' rows, which only nuisances have"""
 
 
-def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> Rows:
-    # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
-    J = np.asarray(e.J, dtype=np.float64)
-    q, p = len(layout.of_interest), len(layout.free)
-    count = layout.size - layout.first_nuisance
-    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
-    # the parameters' own; the defects between windows count as data.
-    data = J[: J.shape[0] - count - p]
-    slopes = np.asarray(e.slopes, dtype=np.float64)
-    factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)
-    # A parameter of negative sign falls as its logarithm rises; the size is what counts.
-    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * signs
-    return Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
-
-
 def relative_rows(
     problem: Problem, layout: Layout, e: Evaluation
 ) -> tuple[tuple[Unknown, ...], Rows]:
@@ -174,7 +146,20 @@ def relative_rows(
         e: the whitened residuals' Jacobian and the values there.
     """
     unknowns = unknowns_of(problem, layout, e)
-    return unknowns, _split(layout, e, references_of(problem, unknowns), _signs(unknowns))
+    # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
+    J = np.asarray(e.J, dtype=np.float64)
+    q, p = len(layout.of_interest), len(layout.free)
+    count = layout.size - layout.first_nuisance
+    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
+    # the parameters' own; the defects between windows count as data.
+    data = J[: J.shape[0] - count - p]
+    slopes = np.asarray(e.slopes, dtype=np.float64)
+    factor = np.divide(
+        references_of(problem, unknowns), slopes, out=np.zeros_like(slopes), where=slopes != 0
+    )
+    # A parameter of negative sign falls as its logarithm rises; the size is what counts.
+    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * _signs(unknowns)
+    return unknowns, Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
 
 
 _NO_EFFECT = 1e-6
@@ -194,36 +179,16 @@ def _with_weak_priors(rows: Rows, S: np.ndarray, N: np.ndarray) -> np.ndarray:
 
 
 def _without_weak_priors(
-    problem: Problem,
-    named: tuple[WeakUnknown, ...],
-    S: np.ndarray,
-    N: np.ndarray,
-    smallest: float,
+    named: tuple[WeakUnknown, ...], S: np.ndarray, N: np.ndarray
 ) -> WithoutWeakPriors:
-    """What is left of that without the weak priors.
-
-    Args:
-        named: the nuisances that have weak priors, the last columns of N.
-        smallest: part of the largest singular value below which a direction of the nuisances has
-            no effect.
-    """
+    """What is left of that without the weak priors of the last columns of N, which are `named`."""
     seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
-    # Before those stand the parameters of the disturbance and the noise's factors, of no kind.
-    kinds = np.array([""] * (N.shape[1] - len(named)) + [nuisance.kind for nuisance in named])
-    switched_off = {
-        f"fit.nuisance.{kind}": projected(S, N[:, seen & (kinds != kind)], smallest)
-        for kind in dict.fromkeys(nuisance.kind for nuisance in named)
-        if can_be_off(problem, kind)
-    }
     # The weak priors' sds are the units of these columns, so the solution is in sds.
     compensation = np.zeros((N.shape[1], S.shape[1]))
-    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=smallest)[0]
+    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
+    # Before those named stand the parameters of the disturbance and the noise's factors.
     return WithoutWeakPriors(
-        projected(S, N[:, seen], smallest),
-        compensation[kinds != ""],
-        tuple(nuisance.words for nuisance in named),
-        tuple(nuisance.label for nuisance in named),
-        switched_off,
+        projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
     )
 
 
@@ -232,49 +197,6 @@ def _signs(unknowns: tuple[Unknown, ...]) -> np.ndarray:
     return np.array([np.sign(u.value) or 1.0 if u.logarithmic else 1.0 for u in unknowns])
 
 
-def _remedies(problem: Problem) -> dict[str, str]:
-    """By parameter, what determines it beside a known value or a prior."""
-    # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
-    # A second run with a known inertia added sets the scale.
-    known = naming.names(problem.model.Params)
-    return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
-
-
-class Around(NamedTuple):
-    """What is known of points other than the one whose slopes are asked."""
-
-    aliased: Collection[str] = ()
-    """the parameters that move a mode which the samples do not tell from its aliases"""
-    second: tuple[SecondSolution, ...] = ()
-    """other values that fit as well"""
-    valley: Valley | None = None
-    """tells which combinations are the same far from the point; else its slopes are believed"""
-    null: tuple[np.ndarray, ...] = ()
-    """directions in relative coordinates that are open at another point as likely"""
-    one_sided: tuple[str, ...] = ()
-    """the parameters that the likelihood does not bound within the factor of ten"""
-    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
-    """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
-    open_combinations: frozenset[str] = frozenset()
-    """names of combinations whose intervals, as they are reported, determine nothing"""
-    combined: bool = True
-    """whether combinations have numbers at all"""
-
-    @property
-    def tied(self) -> Tied:
-        """What is determined along null directions."""
-        asked = self.valley.tied if self.valley is not None else combinations
-
-        def tied(
-            null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
-        ) -> tuple[Combination, ...]:
-            joint = asked(null, covariance, unknowns) if self.combined else ()
-            return tuple(c for c in joint if c.name not in self.open_combinations)
-
-        return tied
-
-
-NOTHING_ELSE = Around()
 _WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
 
 
@@ -310,14 +232,23 @@ def verdict_of(
     R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
     S, N = R[:, :q], R[:, q:]
     sensitivity = _with_weak_priors(rows, S, N)
-    without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, NULL)
-    if not around.combined:
-        # Initial states of a chance optimum may tell what no input does: at rest they would not.
-        without = without._replace(switched_off={})
+    named = weak_unknowns(problem, layout)
     if reported is not None:
         references = references_of(problem, unknowns)
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
-    remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
-    elsewhere = Elsewhere(around.second, around.tied, around.null, around.one_sided, around.limits)
-    return analyse(sensitivity, unknowns, remedies, without, reported, elsewhere)
+    # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
+    # A second run with a known inertia added sets the scale.
+    known = naming.names(problem.model.Params)
+    remedies = {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
+    # Initial states of a chance optimum may tell what no input does: at rest they would not.
+    kinds = {n.kind for n in named} if around.combined else ()
+    return analyse(
+        sensitivity,
+        unknowns,
+        without_weak=_without_weak_priors(named, S, N),
+        reported=reported,
+        around=around,
+        remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
+        switches=(kind for kind in kinds if can_be_off(problem, kind)),
+    )

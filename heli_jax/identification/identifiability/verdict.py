@@ -1,10 +1,13 @@
-"""What the identifiability analysis says: plain data."""
+"""What the identifiability analysis finds: plain data, of which `sentences` makes words."""
 
 import math
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+
+from heli_jax.identification.unknowns.initial_guess import WeakUnknown
 
 # Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
@@ -86,11 +89,30 @@ class SecondSolution(NamedTuple):
     """those whose value is another"""
 
 
+class Group(NamedTuple):
+    """Parameters that no rows tell apart, and how many of them would have to be known."""
+
+    names: tuple[str, ...]
+    count: int
+    combinations: tuple[Combination, ...]
+    """what is determined of them all the same"""
+    exchanged: tuple[WeakUnknown, ...] = ()
+    """nuisances that they are exchanged with, where weak priors alone hold them"""
+
+
+class Weakest(NamedTuple):
+    """The least determined direction where all is determined, but hardly."""
+
+    parts: dict[str, float]
+    combinations: tuple[Combination, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """What the data (with the priors) determine."""
 
-    names: tuple[str, ...]
+    unknowns: tuple[Unknown, ...]
+    """(q,)"""
     identifiable: bool
     # Both without the weak priors of nuisances, which would give full rank to anything.
     rank: int
@@ -105,25 +127,58 @@ class Verdict:
     pairs: tuple[Pair, ...]
     without_effect: tuple[str, ...]
     undetermined: tuple[str, ...]
+    """also those that take a small part in a direction that is not determined, and those that have
+    other values as good"""
     covariance: np.ndarray
     """(q, q) in relative coordinates; the undetermined directions are left out of it"""
     correlation: np.ndarray
-    # A key of fit.json.
     prior_share: dict[str, float]
     """share (P R P)_ii / P_ii of the posterior variance P that the priors with the information R
     explain: its own, those of others, and the weak ones of the nuisances; 1 where the data say
     nothing"""
-    sentences: tuple[str, ...]
-    resting: tuple[str, ...] = ()
-    """parameters that are determined by priors, and not by the data alone"""
-    roughly: tuple[str, ...] = ()
-    """parameters that are determined, but with a wide interval"""
+    own_share: dict[str, float]
+    """share of the posterior precision by the unknown's own prior"""
+    weak_share: dict[str, float]
+    """the same by the weak priors of nuisances"""
+    groups: tuple[Group, ...]
+    """what is not determined"""
+    resting_groups: tuple[Group, ...]
+    """what priors determine, and the data alone do not"""
+    factors: dict[str, float]
+    """of what is determined, but with a wide interval, the factor to its ends; infinite where that
+    reaches the end of its search"""
+    weakest: Weakest | None
+    """None where there is more to say than that"""
+    remedies: Mapping[str, str]
+    """by name, a further way out, as 'add a run with a known inertia'"""
+    switches: frozenset[str]
+    """the kinds of nuisances that may be switched off"""
     through_zero: tuple[str, ...] = ()
     """parameters that are determined, with an interval that holds zero: their sign is open"""
-    exchangeable: tuple[str, ...] = ()
-    """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
     second: tuple[SecondSolution, ...] = ()
     """other values that the data do not tell from these"""
+    sentences: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the unknowns (q,)."""
+        return tuple(u.name for u in self.unknowns)
+
+    @property
+    def resting(self) -> tuple[str, ...]:
+        """Parameters that are determined by priors, and not by the data alone."""
+        return tuple(n for group in self.resting_groups for n in group.names)
+
+    @property
+    def roughly(self) -> tuple[str, ...]:
+        """Parameters that are determined, but with a wide interval."""
+        return tuple(self.factors)
+
+    @property
+    def exchangeable(self) -> tuple[str, ...]:
+        """Nuisances, as 'flight 1/bias p', that make up for what is not determined."""
+        groups = (*self.groups, *self.resting_groups)
+        return tuple(dict.fromkeys(n.label for group in groups for n in group.exchanged))
 
     def nothing(self, sentence: str) -> "Verdict":
         """No parameter determined, for a reason.
@@ -138,8 +193,8 @@ class Verdict:
             pairs=(),
             undetermined=tuple(n for n in self.names if n not in self.without_effect),
             sentences=(sentence,),
-            resting=(),
-            roughly=(),
+            resting_groups=(),
+            factors={},
             through_zero=(),
         )
 
@@ -147,3 +202,15 @@ class Verdict:
     def text(self) -> str:
         """The verdict in words."""
         return " ".join(self.sentences)
+
+
+def connected[T](sets: Iterable[Set[T]]) -> list[set[T]]:
+    """Return the unions of those sets that share a member, directly or through others."""
+    groups: list[set[T]] = []
+    for one in sets:
+        # One may join several groups that had nothing in common until now.
+        touched = [group for group in groups if group & one]
+        rest = [group for group in groups if not group & one]
+        joined = set(one).union(*touched)
+        groups = [*rest, joined] if joined else groups
+    return groups

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heli_jax.errors import require_kind
+from heli_jax.identification.identifiability.profile import Profile, profile
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
-from heli_jax.identification.uncertainty.profile_likelihood import Profile, profile
 from heli_jax.numbers import percent
 from heli_jax.stages import stage
 
@@ -77,7 +77,7 @@ def intervals(
     if profiles:
         report(f"profile likelihood of {', '.join(profiles)}")
         with stage(f"profile likelihood of {', '.join(profiles)}", name="profile likelihood"):
-            profiled = profile(fit, profiles)
+            profiled = {name: profile(fit.reached, name) for name in profiles}
     if runs:
         report(f"bootstrap, {runs} records")
         with stage("bootstrap", total=runs):

@@ -11,13 +11,14 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.identifiability.beyond_slopes import (
+from heli_jax.identification.identifiability.analysis import Around
+from heli_jax.identification.identifiability.equivalents import Valley
+from heli_jax.identification.identifiability.profile import (
     AS_SLOPES,
     Limits,
     beyond_slopes,
 )
-from heli_jax.identification.identifiability.equivalents import Valley
-from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.through_inputs import (
     MOSTLY,
     by_inputs_alone,

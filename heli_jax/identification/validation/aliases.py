@@ -12,7 +12,6 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
-from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.identifiability.equivalents import SAME, Valley
 from heli_jax.identification.problem import Problem
@@ -261,38 +260,3 @@ def _relative_slopes(
         changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
         slopes[name] = changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)
     return slopes
-
-
-_FEEBLE = 3.0
-"""rms of a response over the noise below which an input hardly excites the model"""
-
-
-def _feeble(
-    flight: Flight, outputs: Mapping[str, np.ndarray], noise: Mapping[str, Any]
-) -> list[Finding]:
-    sentences = []
-    for name, y in outputs.items():
-        # About its mean: a trim value that the model holds excites nothing.
-        moved = float(np.std(y))
-        if moved < _FEEBLE * float(noise[name]):
-            words = (
-                f"{flight.name or 'the flight'}: the input hardly excites the model: it moves "
-                f"{name} by {moved:.2g} (rms, at the start values) where the noise is "
-                f"{float(noise[name]):.2g}; use larger or more inputs."
-            )
-            sentences.append(note("excitation.feeble", words, name))
-    return sentences
-
-
-def _few_changes(flight: Flight, free: int) -> list[Finding]:
-    # Every change of an input is one new piece of information at best.
-    changes = sum(int(np.count_nonzero(np.diff(u))) for u in flight.inputs.values())
-    # A free decay tells by its initial state.
-    if changes >= free or not any(np.ptp(u) > 0 for u in flight.inputs.values()):
-        return []
-    words = (
-        f"{flight.name or 'the flight'}: {' and '.join(flight.inputs)} "
-        f"{'change' if len(flight.inputs) > 1 else 'changes'} {changes} times in the record, fewer "
-        f"than there are free parameters ({free}): it excites too little."
-    )
-    return [note("excitation.few-changes", words, *flight.inputs)]

@@ -1,8 +1,9 @@
-"""Which band each input excites, and which inputs move together there."""
+"""The band that each input excites, the outputs that follow it, the inputs that move together."""
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -10,61 +11,8 @@ import scipy.special
 from jaxtyping import Bool, Complex, Float
 
 from heli_jax.analysis.spectral import partial_coherence, segment_transforms, without
-from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import spans
-
-# Inputs that move so little that they tell nothing: a count of the log, a few samples. Outputs
-# that never move.
-
-
-_FEW = 8
-"""samples away from the value that an input mostly has: fewer are a spike rather than a stick"""
-_ON_LATTICE = 5
-"""steps from zero, of a value between which and the next one all motion is, from which on that
-step is taken for the log's: what is commanded seldom stands at whole multiples of its own size"""
-
-
-def hardly_moving(flights: Sequence[Flight], moving: Sequence[str]) -> list[Finding]:
-    """Doubts about inputs that move by one step of the log, or in a few samples alone.
-
-    Args:
-        flights: those that are fitted.
-        moving: the inputs that move in any of them.
-    """
-    findings = []
-    for name in moving:
-        values = [f.inputs[name] for f in flights]
-        away, samples = sum(_away(u) for u in values), sum(u.size for u in values)
-        levels = np.unique(np.concatenate(values))
-        if words := _one_step(levels):
-            text = f"{name} moves by one step of the log alone, between {words}: it excites nothing"
-        elif away < _FEW:
-            text = f"{name} moves in {away} of {samples} samples alone: it excites hardly anything"
-        else:
-            continue
-        criterion = f"samples in which it is away from its usual value, {_FEW}"
-        findings.append(
-            Finding("excitation.excited-band", "doubt", f"{text}.", float(away), criterion)
-        )
-    return findings
-
-
-def _away(u: Float[np.ndarray, " N"]) -> int:
-    """Samples at other values than the one that is most frequent."""
-    _, counts = np.unique(u, return_counts=True)
-    return int(u.size - counts.max())
-
-
-def _one_step(levels: Float[np.ndarray, " k"]) -> str:
-    """Between which two neighbouring counts an input moves, in words; empty where it moves more."""
-    if levels.size != 2:
-        return ""
-    low, high = (float(v) for v in levels)
-    multiple = min(abs(low), abs(high)) / (high - low)
-    if multiple < _ON_LATTICE or abs(multiple - round(multiple)) > 1e-6 * multiple:
-        return ""
-    return f"{low:.6g} and {high:.6g}"
 
 
 def moving_outputs(flight: Flight) -> tuple[Flight | None, str]:
@@ -120,8 +68,8 @@ class SeenParts(NamedTuple):
 
     outputs: tuple[str, ...]
     parts: tuple[Part, ...]
-    left_out: dict[str, str]
-    """by output why it is not among `outputs`, in words"""
+    left_out: tuple[str, ...]
+    """outputs that are not in every flight, or lack too many samples"""
 
 
 def seen_parts(flights: Sequence[Flight]) -> SeenParts:
@@ -131,11 +79,11 @@ def seen_parts(flights: Sequence[Flight]) -> SeenParts:
         flights: of one sample time.
     """
     used: list[str] = []
-    left_out: dict[str, str] = {}
+    left_out: list[str] = []
     filled: list[dict[str, np.ndarray]] = [{} for _ in flights]
     for name in dict.fromkeys(n for f in flights for n in f.outputs):
         if not all(name in f.outputs for f in flights):
-            left_out[name] = "is not in every flight"
+            left_out.append(name)
             continue
         made = [_bridged(f.outputs[name]) for f in flights]
         missing = sum(int(np.isnan(f.outputs[name]).sum()) for f in flights)
@@ -143,13 +91,13 @@ def seen_parts(flights: Sequence[Flight]) -> SeenParts:
         total = sum(f.n_samples for f in flights)
         # Within its own span: what is missing before the first and after the last is cut off.
         if line > _SHARE * total or missing > 0.5 * total:
-            left_out[name] = f"lacks {100 * missing / total:.2g} % of its samples"
+            left_out.append(name)
             continue
         used.append(name)
         for outputs, (y, _) in zip(filled, made, strict=True):
             outputs[name] = y
     parts = tuple(p for f, ys in zip(flights, filled, strict=True) for p in _whole(f, ys))
-    return SeenParts(tuple(used), parts, left_out)
+    return SeenParts(tuple(used), parts, tuple(left_out))
 
 
 def _bridged(y: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], int]:
@@ -199,33 +147,62 @@ _WIDTH, _BINS = 0.25, 3
 vibration, or chance"""
 _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
-NOTHING = 0.2
-"""of the power of each output, below which inputs that no output follows over a band tell nothing,
-where they follow the response or none of it is beyond chance: a machine that is not flying had 0.11
-"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
-_NOISE = 0.5
-"""of what white noise has, in steps from sample to sample: above it an output shows no motion"""
 NOTHING_FOLLOWS = "excitation.nothing-follows"
-_NOTHING = (
-    "no output follows any input coherently over a band of frequencies: noise, disturbances or "
-    "something else moves the machine more than the sticks do."
-)
+"""code of a record in which no output follows any input"""
+
+
+class Followed(NamedTuple):
+    """Where an output follows an input."""
+
+    output: str
+    low: float
+    high: float
+    """[Hz]"""
+    coherence: float
+    """the largest there"""
+
+
+class Pair(NamedTuple):
+    """How far two inputs move together."""
+
+    inputs: tuple[str, str]
+    coherence: float
+    """the other inputs taken out, averaged by the power that both have"""
+
+
+class Excitation(NamedTuple):
+    """What the inputs of some flights excite."""
+
+    powers: dict[str, tuple[float, float]]
+    """by input that moves the band [Hz] that holds 90 % of its power"""
+    left_out: tuple[str, ...]
+    """outputs that were not looked at, for lack of samples"""
+    followed: Mapping[str, Followed | None] = MappingProxyType({})
+    """by input the widest band in which an output follows it alone, None where there is none; empty
+    where records are too short for a coherence"""
+    limit: float = COHERENT
+    """of that coherence"""
+    share: float | None = None
+    """largest part of an output's power that follows the inputs, where no output follows them over
+    a band; else None"""
+    pairs: tuple[Pair, ...] = ()
+    """the most alike first"""
+    pair_limit: float = TOGETHER
 
 
 class _Pooled(NamedTuple):
-    """Fourier transforms of the segments of all flights, or why there are none."""
+    """Fourier transforms of the segments of all flights."""
 
     hz: Float[np.ndarray, " k"]
     inputs: Complex[np.ndarray, "k segments m"]
     outputs: Complex[np.ndarray, "k segments p"]
 
 
-def bands(flights: Sequence[Flight]) -> list[Finding]:
-    """Which band each input excites, and which inputs move together.
-
-    Flights of one sample time are looked at together: what one of them tells apart is told apart.
+def excitation_of(flights: Sequence[Flight]) -> Excitation:
+    """What the inputs excite; flights of one sample time are looked at together, since what one of
+    them tells apart is told apart.
 
     Args:
         flights: those that are fitted.
@@ -233,35 +210,35 @@ def bands(flights: Sequence[Flight]) -> list[Finding]:
     dt = flights[0].dt
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
     moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
-    if not moving:
-        return [_free_motion(alike)]
     seen = seen_parts(alike)
-    barely = hardly_moving(alike, moving)
-    pooled = _pooled(seen, moving, alike[0].dt)
-    if pooled is not None:
-        together, coherent = _moving_together(pooled, moving), _coherent_bands(pooled, moving, seen)
-        return [*barely, *coherent, *together]
-    together = _short_together(alike, moving)
-    return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
-
-
-def _free_motion(flights: Sequence[Flight]) -> Finding:
-    """What can be learnt where no input moves: a free decay, or nothing from noise alone."""
-    turns = {
-        n: min(_roughness(f.outputs[n]) for f in flights if n in f.outputs)
-        for f in flights
-        for n in f.outputs
-    }
-    name = min(turns, key=lambda n: turns[n])
-    criterion = f"mean squared step of an output over that of white noise, {_NOISE:g}"
-    if turns[name] > _NOISE:
-        words = "no input moves, and the outputs show noise alone: nothing is excited."
-        return Finding(NOTHING_FOLLOWS, "refuse", words, turns[name], criterion)
-    words = (
-        f"no input moves: {name} shows how the machine moves freely from its first state, or under "
-        "constant inputs; what inputs do beyond that is not in the record."
+    pooled = _pooled(seen, moving, dt) if moving else None
+    if pooled is None:
+        return Excitation(_powers_alone(alike, moving), seen.left_out)
+    powers = np.sum(np.abs(pooled.inputs) ** 2, axis=1).T
+    limit = _chance(pooled, COHERENT, len(moving) * len(seen.outputs))
+    followed = {n: _widest(pooled, j, seen.outputs, limit) for j, n in enumerate(moving)}
+    alone = any(followed.values()) or _follow_together(pooled)
+    return Excitation(
+        {n: _power_band(pooled.hz, power) for n, power in zip(moving, powers, strict=True)},
+        seen.left_out,
+        followed,
+        limit,
+        None if alone else max(_share(pooled, i) for i in range(len(seen.outputs))),
+        _pairs(pooled, moving),
+        _chance(pooled, TOGETHER, len(moving) * (len(moving) - 1) // 2),
     )
-    return Finding("excitation.free-motion", "note", words, turns[name], criterion, (name,))
+
+
+def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
+    """The output that shows most of a motion, and its mean squared step from sample to sample over
+    that of white noise.
+
+    Args:
+        flights: with one output at least.
+    """
+    return min(
+        ((n, _roughness(y)) for f in flights for n, y in f.outputs.items()), key=lambda one: one[1]
+    )
 
 
 def _roughness(y: Float[np.ndarray, " N"]) -> float:
@@ -269,15 +246,6 @@ def _roughness(y: Float[np.ndarray, " N"]) -> float:
     y = y[np.isfinite(y)]
     spread = float(np.var(y)) if y.size > 2 else 0.0
     return float(np.mean(np.diff(y) ** 2)) / (2.0 * spread) if spread > 0 else 1.0
-
-
-def _why_not(seen: SeenParts) -> str:
-    """Why there is no coherence, in words."""
-    if seen.left_out and not seen.outputs:
-        return "; ".join(f"{n} {why}" for n, why in seen.left_out.items())
-    if len(seen.parts) > 1:
-        return "the parts without missing samples are too short"
-    return "the record is too short"
 
 
 def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
@@ -296,18 +264,16 @@ def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
     if length == 0:
         return None
     long = [p for p in parts if p.n_samples >= length]
-    transforms = [segment_transforms(_channels(p, moving, seen.outputs), dt, length) for p in long]
+    channels = [
+        np.stack([*(p.inputs[n] for n in moving), *(p.outputs[n] for n in seen.outputs)])
+        for p in long
+    ]
+    transforms = [segment_transforms(of_part, dt, length) for of_part in channels]
     omega, both = transforms[0][0], np.concatenate([t for _, t in transforms], axis=1)
     # Without zero frequency, which the straight lines took, and Nyquist's.
     inner = slice(1, -1)
     hz, m = omega[inner] / (2.0 * np.pi), len(moving)
     return _Pooled(hz, both[inner, :, :m], both[inner, :, m:])
-
-
-def _channels(
-    part: Part, inputs: Sequence[str], outputs: Sequence[str]
-) -> Float[np.ndarray, "channels n"]:
-    return np.stack([part.inputs[n] for n in inputs] + [part.outputs[n] for n in outputs])
 
 
 def _length(sizes: list[int], segments: int, least: int) -> int:
@@ -330,34 +296,6 @@ def _chance(pooled: _Pooled, level: float, pairs: int) -> float:
     # half-overlapping Hann windows are worth about 0.9 n, and each other input takes one.
     free = max(0.9 * segments - m, 1.0)
     return max(level, 1.0 - (_CHANCE / (k * max(pairs, 1))) ** (1.0 / free))
-
-
-def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list[Finding]:
-    limit = _chance(pooled, COHERENT, len(moving) * len(seen.outputs))
-    findings, followed = [], False
-    criterion = f"partial coherence with an output, {limit:.2f}"
-    left = "".join(f" {n} was not looked at: it {why}." for n, why in seen.left_out.items())
-    for j, name in enumerate(moving):
-        power = np.sum(np.abs(pooled.inputs[:, :, j]) ** 2, axis=1)
-        low, high = _power_band(pooled.hz, power)
-        words = f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; "
-        best = _best_band(pooled, j, seen.outputs, limit)
-        if best is None:
-            words += (
-                f"no output follows it alone over a quarter of an octave with a coherence of "
-                f"{limit:.2f}.{left}"
-            )
-            # No pass: this input alone moves nothing, though several together may.
-            findings.append(Finding("excitation.excited-band", "note", words, None, criterion))
-            continue
-        followed = True
-        words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
-        findings.append(Finding("excitation.excited-band", "ok", words, best.peak, criterion))
-    if not followed and not _follow_together(pooled):
-        share = max(_share(pooled, i) for i in range(pooled.outputs.shape[2]))
-        criterion = f"part of an output's power that follows the inputs, {NOTHING:g}"
-        findings.append(Finding(NOTHING_FOLLOWS, "doubt", _NOTHING, share, criterion))
-    return findings
 
 
 def _share(pooled: _Pooled, i: int) -> float:
@@ -402,18 +340,7 @@ def _is_band(run: tuple[float, float], step: float) -> bool:
     return bool(wide and run[1] - run[0] >= (_BINS - 1.5) * step)
 
 
-class _Band(NamedTuple):
-    """Where an output follows an input."""
-
-    output: str
-    low: float
-    high: float
-    """[Hz]"""
-    peak: float
-    """coherence"""
-
-
-def _best_band(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) -> _Band | None:
+def _widest(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) -> Followed | None:
     """The widest band in which an output follows the j-th input; None where it is too narrow."""
     others, u = np.delete(pooled.inputs, j, axis=2), pooled.inputs[:, :, j]
     power = np.sum(np.abs(u) ** 2, axis=1)
@@ -425,7 +352,7 @@ def _best_band(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) ->
         if run is None or not _is_band(run, step):
             continue
         if best is None or run[1] / run[0] > best.high / best.low:
-            best = _Band(output, *run, float(np.max(c[good])))
+            best = Followed(output, *run, float(np.max(c[good])))
     return best
 
 
@@ -450,8 +377,8 @@ def longest_band(hz: np.ndarray, good: Bool[np.ndarray, " k"]) -> tuple[float, f
     return float(hz[begins[widest]]), float(hz[ends[widest]])
 
 
-def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
-    limit, pairs = _chance(pooled, TOGETHER, len(moving) * (len(moving) - 1) // 2), []
+def _pairs(pooled: _Pooled, moving: list[str]) -> tuple[Pair, ...]:
+    pairs = []
     for a, b in itertools.combinations(range(len(moving)), 2):
         others = np.delete(pooled.inputs, [a, b], axis=2)
         u, v = pooled.inputs[:, :, a], pooled.inputs[:, :, b]
@@ -463,73 +390,17 @@ def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
         weights = np.min([p / max(p.sum(), 1e-300) for p in powers], axis=0)
         # None where one of them moves in parts alone that are shorter than a segment.
         mean = float(np.sum(c * weights) / max(np.sum(weights), 1e-300))
-        excited = weights >= _LEAST_POWER * weights.max()
-        band = longest_band(pooled.hz, (c >= limit) & excited)
-        pairs.append((mean, moving[a], moving[b], band))
-    return _pair_findings(pairs, limit)
+        pairs.append(Pair((moving[a], moving[b]), mean))
+    return tuple(sorted(pairs, key=lambda pair: -pair.coherence))
 
 
-def _pair_findings(
-    pairs: list[tuple[float, str, str, tuple[float, float] | None]], limit: float
-) -> list[Finding]:
-    criterion = f"coherence of two inputs, {limit:.2f}"
-    if not pairs:
-        return []
-    pairs.sort(key=lambda p: -p[0])
-    findings = []
-    for mean, a, b, band in pairs:
-        if mean < limit:
-            continue
-        where = "" if band is None else f" from {band[0]:.2g} to {band[1]:.2g} Hz"
-        wider = (
-            f"intervals of what each does are {(1.0 - mean) ** -0.5:.2g} times as wide as if they "
-            "moved apart"
-            if mean < 1.0 - 1e-6
-            else "nothing in the record tells what each does"
-        )
-        words = (
-            f"{a} and {b} move together{where} (coherence {mean:.2f}, other inputs taken out): "
-            f"their effects cannot be told apart there, and {wider}; move one at a time."
-        )
-        findings.append(Finding("excitation.inputs-together", "doubt", words, mean, criterion))
-    if findings:
-        return findings
-    mean, a, b, _ = pairs[0]
-    words = f"no two inputs move together (most {a} and {b}: coherence {mean:.2f})."
-    return [Finding("excitation.inputs-together", "ok", words, mean, criterion)]
-
-
-def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Finding]:
-    """From the power of the inputs alone, where there is no coherence, and why that is."""
+def _powers_alone(flights: list[Flight], moving: list[str]) -> dict[str, tuple[float, float]]:
+    """The bands of the inputs' power by the longest flight, where there is no coherence."""
     longest = max(flights, key=lambda f: f.n_samples)
     length = min(longest.n_samples, _LONGEST) // 2 * 2
-    findings = []
+    powers = {}
     for name in (n for n in moving if np.ptp(longest.inputs[n]) > 0):
         omega, U = segment_transforms(longest.inputs[name][None, :], longest.dt, length)
         power = np.sum(np.abs(U[1:-1, :, 0]) ** 2, axis=1)
-        low, high = _power_band(omega[1:-1] / (2.0 * np.pi), power)
-        words = (
-            f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; whether an output "
-            f"follows it was not computed: {why}."
-        )
-        findings.append(Finding("excitation.excited-band", "doubt", words))
-    return findings
-
-
-def _short_together(flights: list[Flight], moving: list[str]) -> list[Finding]:
-    """By correlation in time, the others taken out by least squares."""
-    u = np.concatenate([np.stack([f.inputs[n] for n in moving], axis=1) for f in flights])
-    which = np.repeat(np.arange(len(flights)), [f.n_samples for f in flights])
-    level = np.stack([which == i for i in range(len(flights))], axis=1).astype(float)
-    pairs = []
-    for a, b in itertools.combinations(range(len(moving)), 2):
-        both = u[:, [a, b]] - level @ np.linalg.lstsq(level, u[:, [a, b]], rcond=None)[0]
-        others = np.hstack([level, np.delete(u, [a, b], axis=1)])
-        left = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
-        sizes = np.sum(left**2, axis=0)
-        # Where the others explain all of one, what is left is rounding: the pair by itself.
-        if np.any(sizes <= 1e-12 * np.sum(both**2, axis=0)):
-            left, sizes = both, np.sum(both**2, axis=0)
-        squared = float((left[:, 0] @ left[:, 1]) ** 2 / max(float(np.prod(sizes)), 1e-300))
-        pairs.append((squared, moving[a], moving[b], None))
-    return _pair_findings(pairs, TOGETHER)
+        powers[name] = _power_band(omega[1:-1] / (2.0 * np.pi), power)
+    return powers

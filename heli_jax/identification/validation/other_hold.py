@@ -14,14 +14,12 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions, evaluate
+from heli_jax.identification.estimation.evaluation import directions, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 from heli_jax.numerics.jumps import split
 
-_NULL = 1e-8
-"""Directions of the scaled Jacobian below this part of the largest stay where they are."""
 _BEYOND_DOUBT = 20.0
 """of twice the log-likelihood, from which on the other hold is taken where the log leaves it
 open"""
@@ -130,7 +128,7 @@ def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> Likelie
 def _least(e: Evaluation) -> float:
     """The smallest sum of squares to first order about a point."""
     r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
-    taken = directions(J, _NULL).T @ r
+    taken = directions(J).T @ r
     return float(r @ r - taken @ taken)
 
 
@@ -225,13 +223,3 @@ def _flipped(layout: Layout, moving: list[set[str]]) -> Layout:
 
 def _other(hold: str) -> str:
     return "linear" if hold == "zero-order" else "zero-order"
-
-
-def pseudoinverse(J: np.ndarray) -> np.ndarray:
-    """Of sensitivities (n, q), with columns brought to one size first: (q, n)."""
-    # The cut is on singular values, and units of the unknowns must not decide what it takes.
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    # The triangle has the same singular values, and q rows instead of n.
-    Q, R = np.linalg.qr(J / norms[None, :])
-    return np.linalg.pinv(R, rcond=_NULL) @ Q.T / norms[:, None]

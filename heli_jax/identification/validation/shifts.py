@@ -30,12 +30,12 @@ from heli_jax.flights.align import NotAligned, correlations, other_peak
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions, evaluate
+from heli_jax.identification.estimation.evaluation import directions, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 from heli_jax.identification.validation.metrics import autocorrelation
-from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
+from heli_jax.identification.validation.other_hold import feeds_through
 from heli_jax.identification.validation.signal_signs import (
     PARTS,
     WITHIN,
@@ -387,8 +387,6 @@ class _ShiftLimits:
     """sds from zero, from which on a shift is clear; of twice the log-likelihood the square"""
     farthest: float = 0.5
     """[s] that an input is moved at most"""
-    rounding: float = 1e-8
-    """part of the largest singular value of the sensitivities below which one is rounding"""
     block: float = 1.0
     """[s] over which rows may be correlated"""
 
@@ -474,7 +472,7 @@ def _best_place(problem: Problem, at: Solution, e: Evaluation, name: str) -> tup
 
 def _beside(J: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
     """Return the part of v (n,) that no step of the unknowns, of slopes J (n, q), takes up."""
-    Q = directions(J, SHIFT.rounding)
+    Q = directions(J)
     return v - Q @ (Q.T @ v)
 
 

@@ -1,21 +1,27 @@
-"""Whether signals have the signs and units that they are said to have.
+"""Signs and units of signals, as far as signals tell them.
 
-Two tests that need no fit. An angle is the integral of its rate, so the two have to move alike by
-as much. And with start values of the right signs the simulated outputs move with the measured ones.
+Three tests that need no fit. An angle is the integral of its rate, so the two move alike, and as
+far. With start values of the right signs and units the simulated outputs move with the measured
+ones, and about as far. And the size of a signal suits one unit better than another: degrees fit as
+well as radians where all outputs are in them, with every estimate off by 57.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax import naming, units
 from heli_jax.dynamics.model import Model, axes_of
-from heli_jax.finding import Finding
-from heli_jax.flights.flight import Flight
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
+from heli_jax.flights.flight import Flight, Signal
+from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
+from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
+from heli_jax.vehicle import of_helicopter
+
+# An angle and the integral of its rate.
+
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
 """rate and angle by the names that outputs have here, beside those of the model's axes"""
@@ -25,50 +31,30 @@ PARTS = 10
 """so many of these parts of a record at least"""
 _ALIKE = 0.8
 """correlation of the two from which on their sizes are compared"""
-_FACTOR = 1.3
-"""by which these may differ: coupled rotation and sensors that are off by a fifth"""
-_SCALE = 1.12
-"""by which they may differ for certain, by the interval of their factor: a sensor off by a tenth,
-and of pitch and heading the cosine of the bank"""
-_ROLL, _ROLL_SCALE = frozenset({"phi", "roll"}), 1.04
-"""the same of the bank, whose rate is p but for what the tangent of the pitch angle lets in: that
-goes with another motion, and changes no factor by more than a hundredth or two"""
 _QUANTILE = 2.26
 """of Student's t with as many degrees of freedom as parts but one, for 95 %"""
 _GAP = 0.3
 """[s] without a sample, over which nothing is put between"""
-_DEGREE = 180.0 / np.pi
-_NEARLY = 1.3
-"""factor about 57.3 that is still degrees taken for radians"""
-
-RATE_SCALE = "units.rate-scale"
-AGAINST_START, RATE_AGAINST_ANGLE = "signs.against-start", "signs.rate-against-angle"
-AGAINST = -0.3
-"""correlation below which a simulated output moves against the measured one"""
-_SURE = 3.0
-"""times what chance makes of it"""
-_LAG = 0.25
-"""[s] to either side: later, a swing of the right sign looks like one of the wrong sign"""
-_LARGER = 1.3
-"""by how much the correlation of the wrong sign exceeds any of the right one"""
-_MORE = 1.3
-"""times as far an output is simulated to move in a flight that says more of it"""
 
 
-def rate_against_angle(problem: Problem) -> list[Finding]:
-    """A doubt for each angle that does not move as the integral of its rate does.
+class AngleOverRate(NamedTuple):
+    """The change of an angle over that of its integrated rate.
 
-    Args:
-        problem: the flights that are fitted, and the model, whose axes name rates and angles.
+    Where both are noisy, the regressions of the one on the other and of the other on the one
+    enclose the factor (Frisch, 1934): it lies between `factor` times and over `|correlation|`.
     """
-    pairs = rates_and_angles(problem.model)
-    flights = problem.training
-    findings = []
-    for label, flight in zip(labels(flights), flights, strict=True):
-        for rate, angle in pairs:
-            if rate in flight.outputs and angle in flight.outputs:
-                findings += _of_pair(label, flight, rate, angle)
-    return findings
+
+    factor: float
+    """negative where they go against one another"""
+    correlation: float
+    scale: tuple[float, float]
+    """95 % interval of the rate's size over that of the angle's rate of change, noise of either
+    allowed for"""
+
+    def off(self, by: float) -> bool:
+        """True if the size is off by a factor of `by` or more, whatever the noise."""
+        size, alike = abs(self.factor), abs(self.correlation)
+        return size * alike > by or size / alike < 1.0 / by
 
 
 def rates_and_angles(model: Model) -> list[tuple[str, str]]:
@@ -78,64 +64,34 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
     return list(dict.fromkeys([*axes, *_PAIRS]))
 
 
-def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
-    ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
-    if ratio is None:
-        return []
-    smallest, largest = ratio
-    size = float(np.sign(smallest) * np.sqrt(smallest * largest))
-    backward, off = size < 0, abs(smallest) > _FACTOR or abs(largest) < 1.0 / _FACTOR
-    if not (backward or off):
-        return _of_scale(label, flight, rate, angle, ratio)
-    distance = f"{abs(size):.3g} times as far as" if off else "as far as"
-    alike = np.sign(smallest) * np.sqrt(smallest / largest)
-    against = f", and against it (correlation {alike:+.2f})" if backward else ""
-    reasons = ["one of the two has the wrong sign (invert)"] if backward else []
-    if off and 1.0 / _NEARLY < max(abs(size), 1.0 / abs(size)) / _DEGREE < _NEARLY:
-        reasons.append("one of the two is in degrees and read as radians, or the reverse (unit)")
-    elif off:
-        reasons.append("the unit or the scale of one of the two is wrong")
-    words = (
-        f"{label}: {angle} moves {distance} the integral of {rate}{against}: "
-        f"{' and '.join(reasons)}."
-    )
-    criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
-    # No model follows an angle that runs against its rate, or is in other units.
-    degrees = 1.0 / _NEARLY < max(abs(size), 1.0 / abs(size)) / _DEGREE < _NEARLY
-    brief = (
-        f"{angle} runs against the integral of {rate}"
-        if backward
-        else f"{angle} moves {abs(size):.3g} times as far as the integral of {rate}"
-    )
-    code, denies = RATE_AGAINST_ANGLE, backward or degrees
-    return [
-        Finding(code, "doubt", words, size, criterion, (rate, angle), brief=brief, denies=denies)
-    ]
+def angle_over_rate(
+    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
+) -> AngleOverRate | None:
+    """How far an angle moves beside the integral of its rate; None where nothing can be told: a gap
+    is long, the record is short, or the two have little in common.
 
-
-def _of_scale(
-    label: str, flight: Flight, rate: str, angle: str, ratio: tuple[float, float]
-) -> list[Finding]:
-    """A doubt where a rate is too large or too small for its angle by more than chance, the noise
-    of either and a sensor's usual error explain."""
-    smallest, largest = ratio
-    changes = _changes(flight.outputs[angle], flight.outputs[rate], flight.dt)
-    if changes is None:
-        return []
-    sd = _log_sd(*changes)
-    low = float(np.exp(-_QUANTILE * sd)) / largest
-    high = float(np.exp(_QUANTILE * sd)) / smallest
-    most = _ROLL_SCALE if angle in _ROLL else _SCALE
-    if low <= most and high >= 1.0 / most:
-        return []
-    size = 1.0 / float(np.sqrt(smallest * largest))
-    words = (
-        f"{label}: {rate} is {size:.3g} times the rate of {angle} (95 % {low:.3g} to {high:.3g}): "
-        "the scale or the unit of one of the two is off, and a fit puts it into the machine."
-    )
-    criterion = f"the integrated rate's change over that of the angle, 1 within {most:g}"
-    brief = f"{rate} is {size:.3g} times the rate of {angle}"
-    return [Finding(RATE_SCALE, "doubt", words, size, criterion, (rate, angle), brief=brief)]
+    Args:
+        angle: [rad], NaN where missing.
+        rate: [rad/s], likewise.
+        dt: [s].
+    """
+    steps = max(1, round(WITHIN / dt))
+    if min(np.isfinite(v).sum() for v in (angle, rate)) < 2 or angle.size < (PARTS + 1) * steps:
+        return None
+    (phi, known), (p, known_too) = (over_gaps(v, dt) for v in (angle, rate))
+    if not (known & known_too).all():
+        return None
+    # Headings jump by a turn where they pass south. Changes over half a second: a bias of the rate
+    # is in their mean alone, and noise of the angle is not divided by a sample time.
+    both = [v[steps:] - v[:-steps] for v in (np.unwrap(phi), integral(p, dt))]
+    both = [v - v.mean() for v in both]
+    sds = [float(np.std(v)) for v in both]
+    alike = float(np.corrcoef(*both)[0, 1]) if min(sds) > 0 else 0.0
+    if abs(alike) < _ALIKE:
+        return None
+    size, wide = sds[1] / sds[0], float(np.exp(_QUANTILE * _log_sd(*both)))
+    scale = (size * abs(alike) / wide, size / abs(alike) * wide)
+    return AngleOverRate(float(np.copysign(1.0 / size, alike)), alike, scale)
 
 
 def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
@@ -143,70 +99,7 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
     one part after the other (the jackknife)."""
     squares = [[float(part @ part) for part in np.array_split(x, PARTS)] for x in (first, second)]
     left = [sum(of) - np.asarray(of) for of in squares]
-    return jackknife_sd(0.5 * np.log(left[0] / left[1]))
-
-
-def jackknife_sd(each: Sequence[float] | np.ndarray) -> float:
-    """Standard deviation of what all parts of a record give together, by what is given without one
-    part after the other.
-
-    Args:
-        each: without the first of the `PARTS` parts, without the second, and so on.
-    """
-    return float(np.sqrt((PARTS - 1) * np.var(each)))
-
-
-def angle_over_rate(
-    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
-) -> tuple[float, float] | None:
-    """Between which factors an angle's changes are those of its integrated rate, whatever the noise
-    of either; both negative where they go against one another, None where nothing can be told.
-
-    Regressions of the one on the other and of the other on the one enclose the factor where both
-    are noisy (Frisch, 1934).
-
-    Args:
-        angle: [rad], NaN where missing.
-        rate: [rad/s], likewise.
-        dt: [s].
-    """
-    changes = _changes(angle, rate, dt)
-    if changes is None:
-        return None
-    sds = [float(np.std(v)) for v in changes]
-    if not min(sds) > 0:
-        return None
-    alike = float(np.corrcoef(changes[0], changes[1])[0, 1])
-    if abs(alike) < _ALIKE:
-        return None
-    size = float(np.sign(alike)) * sds[0] / sds[1]
-    return size * abs(alike), size / abs(alike)
-
-
-def _changes(
-    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """By how much an angle and the integral of its rate change over `WITHIN`, without their means;
-    None where nothing can be told."""
-    both = angle_and_integral(angle, rate, dt)
-    if both is None:
-        return None
-    first, second = (changes_within(v, dt) for v in both)
-    return first, second
-
-
-def changes_within(signal: Float[np.ndarray, " N"], dt: float) -> np.ndarray:
-    """By how much a signal changes over `WITHIN`, without the mean.
-
-    Args:
-        signal: without a missing sample.
-        dt: [s].
-    """
-    steps = max(1, round(WITHIN / dt))
-    # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
-    # is not divided by a sample time.
-    changes = signal[steps:] - signal[:-steps]
-    return changes - changes.mean()
+    return float(np.sqrt((PARTS - 1) * np.var(0.5 * np.log(left[0] / left[1]))))
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
@@ -217,39 +110,6 @@ def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"
         dt: [s].
     """
     return np.concatenate([np.zeros(1), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
-
-
-def angle_and_integral(
-    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """An angle without turns and the integral of its rate (N,), with straight lines over short
-    gaps; None where a gap is long or the record too short to compare the two.
-
-    Args:
-        angle: [rad], NaN where missing.
-        rate: [rad/s], likewise.
-        dt: [s].
-    """
-    whole = [filled(v, dt) for v in (angle, rate)]
-    steps = max(1, round(WITHIN / dt))
-    if whole[0] is None or whole[1] is None or angle.size < (PARTS + 1) * steps:
-        return None
-    # Headings jump by a turn where they pass south.
-    turned = np.unwrap(whole[0])
-    return turned, integral(whole[1], dt)
-
-
-def filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
-    """A signal with straight lines over its short gaps; None where one is long.
-
-    Args:
-        signal: (N,), NaN where missing.
-        dt: [s].
-    """
-    if np.count_nonzero(np.isfinite(signal)) < 2:
-        return None
-    values, known = over_gaps(signal, dt)
-    return values if known.all() else None
 
 
 def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -269,13 +129,39 @@ def over_gaps(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return np.interp(rows, seen, signal[seen]), known
 
 
+# Outputs against those simulated at the start values.
+
+
+AGAINST = -0.3
+"""correlation below which a simulated output moves against the measured one"""
+_SURE = 3.0
+"""times what chance makes of it"""
+_LAG = 0.25
+"""[s] to either side: later, a swing of the right sign looks like one of the wrong sign"""
+_LARGER = 1.3
+"""by how much the correlation of the wrong sign exceeds any of the right one"""
+_MORE = 1.3
+"""times as far an output is simulated to move in a flight that says more of it"""
+
+
+class Turned(NamedTuple):
+    """Outputs of a flight that move against those simulated at the start values."""
+
+    flight: str
+    correlations: dict[str, float]
+    """by output"""
+    sticks: tuple[str, ...]
+    """inputs one of which may have the wrong sign instead; none where another output of the same
+    input has the right one"""
+
+
 def against_start(
     flights: Sequence[tuple[str, Flight]],
     simulated: Sequence[Mapping[str, np.ndarray]],
-    sticks: Mapping[str, str] | None = None,
-) -> list[Finding]:
-    """A doubt for outputs that move against those simulated at the start values: for all that a
-    stick moves together, or for one of them that others do not go with.
+    sticks: Mapping[str, str],
+) -> Iterator[Turned]:
+    """Outputs that move against those simulated at the start values: all that a stick moves, or one
+    of them that others do not go with.
 
     A stick that only holds an output against gusts moves against it by feedback alone. So what
     another flight shows, in which it moves the output further and the right way, goes before it.
@@ -283,20 +169,21 @@ def against_start(
     Args:
         flights: by what each is called.
         simulated: by flight and output (N,), SI.
-        sticks: by output the input that moves it, of `sticks_of`; without it any of them may.
+        sticks: by output the input that moves it, of `sticks_of`; of others any input may.
     """
-    findings = []
     by_flight = [_signs(f, run) for (_, f), run in zip(flights, simulated, strict=True)]
     for (label, flight), of_flight in zip(flights, by_flight, strict=True):
-        counting = {n: s for n, s in of_flight.items() if _counts(n, s, by_flight)}
-        signs = {n: s.correlation for n, s in counting.items()}
-        groups: dict[str, dict[str, float]] = {}
-        for name, c in signs.items():
-            stick = (sticks or {}).get(name, " or ".join(flight.inputs))
-            groups.setdefault(stick, {})[name] = c
-        for stick, group in groups.items():
-            findings += _of_stick(label, stick, group)
-    return findings
+        groups: dict[tuple[str, ...], dict[str, float]] = {}
+        for name, sign in of_flight.items():
+            if _counts(name, sign, by_flight):
+                of = (sticks[name],) if name in sticks else tuple(flight.inputs)
+                groups.setdefault(of, {})[name] = sign.correlation
+        for of, group in groups.items():
+            turned = {n: c for n, c in group.items() if c < 0}
+            if turned and len(turned) == len(group):
+                yield Turned(label, turned, of)
+            else:
+                yield from (Turned(label, {n: c}, ()) for n, c in turned.items())
 
 
 def sticks_of(model: Model) -> dict[str, str]:
@@ -335,46 +222,6 @@ def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) ->
     )
 
 
-def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Finding]:
-    """Of the outputs that one input moves, by the correlation of each with what is simulated."""
-    turned = {n: c for n, c in signs.items() if c < 0}
-    criterion = f"largest correlation of both, {AGAINST:g}"
-    if turned and len(turned) == len(signs):
-        names, size = " and ".join(turned), min(turned.values())
-        whose = stick if len(turned) > 1 else f"{names} or {stick}"
-        moves = "move against the measured ones"
-        moves = moves if len(turned) > 1 else "moves against the measured one"
-        words = (
-            f"{label}: at the start values the simulated {names} {moves} (correlation "
-            f"{', '.join(f'{c:+.2f}' for c in turned.values())}): {whose} has the wrong sign "
-            f"(invert: true) or is another column, or the effect of {stick} has the wrong sign at "
-            f"the start values. {_or_held(names)}"
-        )
-        return [Finding(AGAINST_START, "doubt", words, size, criterion, (*turned, stick))]
-    others = [n for n in signs if n not in turned]
-    return [
-        Finding(
-            AGAINST_START,
-            "doubt",
-            f"{label}: at the start values the simulated {name} moves against the measured one "
-            f"(correlation {c:+.2f}), though {' and '.join(others)} "
-            f"{'do' if len(others) > 1 else 'does'} not: {name} has the wrong sign "
-            f"(invert: true) or is another column. {_or_held(name)}",
-            c,
-            criterion,
-            (name,),
-        )
-        for name, c in turned.items()
-    ]
-
-
-def _or_held(outputs: str) -> str:
-    return (
-        f"An input that is not swept in this flight and holds {outputs} against gusts makes that "
-        "by itself: then nothing is wrong."
-    )
-
-
 def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
     """The correlation of the wrong sign, or else of the right one, where it is sure."""
     seen = np.isfinite(measured)
@@ -393,3 +240,194 @@ def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | N
     if -worst > least and -worst > _LARGER * best:
         return worst
     return best if best > least and best > -worst else None
+
+
+# The size of a signal in its unit.
+
+
+_ATTITUDE = {"p", "q", "r", "phi", "theta", "psi", "roll", "pitch", "yaw"}
+"""what the outputs of models without axes (kinematics) and of files are called then"""
+_LARGEST, _LINEAR = {"rad": np.pi, "rad/s": 20.0}, {"rad": np.pi / 2, "rad/s": 8.0}
+"""what a small helicopter does not exceed, but for its heading, and up to what a linear model may
+mean something"""
+_HEADING_TURNS = 20.0
+"""turns in one sense, of a heading without jumps"""
+_FLOWN_TURNS = 5.0
+"""turns that rolls and loops may add up to in an angle without jumps"""
+_MOST = 99.0
+"""percentile of the size that is held against them: no single spike counts"""
+_FLOWN = 0.3
+"""by which an angle's changes may differ from those of its integrated rate where it was flown"""
+
+
+class Oversized(NamedTuple):
+    """An angle or a rate that is larger than its unit lets expect."""
+
+    name: str
+    signal: Signal
+    size: float
+    """[SI]"""
+    limit: float
+    """[SI]"""
+    flown: bool
+    """whether an angle is what its rate adds up to: it was flown, or both are in degrees"""
+    certain: bool
+
+
+def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
+    """Angles and rates of a log that are too large to be in the unit that they are read in.
+
+    Args:
+        model: whose axes say which outputs are attitudes and rates.
+        flight: as read from a log.
+    """
+    headings = {a.angle for a in axes_of(model) if a.rate == "r"} | {"psi", "yaw"}
+    for name, signal in (flight.source.outputs if flight.source else {}).items():
+        values = flight.outputs.get(name)
+        if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
+            continue
+        seen = np.abs(values[np.isfinite(values)])
+        # What the file says of it makes sure what its size alone does not.
+        said = signal.contradicted == ("deg" if signal.unit == "rad" else "deg/s")
+        # The shaft of a motor turns as often as it likes, and a rotor faster than any fuselage; so
+        # may the angle of a nonlinear model of one's own, such as a pendulum.
+        free = signal.unit == "rad" and not (model.linear or of_helicopter(model.Params))
+        if not seen.size or not ((_of_fuselage(model, name) and not free) or said):
+            continue
+        size, impossible = float(np.percentile(seen, _MOST)), _LARGEST[signal.unit]
+        limit = _LINEAR[signal.unit] if model.linear else impossible
+        if signal.unit == "rad" and name in headings:
+            limit = impossible = _HEADING_TURNS * 2 * np.pi
+        if size > limit:
+            flown = _flown(model, flight, name, size) and not said
+            certain = said or (size > impossible and not flown)
+            yield Oversized(name, signal, size, limit, flown, certain)
+
+
+def _of_fuselage(model: Model, name: str) -> bool:
+    """Whether an output is an attitude or a rate of the vehicle, and no other angle of it."""
+    of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
+    return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
+
+
+def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
+    """Whether an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
+    so it is in aerobatics, and where both are in degrees."""
+    rate = next((a.rate for a in axes_of(model) if a.angle == name), None)
+    p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
+    if p is None or not np.isfinite(p).any() or size > _FLOWN_TURNS * 2 * np.pi:
+        return False
+    if np.nanmax(np.abs(p)) > _LARGEST["rad/s"]:
+        return False
+    seen, rated = np.isfinite(phi), np.isfinite(p)
+    # From one sample of the angle to its next, which a slower sensor has seconds later.
+    at = np.arange(p.size)
+    turned = integral(np.interp(at, at[rated], p[rated]), flight.dt)
+    moved, by_rate = np.diff(phi[seen]), np.diff(turned[seen])
+    power = float(np.sum(by_rate**2))
+    return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < _FLOWN
+
+
+# A stick in per cent that is read as plain numbers fits as well as one read right, with its effect
+# a hundredth of what it is. Two things together tell: numbers that are large (or small) for the
+# unit, and a model that at the start values moves its outputs too far (or not far enough) by about
+# as much.
+
+
+NEAR = 3.0
+"""factor by which start values may be off beside the unit"""
+_STEP, _SCALED = 1.001, 0.2
+"""factor on a signal, and the relative change of a parameter over its own, from which on the unit
+of the signal decides what the parameter is"""
+_FULL = 1.2
+"""of a stick's or a surface's full travel: 1, or a radian"""
+
+
+class OtherUnit(NamedTuple):
+    """An input whose numbers suit another unit than the one that was stated."""
+
+    flight: str
+    name: str
+    stated: str
+    unit: str
+    """that they suit"""
+    factor: float
+    """of the stated unit over this one"""
+    moved: dict[str, float]
+    """by output how many times as far it moves as is simulated"""
+
+
+def inputs_in_other_units(
+    flights: Sequence[tuple[str, Flight]],
+    simulated: Sequence[Mapping[str, np.ndarray]],
+    sticks: Mapping[str, str],
+) -> Iterator[OtherUnit]:
+    """Inputs that look like degrees for radians, per cent for plain numbers, or the reverse.
+
+    Args:
+        flights: by what each is called.
+        simulated: at the start values, by flight and output (N,), SI.
+        sticks: by output the input that moves it, of `sticks_of`; of others any input may.
+    """
+    for (label, flight), run in zip(flights, simulated, strict=True):
+        for name, signal in (flight.source.inputs if flight.source else {}).items():
+            if signal.constant is not None:
+                continue
+            outputs = [n for n in flight.outputs if sticks.get(n, name) == name]
+            sizes = {n: _size(flight.outputs[n], run[n]) for n in outputs}
+            stated, other = _units_by_size(signal, flight.inputs[name])
+            if other and sizes:
+                factor = units.factor(other, stated)
+                if all(factor / NEAR < size < factor * NEAR for size in sizes.values()):
+                    yield OtherUnit(label, name, stated, other, factor, sizes)
+
+
+def scaled_by(at: Solution, name: str) -> tuple[str, ...]:
+    """The parameters that another unit of a signal would change by a good part of its factor.
+
+    Args:
+        at: where the fit ended.
+        name: of the input or output.
+    """
+    layout, data = at.layout, at.data
+    flights = []
+    for flight in data.flights:
+        outputs = {n: y * _STEP if n == name else y for n, y in flight.outputs.items()}
+        inputs = {n: u * _STEP if n == name else u for n, u in naming.asdict(flight.inputs).items()}
+        flights.append(
+            flight._replace(outputs=outputs, inputs=naming.replace(flight.inputs, **inputs))
+        )
+    e = evaluate(*at)
+    other = evaluate(layout, data._replace(flights=tuple(flights)), at.noise, at.z)
+    step = pseudoinverse(np.asarray(e.J)) @ (np.asarray(e.r) - np.asarray(other.r))
+    values, slopes = np.asarray(e.named), np.asarray(e.slopes)
+    change = step[: slopes.size] * slopes / (_STEP - 1.0)
+    return tuple(
+        n
+        for n, c, v in zip(layout.of_interest, change, values, strict=True)
+        if abs(c) > _SCALED * abs(v)
+    )
+
+
+def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:
+    """The stated unit of an input, and the one that its size suits better; empty for none."""
+    named = signal.unit in ("rad", "deg", "%")
+    stated = "1" if not named and units.is_plain(signal.unit) else signal.unit
+    if not named and stated != "1":
+        return stated, ""
+    size = float(np.max(np.abs(values), initial=0.0)) / units.factor(signal.unit, signal.si)
+    for small, large in (("rad", "deg"), ("1", "%")):
+        # Of the larger unit no more than its full travel, so that a motor's speed is none.
+        if stated == small and _FULL < size <= _FULL * units.factor(small, large):
+            return stated, large
+        if stated == large and size <= _FULL:
+            return stated, small
+    return stated, ""
+
+
+def _size(measured: np.ndarray, simulated: np.ndarray) -> float:
+    """How many times as far an output moves as was simulated; 0 where nothing can be told."""
+    seen = np.isfinite(measured)
+    with np.errstate(over="ignore", invalid="ignore"):
+        far = float(np.std(simulated[seen])) if seen.any() else 0.0
+    return float(np.std(measured[seen])) / far if far > 0 and np.isfinite(far) else 0.0

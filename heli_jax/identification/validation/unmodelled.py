@@ -22,11 +22,15 @@ from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import HALF_INTERVAL
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations, evaluate, simulated_outputs
+from heli_jax.identification.estimation.evaluation import (
+    deviations,
+    evaluate,
+    pseudoinverse,
+    simulated_outputs,
+)
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import signals
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.other_hold import pseudoinverse
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,

@@ -15,7 +15,7 @@ from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.analysis.operating_point import OperatingPoint
 from heli_jax.analysis.response_curves import COHERENT, octave_mean
 from heli_jax.dynamics.model import Model
-from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.identification.result import Signals
 from heli_jax.report import frequency, style

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from heli_jax.identification.identifiability.profile import Profile
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.result import Estimate, Fit, StartRow
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Posterior
-from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.report import style
 from heli_jax.report.style import Panels, legend_above, panels, subtitle
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import (
     BAND99,

@@ -15,15 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
-from heli_jax.identification.identifiability.sensitivity import verdict_of
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
-from heli_jax.identification.validation.expected_accuracy import (
+from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     repeated,
@@ -31,7 +24,13 @@ from heli_jax.identification.validation.expected_accuracy import (
     together,
     triangle,
 )
-from heli_jax.identification.validation.record_windows import DETERMINES
+from heli_jax.identification.design.windows import DETERMINES
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
+from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
 # What outputs would tell that the model has and the log lacks, by Fisher's information.
@@ -40,17 +39,9 @@ from heli_jax.simulation.inputs import chirp, multistep_3211
 # shows them; how much narrower each interval would be follows from the rows alone.
 
 
-_NARROWS = 0.9
-"""of an interval's width, below which an output is spoken of"""
-_DOUBT = 0.5
-"""of an interval's width: an output that halves it is missed"""
-_KNOWN = 0.1
-"""relative sd of a parameter below which nothing is missed"""
 TYPICAL = {"rad": 0.01, "rad/s": 0.01, "m": 0.5, "m/s": 0.1, "m/s^2": 0.3}
 """noise of small autopilots' sensors (attitude, gyro, GPS position and velocity, accelerometer),
 SI, by unit: for outputs of a unit that no measured output has"""
-_MOST_NAMED = 3
-"""outputs that are named, those that narrow an interval most"""
 
 
 class MissingOutput(NamedTuple):
@@ -63,61 +54,6 @@ class MissingOutput(NamedTuple):
     """sd of each parameter of interest with it, over that without; 0 where only it determines"""
     before: Float[np.ndarray, " q"]
     """relative sd of each without it"""
-
-
-def missing_outputs(problem: Problem, at: Solution) -> list[Finding]:
-    """What each output that the model has and the log lacks would do to the intervals.
-
-    Args:
-        problem: what is free.
-        at: layout, data, noise and unknowns at the start values.
-    """
-    looked = look_at_missing(problem, at)
-    if looked is None:
-        return []
-    unknowns, missing = looked
-    if not missing:
-        return []
-    criterion = f"width of an interval with the output, over that without; {_DOUBT:g}"
-    missing = sorted(missing, key=lambda m: float(np.min(m.ratios)))
-    worth = [m for m in missing if float(np.min(m.ratios)) < _NARROWS][:_MOST_NAMED]
-    if not worth:
-        words = (
-            f"of the model's outputs that are not used none would narrow an interval by more than "
-            f"{100 * (1 - _NARROWS):.0f} % (most {missing[0].name})."
-        )
-        return [
-            Finding(
-                "excitation.missing-output",
-                "ok",
-                words,
-                float(np.min(missing[0].ratios)),
-                criterion,
-            )
-        ]
-    return [_finding(problem, unknowns, m, criterion) for m in worth]
-
-
-def _finding(
-    problem: Problem, unknowns: tuple[str, ...], m: MissingOutput, criterion: str
-) -> Finding:
-    order = [i for i in np.argsort(m.ratios) if m.ratios[i] < _NARROWS][:_MOST_NAMED]
-    parts = [
-        f"that of {unknowns[i]} would be {m.ratios[i]:.2g} times as wide"
-        if m.ratios[i] > 0
-        else f"{unknowns[i]} would be determined"
-        for i in order
-    ]
-    unit = naming.unit(problem.model.Outputs, m.name) or ""
-    least = float(np.min(m.ratios))
-    words = (
-        f"{m.name} is not among the outputs: with it (noise taken as {m.sd:.2g} {unit}".rstrip()
-        + f") of the intervals {', '.join(parts)}; at the start values."
-    )
-    # What is known well already need not be known better.
-    missed = bool(np.any((m.ratios < _DOUBT) & ~(m.before < _KNOWN)))
-    severity = "doubt" if missed else "ok"
-    return Finding("excitation.missing-output", severity, words, least, criterion)
 
 
 def look_at_missing(
@@ -252,8 +188,6 @@ _SHORT = 20_000
 """samples of a record up to which its own program serves for the candidates"""
 _FREE = 1e-3
 """weight of weak priors where they are all that holds a parameter up"""
-_WORTH = 0.98
-"""of the sd that the same record again would leave: less is no reason to fly something else"""
 
 
 class Candidate(NamedTuple):
@@ -283,47 +217,6 @@ class Plan(NamedTuple):
     """of the best candidate, SI"""
     left_out: tuple[str, ...]
     """inputs that do not move in the record, of which no amplitude is known"""
-
-
-def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
-    """The manoeuvre that narrows the widest interval most, as a sentence.
-
-    Args:
-        problem: what is free.
-        at: layout, data, noise and unknowns at the start values.
-        e: the evaluation there.
-    """
-    plan = plan_next_flight(problem, at, e)
-    if plan is None:
-        return []
-    unit = naming.unit(problem.model.Inputs, plan.best.input) or ""
-    unit = "" if unit == "1" else unit
-    flown = (
-        f"{plan.best.words} of {plan.best.input}, amplitude {plan.amplitude:.3g} {unit}".rstrip()
-        + f", for {plan.duration:.3g} s"
-    )
-    criterion = f"sd with it over that with the same record again; {_WORTH:g}"
-    ratio = plan.after / plan.again if np.isfinite(plan.after) and plan.again > 0 else 1.0
-    now = f"{plan.parameter}, the widest, has {_sd(plan.before)} in white noise: fly "
-    if not np.isfinite(plan.after):
-        words = f"none of the manoeuvres that were compared determines {plan.parameter}."
-    elif ratio < _WORTH:
-        words = (
-            f"{now}{flown}, which leaves {_sd(plan.after)}; the same record again leaves "
-            f"{_sd(plan.again)}."
-        )
-    else:
-        words = (
-            f"{now}the same again, which leaves {_sd(plan.again)}; no other manoeuvre that was "
-            f"compared does better ({flown}: {_sd(plan.after)})."
-        )
-    if plan.left_out:
-        words += f" Not compared: {', '.join(plan.left_out)}, which the record does not move."
-    return [Finding("excitation.next-flight", "note", words, ratio, criterion)]
-
-
-def _sd(relative: float) -> str:
-    return f"sd {100 * relative:.2g} %" if np.isfinite(relative) else "not determined"
 
 
 def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:

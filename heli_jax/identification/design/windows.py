@@ -21,6 +21,13 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
+from heli_jax.identification.design.accuracy import (
+    Sensitivity,
+    expected_sd,
+    sensitivity_at,
+    together,
+    triangle,
+)
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.simulated_flights import predict, signal_numbers
@@ -29,13 +36,6 @@ from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
-from heli_jax.identification.validation.expected_accuracy import (
-    Sensitivity,
-    expected_sd,
-    sensitivity_at,
-    together,
-    triangle,
-)
 
 # Why a window of a record is not to be used: gaps, missing samples, signals at their ends.
 

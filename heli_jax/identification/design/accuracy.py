@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.finding import Finding, note
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.identifiability.directions import projected
@@ -17,7 +16,7 @@ from heli_jax.identification.identifiability.sensitivity import relative_rows
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Layout, Solution, unpack
+from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.transforms import scale
 
 # What parts of a record say of the parameters, at the start values: expected standard deviations.
@@ -164,27 +163,6 @@ def unstated_gusts(problem: Problem) -> list[str]:
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]
     return [n for n in sizes if not _is_stated(float(getattr(problem.vehicle, n)))]
-
-
-def guessed_gusts(problem: Problem, at: Solution) -> list[Finding]:
-    """A note where the disturbances' size is what the record says at the start values.
-
-    Args:
-        problem: with its vehicle, where a size may be stated.
-        at: the start values.
-    """
-    guessed = unstated_gusts(problem)
-    if not guessed:
-        return []
-    taken = unpack(at.layout, at.data, at.z).noise
-    units = {n: naming.unit(problem.model.Params, n) or "" for n in guessed}
-    sizes = " and ".join(f"{n} of {float(taken[n]):.2g} {units[n]}".rstrip() for n in guessed)
-    words = (
-        f"Nobody stated {' and '.join(guessed)}: the expected sds are for {sizes}, the likeliest "
-        "at the start values, where whatever these do not explain is taken for gusts. A fit "
-        "estimates it; method: output-error shows the other end, no gusts at all."
-    )
-    return [note("noise.gusts-guessed", words, *guessed)]
 
 
 def _is_stated(value: float) -> bool:

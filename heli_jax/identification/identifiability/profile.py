@@ -1,0 +1,332 @@
+"""Profile likelihood: what a parameter may be when all others adapt to it.
+
+One parameter is held at values further and further from the optimum, all other unknowns follow, and
+the deviance (twice the log-likelihood that is lost, priors included) ends its interval where it
+passes the point of chi-squared. A fit asks so of each parameter whose interval by the slopes is
+wide: an optimum of a record that tells little is one of chance, and its slopes may bound a
+parameter that the likelihood, a little further off, does not.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.identifiability.equivalents import (
+    Rows,
+    descend,
+    rows_at,
+    squares_of,
+)
+from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
+from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.initial_guess import weak_unknowns
+from heli_jax.identification.unknowns.layout import Solution, value_of
+
+_REACHES = (3.0, 9.0)
+"""standard deviations to either side of a profile that is asked for; the second only where the
+first holds no whole interval"""
+_OUTWARDS = (0.35, 0.6, 1.0, 1.7, 2.9, 4.9, 8.4, 14.0, 24.0, 41.0)
+"""the points of a search for an interval's end, over the end by the slopes"""
+_AS_EXPECTED = 1.15
+"""factor by which the root of the deviance may differ from what the slopes say: the interval of the
+slopes is then as wide as that of the likelihood within about as much"""
+_WIDE = 0.1
+"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked"""
+_INFLATED = 1.5
+"""factor by which autocorrelated residuals may make intervals wider: beyond, a disturbance does,
+and the likelihood of white residuals means little"""
+_TOGETHER = 0.99
+"""correlation beyond which two parameters lie along one valley, which bends"""
+_BY_CHANCE = 1e-3
+"""probability that initial states which are those of rest gain as much of the likelihood"""
+_REST = 1e-6
+"""initial states below this, in sds of their weak priors, are those of rest already"""
+
+
+class Profile(NamedTuple):
+    """The likelihood along one parameter, everything else at its best there."""
+
+    values: np.ndarray
+    """(k,) in the parameter's unit, rising in size"""
+    deviance: np.ndarray
+    """(k,) twice the log-likelihood lost (priors included); NaN where nothing finite was found"""
+    lower95: float
+    upper95: float
+    """where the deviance passes 3.84; NaN where it does not within nine standard deviations"""
+
+
+def profile(at: Solution, name: str, points: int = 13) -> Profile:
+    """Return the profile of a free parameter; white residuals are taken for granted.
+
+    Args:
+        at: the optimum that the profile goes through.
+        name: of a free parameter that the data determine.
+        points: of the profile; odd, so that the optimum is one of them.
+    """
+    i = at.layout.free.index(name)
+    line = _line(at, rows_at(at, at.z), i)
+    for reach in _REACHES:
+        t = np.linspace(-reach, reach, points) * line.sd
+        left = [root for _, root in line.roots(-1, -t[t < 0][::-1])][::-1]
+        right = [root for _, root in line.roots(1, t[t > 0])]
+        root = np.array([-r for r in left] + [0.0] * (points % 2) + right)
+        root = np.where(np.isfinite(root), root, np.nan)
+        z = [_crossing(root, t, side * Z95) for side in (-1, 1)]
+        values = np.array([line.value(float(d)) for d in (*z, *t)])
+        # Negative parameters fall as their logarithm rises; what is missing comes last.
+        bounds = sorted(values[:2].tolist(), key=lambda v: (np.isnan(v), v))
+        if np.isfinite(bounds).all():
+            break
+    return Profile(values[2:], root**2, *bounds)
+
+
+def _crossing(root: np.ndarray, t: np.ndarray, limit: float) -> float:
+    """Distance at which the signed root of the deviance, nearly a straight line, passes the
+    limit."""
+    seen = np.isfinite(root)
+    root, t = root[seen], t[seen]
+    order = np.argsort(root)
+    if not root.size or not root[order[0]] <= limit <= root[order[-1]]:
+        return math.nan
+    return float(np.interp(limit, root[order], t[order]))
+
+
+class _Line(NamedTuple):
+    """The way along which one unknown is moved, and the others follow."""
+
+    at: Solution
+    i: int
+    tangent: np.ndarray
+    """(q,) change of all unknowns by a unit of this one, to first order"""
+    sd: float
+    """of the unknown's coordinate"""
+    squares: float
+    """at the optimum"""
+
+    def roots(self, side: int, distances: Iterable[float]) -> Iterator[tuple[float, float]]:
+        """Distances from the optimum to one side, each with the root of the deviance there.
+
+        Each point is sought from the one before, where the line through that and the optimum goes.
+        """
+        z0 = np.asarray(self.at.z, np.float64)
+        held, guess, tangent = np.arange(z0.size) == self.i, z0, self.tangent
+        for t in distances:
+            guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
+            guess, squares = follow(self.at, guess, held)
+            if t > 0.0:
+                tangent = (guess - z0) / (guess[self.i] - z0[self.i])
+            yield t, math.sqrt(deviance_of(self.at, self.squares, squares))
+
+    def value(self, distance: float) -> float:
+        """The parameter, in its unit."""
+        z = jnp.asarray(float(self.at.z[self.i]) + distance)
+        return float(value_of(self.at.layout, self.at.data, self.i, z))
+
+
+def _line(at: Solution, here: Rows, i: int, inverse: np.ndarray | None = None) -> _Line:
+    """The line along unknown i; `inverse` (q, k) a root of the covariance of all unknowns."""
+    inverse = pseudoinverse(here.J) if inverse is None else inverse
+    along = inverse @ inverse[i]
+    return _Line(at, i, along / along[i], math.sqrt(along[i]), squares_of(here.r))
+
+
+def follow(at: Solution, z: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the point (q,) of the smallest sum of squares near z with the coordinates `held` (q,)
+    where they are, and that sum, infinite where nothing finite is found."""
+    return descend(lambda z: rows_at(at, z), z, ~held)
+
+
+def deviance_of(at: Solution, first: float, squares: float) -> float:
+    """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
+    if not math.isfinite(squares):
+        return math.inf
+    # What a further step promises may be all there is.
+    if squares <= 0.0:
+        return 0.0
+    n = measured_count(at.data)
+    # Filter error has the noise at its best too, output error keeps it: the method says which.
+    deviance = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
+    return max(0.0, float(deviance))
+
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+class BeyondSlopes(NamedTuple):
+    """What slopes at the optimum do not tell."""
+
+    limits: Limits = MappingProxyType({})
+    """by parameter the ends of its 95 % interval by the likelihood, in the parameter's unit, where
+    those by the slopes are others"""
+    one_sided: tuple[str, ...] = ()
+    """parameters that the likelihood does not bound within the factor of ten to either side"""
+    null: tuple[np.ndarray, ...] = ()
+    """directions (q,) in relative coordinates that are open with the initial states at rest, where
+    the data cannot tell them from that"""
+
+
+AS_SLOPES = BeyondSlopes()
+
+
+def beyond_slopes(
+    problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
+) -> BeyondSlopes:
+    """Ask the likelihood of the parameters whose intervals are wide.
+
+    Args:
+        problem: with bounds and priors.
+        at: the optimum.
+        e: what it tells.
+        verdict: what the data determine by the slopes there.
+        reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
+    """
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    wide = _wide(problem, at, e, verdict, reaches)
+    if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
+        return AS_SLOPES
+    null = _open_at_rest(problem, at, e, lacking, reaches)
+    opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
+    # What is open already goes along with anything, and tells nothing of where the others go.
+    J = np.array(e.J, np.float64)
+    J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
+    inverse = pseudoinverse(J)
+    # Several that go together along one valley have as many ways to fit the noise: their intervals
+    # are those that hold for all of them at once.
+    together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
+    limits, one_sided = {}, []
+    for i, u in wide:
+        if u.name in opened:
+            continue
+        line = _line(at, Rows(np.asarray(e.r), J), i, inverse)
+        reach = together * float(reaches[i])
+        ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
+        if None in ends:
+            one_sided.append(u.name)
+        elif any(abs(t) != reach * line.sd for t in ends):
+            low, high = sorted(line.value(t) for t in ends)
+            limits[u.name] = (low, high)
+    return BeyondSlopes(limits, tuple(one_sided), tuple(null))
+
+
+def _wide(
+    problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
+) -> list[tuple[int, Unknown]]:
+    """Return the parameters that the likelihood is asked of, by their place among the unknowns."""
+    sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    reaches = reaches[: len(sd)]
+    related = np.abs(np.where(np.eye(len(sd)), 0.0, verdict.correlation)).max(1, initial=0.0)
+    asked = (reaches < _INFLATED * Z95) | (related > _TOGETHER)
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    wide = []
+    for i, u in enumerate(unknowns_of(problem, at.layout, e)):
+        if u.name not in problem.free or u.name in lacking or u.at_bound or not asked[i]:
+            continue
+        low, high = transforms.limits(problem.free[u.name])
+        # What acts through a parameter that may be zero may act not at all: slopes beside zero
+        # bound what the likelihood there does not.
+        may_vanish = u.symmetric and low < 0.0 < high and sd[i] * reaches[i] >= u.distance
+        if (u.logarithmic or u.symmetric) and (sd[i] * reaches[i] > Z95 * _WIDE or may_vanish):
+            wide.append((i, u))
+    return wide
+
+
+def _end(
+    problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: int, reach: float
+) -> float | None:
+    """Return the distance at which the root of the deviance passes `reach`, negative to that side;
+    None where that is not within the factor of ten, and no stated bound ends the interval."""
+    expected, furthest = reach * line.sd, _furthest(problem, line, e, u, side)
+    [(t, root)] = line.roots(side, [min(expected, furthest)])
+    if 1.0 / _AS_EXPECTED < root / reach < _AS_EXPECTED:
+        return side * t
+    inside, outside = (0.0, 0.0), (furthest, math.inf)
+
+    def outwards() -> Iterator[float]:
+        for factor in _OUTWARDS:
+            yield min(factor * expected, furthest)
+            if outside[1] < math.inf or inside[0] >= furthest:
+                break
+        # Once more where a straight line has the end.
+        yield between()
+        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
+        # chance is one among many places where the noise may have put it.
+        if outside[0] < furthest:
+            yield furthest
+
+    def between() -> float:
+        share = (reach - inside[1]) / (outside[1] - inside[1])
+        return inside[0] + share * (outside[0] - inside[0])
+
+    for t, root in line.roots(side, outwards()):
+        if root < reach and t >= furthest:
+            # A bound that was stated bounds it, a factor of ten does not.
+            bounded = transforms.at_bound(problem.free[u.name], line.value(side * furthest))
+            return side * furthest if bounded else None
+        if root < reach:
+            inside = (t, root)
+        elif t < outside[0]:
+            outside = (t, root)
+    return side * between()
+
+
+def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: int) -> float:
+    """Distance in the coordinate to a factor of ten, or to a bound."""
+    free, value = problem.free[u.name], u.value
+    size = abs(value) / u.distance if u.distance else abs(value)
+    up = (float(e.slopes[line.i]) > 0) == (side > 0)
+    outwards = up == (value > 0)
+    target = value * FACTOR if outwards else value / FACTOR
+    if u.symmetric and not (outwards and abs(value) > 0.3 * size):
+        # Away from zero a factor, as for all; towards it as far on its other side.
+        target = value + math.log(FACTOR) * (size if up else -size)
+    low, high = transforms.limits(free)
+    width = high - low if math.isfinite(high - low) else abs(value)
+    target = min(max(target, low + 1e-6 * width), high - 1e-6 * width)
+    at, i = line.at, line.i
+    limits = (at.data.sign[i], at.data.low[i], at.data.high[i])
+    z = float(transforms.to_coordinate(at.layout.kinds[i], target, *limits))
+    return abs(z - float(at.z[i]))
+
+
+def _open_at_rest(
+    problem: Problem, at: Solution, e: Evaluation, lacking: set[str], reaches: np.ndarray
+) -> list[np.ndarray]:
+    """Return directions that nothing but initial states of chance determine.
+
+    A transient is as large as the initial states that the fit has found, and so is what it tells
+    of the parameters. Where the data do not tell these states from rest, it may as well be none.
+    """
+    layout = at.layout
+    if not layout.estimator.nuisances_in_rows or any(count > 1 for count, _ in layout.windows):
+        return []
+    kinds = np.array([w.kind for w in weak_unknowns(problem, layout)])
+    held = np.zeros(layout.size, bool)
+    held[layout.first_nuisance :] = kinds == "initial_state"
+    z = np.asarray(at.z, np.float64)
+    if not (np.abs(z[held]) > _REST).any():
+        return []
+    rest, squares = follow(at, np.where(held, 0.0, z), held)
+    deviance = deviance_of(at, squares_of(e.r), squares)
+    # Autocorrelated residuals let chance gain more.
+    wider = max(1.0, float(np.median(reaches[held])) / Z95)
+    if deviance > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
+        return []
+    e = evaluate(layout, at.data, at.noise, jnp.asarray(rest, at.z.dtype))
+    if not np.isfinite(e.J).all():
+        return []
+    there = verdict_of(problem, layout, e)
+    return [
+        np.array([v[n] for n in there.names])
+        for v in there.null_directions
+        if not lacking & {n for n, part in v.items() if abs(part) > 0.1}
+    ]
