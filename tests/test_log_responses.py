@@ -181,7 +181,7 @@ def test_degrees_that_are_read_as_radians_are_said(config, tmp_path):
         row[at] = str(np.degrees(float(row[at])))
     log.write_text("\n".join(",".join(row) for row in [head, *rows]))
     assert main(["frf", str(config), "--out", str(tmp_path / "degrees")]) == 0
-    assert "state unit: deg/s" in (tmp_path / "degrees" / "responses.html").read_text()
+    assert "unit: deg/s" in (tmp_path / "degrees" / "responses.html").read_text()
     assert main(["frf", str(config), "--set", "frequency.window=100", "--out", "none"]) == 2
 
 

@@ -96,7 +96,7 @@ def test_prior_on_a_makes_it_well_posed(resting):
 
 def codes(flight, free):
     found = check(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free))
-    return {f.code for f in found.notes}
+    return {f.code for f in found.findings}
 
 
 def test_ratios_that_the_data_alone_determine_have_their_own_intervals(resting, alone):

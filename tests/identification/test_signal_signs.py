@@ -108,8 +108,8 @@ def test_a_turned_output_is_a_doubt_before_a_fit_and_after_one_that_explains_lit
     start = SimpleNamespace(simulated=[run])
     for fitted, denied, count in ((False, False, 1), (True, False, 0), (True, True, 1)):
         asked = SimpleNamespace(
-            flights=[("held", held)], problem=problem(held), start=start, fitted=fitted,
-            adequacy=SimpleNamespace(denied=denied),
+            flights=[("held", held)], problem=SimpleNamespace(model=SWING), start=start,
+            fitted=fitted, adequacy=SimpleNamespace(denied=denied),
         )  # fmt: skip
         found = list(outputs_against_start(asked))
         assert [f.code for f in found] == count * ["signs.against-start"]
