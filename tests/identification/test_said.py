@@ -139,7 +139,7 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
     assert verdict.through_zero == ("B",)
     # So it is where the value is small beside the start, in whose units the coordinate is then.
-    near = second._replace(symmetric=True, logarithmic=False, distance=0.002)
+    near = second._replace(symmetric=True, logarithmic=False, reference=500.0)
     for sd, zero in ((0.0009, ()), (0.0011, ("B",))):
         verdict = analyse(np.diag([100.0, 1.0 / sd]), (first, near))
         assert verdict.identifiable

@@ -5,7 +5,7 @@ scale for those that may be zero. Initial states and biases are projected out fi
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -61,8 +61,6 @@ class Around(NamedTuple):
     """the parameters that the likelihood does not bound within the factor of ten"""
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
     """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
-    open_combinations: frozenset[str] = frozenset()
-    """names of combinations whose intervals, as they are reported, determine nothing"""
     combined: bool = True
     """whether combinations have numbers at all"""
 
@@ -73,8 +71,7 @@ class Around(NamedTuple):
         if not self.combined:
             return ()
         asked = self.valley.tied if self.valley is not None else combinations
-        joint = asked(null, covariance, unknowns)
-        return tuple(c for c in joint if c.name not in self.open_combinations)
+        return asked(null, covariance, unknowns)
 
 
 NOTHING_ELSE = Around()
@@ -239,13 +236,15 @@ def _groups(
     groups = []
     for members in connected(parts):
         mine = [v for v, part in zip(rows, parts, strict=True) if part & members]
-        exchanged = (n for v in mine for n in without_weak.exchanged(v, sensitivity))
+        exchanged = []
+        if without_weak is not None:
+            exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
         groups.append(
             Group(
                 tuple(unknowns[i].name for i in sorted(members)),
                 len(mine),
                 around.tied(mine, covariance, unknowns),
-                tuple(dict.fromkeys(exchanged)) if without_weak else (),
+                tuple(dict.fromkeys(exchanged)),
             )
         )
     return tuple(groups)
@@ -325,3 +324,23 @@ def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> Weakest:
         u.name: float(v) for u, v in zip(unknowns, direction, strict=True) if abs(v) > TAKES_PART
     }
     return Weakest(parts, combinations([direction], covariance, unknowns))
+
+
+def with_combinations(verdict: Verdict, change: Callable[[Combination], Combination]) -> Verdict:
+    """Return the verdict with other intervals of its combinations, without those that then
+    determine nothing.
+
+    Args:
+        verdict: what the data determine.
+        change: makes the combination with its interval.
+    """
+
+    def changed(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+        each = (tuple(map(change, g.combinations)) for g in groups)
+        kept = (tuple(c for c in joint if c.is_bounded) for joint in each)
+        return tuple(g._replace(combinations=k) for g, k in zip(groups, kept, strict=True))
+
+    groups, resting = changed(verdict.groups), changed(verdict.resting_groups)
+    joint = tuple(c for group in (*groups, *resting) for c in group.combinations)
+    verdict = replace(verdict, combinations=joint, groups=groups, resting_groups=resting)
+    return replace(verdict, sentences=sentences(verdict))

@@ -346,13 +346,38 @@ def second_solutions(
     """
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}
     values = {n: values[n] for n in problem.free if n in values}
-    finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
-    if len(values) < 2 or not (finite and all(map(math.isfinite, values.values()))):
+    # At the start values nothing has been fitted: any step would make the other the better one. Of
+    # rows that are sums over frequencies none stays.
+    if len(values) < 2 or not (optimum or at.layout.estimator.rows_are_samples):
         return ()
-    family, others = _same_responses(problem, values)
-    valley = Valley(problem, at, e)
-    solutions = (_as_good(valley, family, z, optimum) for z in others)
-    return tuple(one for one in solutions if one is not None)
+    finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
+    if not (finite and all(map(math.isfinite, values.values()))):
+        return ()
+    family, solutions = _Family(problem, values), []
+    for z in family.same_responses():
+        point = Valley(problem, at, e).visit({}, family.by_name(z), same=not optimum, priors=True)
+        if point is None or not point.excess <= SAME:
+            continue
+        there = {n: point.values[n] for n in values}
+        changed = family.changed(there)
+        # Along a valley other values are as good anyhow, and it is said what goes together there.
+        if changed and not family.open_along(changed) and _expected(at, e, there) > _APART:
+            solutions.append(SecondSolution(there, changed))
+    return tuple(solutions)
+
+
+def _expected(at: Solution, e: Evaluation, values: Mapping[str, float]) -> float:
+    """Squares that the slopes here let expect of other values, the nuisances following: with few of
+    them the other values are within the interval of these."""
+    names, J = at.layout.of_interest, np.asarray(e.J, np.float64)
+    here = np.asarray(e.named, np.float64)
+    there = np.array([values.get(n, v) for n, v in zip(names, here, strict=True)])
+    moved = J[:, : len(names)] @ ((there - here) / np.where(e.slopes != 0, e.slopes, np.inf))
+    others = J[:, len(names) :]
+    if others.size:
+        others = others / np.maximum(np.linalg.norm(others, axis=0), 1e-300)
+        moved = moved - others @ np.linalg.lstsq(others, moved, rcond=None)[0]
+    return float(moved @ moved)
 
 
 def same_responses(problem: Problem, values: Mapping[str, float]) -> list[dict[str, float]]:
@@ -363,62 +388,31 @@ def same_responses(problem: Problem, values: Mapping[str, float]) -> list[dict[s
         problem: with bounds; its model is linearised.
         values: of the free parameters, SI.
     """
-    family, others = _same_responses(problem, values)
-    return [
-        family.by_name(z)
-        for z in others
-        if family.apart(z) < _THE_SAME and family.admits(z) and not family.open_along(family.names)
-    ]
-
-
-def _same_responses(
-    problem: Problem, values: Mapping[str, float]
-) -> tuple["_Family", list[np.ndarray]]:
-    """The linearised model about these values, and coordinates at which it answers about alike."""
-    others: list[np.ndarray] = []
-    with np.errstate(all="ignore"):
-        family = _Family(problem, values, list(values))
-        for start in _starts(family):
-            z = _led_to(family, start)
-            if z is not None and not any(np.allclose(z, other, atol=0.02) for other in others):
-                others.append(z)
-    return family, others
-
-
-def _responses_of(
-    problem: Problem, params: Any, about: OperatingPoint, omega: np.ndarray
-) -> np.ndarray:
-    """(k, p, m) of the linearised model, with the delays of its inputs."""
-    matrices = linearize(problem.model, params, about.state, about.inputs).matrices
-    A, B, C, D = (np.asarray(M, np.float64) for M in matrices)
-    s = 1j * omega
-    with np.errstate(all="ignore"):
-        H = C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None] + 0j) + D
-    late = dict(problem.model.delays)
-    names = naming.names(problem.model.Inputs)
-    delays = [float(getattr(params, late[n])) if n in late else 0.0 for n in names]
-    return H * np.exp(-s[:, None] * np.array(delays))[:, None, :]
+    family = _Family(problem, values)
+    if family.open_along(tuple(values)):
+        return []
+    near = (z for z in family.same_responses() if family.apart(z) < _THE_SAME)
+    others = (family.by_name(z) for z in near)
+    return [o for o in others if all(transforms.inside(problem.free[n], v) for n, v in o.items())]
 
 
 class _Family:
     """The linearised model by coordinates of its free parameters, zero where they are here."""
 
-    def __init__(self, problem: Problem, values: Mapping[str, float], names: list[str]) -> None:
-        self.problem, self.values, self.names = problem, values, names
-        flight = problem.training[0]
-        self.known = flight.known
-        late = problem.model.delay_parameters
-        self.value = np.array([values[n] for n in names])
+    def __init__(self, problem: Problem, values: Mapping[str, float]) -> None:
+        self.problem, self.values, self.names = problem, values, list(values)
+        flight, late = problem.training[0], problem.model.delay_parameters
+        self.known, self.value = flight.known, np.array(list(values.values()))
         # What is zero has no relative change, nor has a delay, which may be: so many samples.
-        self.relative = np.array([values[n] != 0.0 and n not in late for n in names])
-        units = np.array([flight.dt if n in late else 1.0 for n in names])
+        self.relative = np.array([v != 0.0 and n not in late for n, v in values.items()])
+        units = np.array([flight.dt if n in late else 1.0 for n in values])
         self.size = np.where(self.relative, self.value, units)
         # A logarithm keeps the sign.
-        turns = np.array([transforms.changes_sign(problem.free[n]) for n in names])
+        turns = np.array([transforms.changes_sign(problem.free[n]) for n in values])
         self.log = self.relative & ~turns
         self.about: OperatingPoint = operating_point(
             problem.model,
-            self._at(np.zeros(len(names))),
+            self._params(np.zeros(len(values))),
             flight.inputs,
             flight.outputs,
             flight.dt,
@@ -429,44 +423,55 @@ class _Family:
         )
         self.rows = [naming.names(problem.model.Outputs).index(n) for n in flight.outputs]
 
-    @functools.cached_property
-    def here(self) -> np.ndarray:
-        """Responses (k, p, m) at zero."""
-        return self.responses(np.zeros(len(self.names)))
-
-    @functools.cached_property
-    def gain(self) -> np.ndarray:
-        """Their sizes, by which differences are judged."""
-        gain = np.abs(self.here)
-        largest = np.max(gain, axis=0)
-        # A response of nothing at all has no size of its own.
-        largest = np.where(largest > 0, largest, max(float(np.max(gain)), 1e-300))
-        return np.maximum(gain, _FLOOR * largest)
-
     def by_name(self, z: np.ndarray) -> dict[str, float]:
         """Values at coordinates (q,)."""
         change = np.where(self.log, np.expm1(np.where(self.log, z, 0.0)), z)
         return dict(zip(self.names, map(float, self.value + change * self.size), strict=True))
 
-    def admits(self, z: np.ndarray) -> bool:
-        """True where all values lie within their bounds."""
-        free = self.problem.free
-        return all(transforms.inside(free[n], v) for n, v in self.by_name(z).items())
+    def changed(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """The parameters whose values are others than here."""
+        there = np.array([values[n] for n in self.names])
+        size = np.maximum(np.abs(self.value), np.abs(there))
+        moved = np.abs(there - self.value) > _CHANGED * (size + self.size * ~self.relative)
+        return tuple(n for n, m in zip(self.names, moved, strict=True) if m)
 
-    def _at(self, z: np.ndarray):  # a record of the model's Params
+    def _params(self, z: np.ndarray) -> Any:  # a record of the model's Params
         return self.problem.params_with(self.known | self.by_name(z))
 
-    def poles(self, z: np.ndarray) -> np.ndarray:
-        """Eigenvalues (n,) of A."""
+    def _matrices(self, z: np.ndarray) -> list[np.ndarray]:
         at = (self.about.state, self.about.inputs)
-        A = linearize(self.problem.model, self._at(z), *at).matrices.A
-        A = np.asarray(A, np.float64)
-        return np.linalg.eigvals(A) if np.isfinite(A).all() else np.full(len(A), np.nan)
+        matrices = linearize(self.problem.model, self._params(z), *at).matrices
+        return [np.asarray(M, np.float64) for M in matrices]
+
+    def responses(self, z: np.ndarray) -> np.ndarray:
+        """(k, p, m) of the measured outputs, with the delays of the inputs."""
+        A, B, C, D = self._matrices(z)
+        s = 1j * self.omega
+        H = C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None] + 0j) + D
+        late, params = dict(self.problem.model.delays), self._params(z)
+        names = naming.names(self.problem.model.Inputs)
+        delays = [float(getattr(params, late[n])) if n in late else 0.0 for n in names]
+        return (H * np.exp(-s[:, None] * np.array(delays))[:, None, :])[:, self.rows]
+
+    @functools.cached_property
+    def here(self) -> tuple[np.ndarray, np.ndarray]:
+        """Responses (k, p, m) at zero, and their sizes, by which differences are judged."""
+        here = self.responses(np.zeros(len(self.names)))
+        gain = np.abs(here)
+        largest = np.max(gain, axis=0)
+        # A response of nothing at all has no size of its own.
+        largest = np.where(largest > 0, largest, max(float(np.max(gain)), 1e-300))
+        return here, np.maximum(gain, _FLOOR * largest)
 
     def differences(self, z: np.ndarray) -> np.ndarray:
         """(2 k p m,) of the responses from those here, relative; their squares add up to a mean."""
-        d = ((self.responses(z) - self.here) / self.gain).ravel()
+        here, gain = self.here
+        d = ((self.responses(z) - here) / gain).ravel()
         return np.concatenate([d.real, d.imag]) / math.sqrt(d.size)
+
+    def apart(self, z: np.ndarray) -> float:
+        """Their root mean square."""
+        return float(np.linalg.norm(self.differences(z)))
 
     def rows_at(self, z: np.ndarray) -> Rows:
         """Return the differences and their derivatives by all coordinates."""
@@ -474,12 +479,8 @@ class _Family:
         J = [(self.differences(z + h) - r) / _DIFFERENCE for h in steps]
         return Rows(r, np.stack(J, axis=1))
 
-    def apart(self, z: np.ndarray) -> float:
-        """Their root mean square."""
-        return float(np.linalg.norm(self.differences(z)))
-
     def open_along(self, names: Sequence[str]) -> bool:
-        """Whether some of these parameters may move with all responses as they are."""
+        """True if some of these parameters may move with all responses as they are."""
         J = self.rows_at(np.zeros(len(self.names))).J
         if not np.isfinite(J).all():
             return True
@@ -490,117 +491,67 @@ class _Family:
         null = right[values < _OPEN * np.max(values)]
         return bool(np.any(np.abs(null[:, [self.names.index(n) for n in names]]) > 0.1))
 
-    def responses(self, z: np.ndarray) -> np.ndarray:
-        """(k, p, m) of the measured outputs."""
-        return _responses_of(self.problem, self._at(z), self.about, self.omega)[:, self.rows]
+    def same_responses(self) -> list[np.ndarray]:
+        """Return other coordinates at which the model answers about alike."""
+        others: list[np.ndarray] = []
+        with np.errstate(all="ignore"):
+            for start in self._exchanged():
+                z, squares = start, 0.0
+                # Held until the others have followed, or those that exchange the modes would come
+                # back.
+                for moving in (start == 0.0, np.ones(len(start), bool)):
+                    z, squares = descend(
+                        self.rows_at, z, moving, floor=0.0, enough=_ARRIVED, steps=_RESPONSE_STEPS
+                    )
+                moved = np.max(np.abs(z[self.relative]), initial=0.0)
+                alike = squares < _ALIKE**2 and moved > _CHANGED
+                if alike and not any(np.allclose(z, other, atol=0.02) for other in others):
+                    others.append(z)
+        return others
 
+    def _exchanged(self) -> list[np.ndarray]:
+        """Coordinates at which two real modes are exchanged, but for what is not linear in them."""
+        q, A = len(self.names), self._matrices(np.zeros(len(self.names)))[0]
+        if not np.isfinite(A).all():
+            return []
+        here: np.ndarray = np.asarray(np.linalg.eigvals(A))
+        largest = np.max(np.abs(here), initial=0.0)
+        real = np.flatnonzero((abs(np.imag(here)) < 1e-6 * largest) & (abs(here) > 1e-6 * largest))
+        pairs = [
+            (i, j)
+            for i, j in itertools.combinations(real, 2)
+            # The same mode twice has no slope, and nothing to exchange.
+            if here[i].real * here[j].real > 0
+            and abs(math.log((here[i] / here[j]).real)) > np.log(_RATIO)
+        ]
+        if not pairs:
+            return []
+        slopes = np.stack([self._slope(here, a) for a in range(q)], axis=1)
+        starts = []
+        for i, j in pairs:
+            target = math.log((here[j] / here[i]).real) * np.array([1.0, -1.0])
+            for a, b in itertools.combinations(range(q), 2):
+                E = slopes[np.ix_([i, j], [a, b])]
+                # Each of the two has to make a mode of its own.
+                straight, crossed = np.abs(np.diag(E)), np.abs(np.diag(E[::-1]))
+                each = max(straight.min(), crossed.min())
+                if each < _MAKES or abs(np.linalg.det(E)) < _MAKES * each:
+                    continue
+                z = np.zeros(q)
+                z[[a, b]] = np.linalg.solve(E, target)
+                if np.max(np.abs(z)) < _REACH:
+                    starts.append((each, np.where(self.log, z, np.expm1(z))))
+        starts.sort(key=lambda one: -one[0])
+        return [z for _, z in starts[:_CANDIDATES]]
 
-def _starts(family: _Family) -> list[np.ndarray]:
-    """Coordinates at which two real modes are exchanged, but for what is not linear in them."""
-    q, here = len(family.names), family.poles(np.zeros(len(family.names)))
-    if not np.isfinite(here).all():
-        return []
-    largest = np.max(np.abs(here), initial=0.0)
-    real = [
-        i
-        for i, pole in enumerate(here)
-        if abs(pole.imag) < 1e-6 * largest and abs(pole) > 1e-6 * largest
-    ]
-    pairs = [
-        (i, j)
-        for i, j in itertools.combinations(real, 2)
-        # The same mode twice has no slope, and nothing to exchange.
-        if here[i].real * here[j].real > 0
-        and abs(math.log((here[i] / here[j]).real)) > np.log(_RATIO)
-    ]
-    if not pairs:
-        return []
-    slopes = np.stack([_slope(family, here, _DIFFERENCE * np.eye(q)[a]) for a in range(q)], axis=1)
-    slopes = np.where(family.relative & np.isfinite(slopes), slopes, 0.0)
-    starts = []
-    for i, j in pairs:
-        target = math.log((here[j] / here[i]).real) * np.array([1.0, -1.0])
-        for a, b in itertools.combinations(range(q), 2):
-            E = slopes[np.ix_([i, j], [a, b])]
-            # Each of the two has to make a mode of its own.
-            each = max(
-                min(abs(E[0, 0]), abs(E[1, 1])),
-                min(abs(E[0, 1]), abs(E[1, 0])),
-            )
-            if each < _MAKES or abs(np.linalg.det(E)) < _MAKES * each:
-                continue
-            z = np.zeros(q)
-            z[[a, b]] = np.linalg.solve(E, target)
-            if np.max(np.abs(z)) < _REACH:
-                starts.append((each, np.where(family.log, z, np.expm1(z))))
-    starts.sort(key=lambda one: -one[0])
-    return [z for _, z in starts[:_CANDIDATES]]
-
-
-def _slope(family: _Family, here: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """(n,) change of the logarithm of each pole by a coordinate, complex ones by their real part;
-    which pole is which is told by nearness, as the step is small."""
-    there = family.poles(step)
-    if not np.isfinite(there).all():
-        return np.zeros(len(here))
-    near = there[np.argmin(np.abs(here[:, None] - there[None, :]), axis=1)]
-    ratio = np.where(here != 0, near / np.where(here != 0, here, 1.0), 1.0)
-    return np.real(ratio - 1.0) / float(np.sum(step))
-
-
-def _led_to(family: _Family, start: np.ndarray) -> np.ndarray | None:
-    """Return coordinates near a start at which the responses are those at zero; None where there
-    are none, or where the way led back."""
-    z = start
-    # Held until the others have followed, or those that exchange the modes would come back.
-    for moving in (start == 0.0, np.ones(len(start), bool)):
-        z, squares = descend(
-            family.rows_at, z, moving, floor=0.0, enough=_ARRIVED, steps=_RESPONSE_STEPS
-        )
-        if not math.isfinite(squares):
-            return None
-    moved = np.max(np.abs(z[family.relative]), initial=0.0)
-    return z if family.apart(z) < _ALIKE and moved > _CHANGED else None
-
-
-def _as_good(
-    valley: Valley, family: _Family, z: np.ndarray, optimum: bool
-) -> SecondSolution | None:
-    """The solution there, if the residuals are as small and it is another than here."""
-    # At the start values nothing has been fitted: any step would make the other the better one. Of
-    # rows that are sums over frequencies none stays.
-    if not (optimum or valley.at.layout.estimator.rows_are_samples):
-        return None
-    point = valley.visit({}, family.by_name(z), same=not optimum, priors=True)
-    if point is None or not point.excess <= SAME:
-        return None
-    values = {n: point.values[n] for n in family.names}
-    here = family.values
-    changed = tuple(
-        n
-        for i, (n, v) in enumerate(values.items())
-        if abs(v - here[n])
-        > _CHANGED * (max(abs(here[n]), abs(v)) + family.size[i] * ~family.relative[i])
-    )
-    # Along a valley other values are as good anyhow, and it is said what goes together there.
-    if not changed or family.open_along(changed) or not _expected(valley, values) > _APART:
-        return None
-    return SecondSolution(values, changed)
-
-
-def _expected(valley: Valley, values: dict[str, float]) -> float:
-    """Squares that the slopes here let expect of so much of a change, the nuisances following: with
-    few of them the other values are within the interval of these."""
-    e, names = valley.e, valley.at.layout.of_interest
-    J = np.asarray(e.J, np.float64)
-    slopes = np.where(e.slopes != 0, e.slopes, np.inf)
-    here = np.asarray(e.named, np.float64)
-    there = np.array([values.get(n, v) for n, v in zip(names, here, strict=True)])
-    q = len(names)
-    moved = J[:, :q] @ ((there - here) / slopes)
-    others = J[:, q:]
-    if not others.size:
-        return float(moved @ moved)
-    others = others / np.maximum(np.linalg.norm(others, axis=0), 1e-300)
-    rest = moved - others @ np.linalg.lstsq(others, moved, rcond=None)[0]
-    return float(rest @ rest)
+    def _slope(self, here: np.ndarray, a: int) -> np.ndarray:
+        """(n,) change of the logarithm of each pole by coordinate a, complex ones by their real
+        part; which pole is which is told by nearness, as the step is small."""
+        A = self._matrices(_DIFFERENCE * np.eye(len(self.names))[a])[0]
+        if not (self.relative[a] and np.isfinite(A).all()):
+            return np.zeros(len(here))
+        there = np.linalg.eigvals(A)
+        near = there[np.argmin(np.abs(here[:, None] - there[None, :]), axis=1)]
+        ratio = np.where(here != 0, near / np.where(here != 0, here, 1.0), 1.0)
+        slope = np.real(ratio - 1.0) / _DIFFERENCE
+        return np.where(np.isfinite(slope), slope, 0.0)

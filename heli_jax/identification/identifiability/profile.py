@@ -40,13 +40,16 @@ _OUTWARDS = (0.35, 0.6, 1.0, 1.7, 2.9, 4.9, 8.4, 14.0, 24.0, 41.0)
 _AS_EXPECTED = 1.15
 """factor by which the root of the deviance may differ from what the slopes say: the interval of the
 slopes is then as wide as that of the likelihood within about as much"""
-_WIDE = 0.1
-"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked"""
+_WIDE, _WIDE_IN_A_VALLEY = 0.2, 0.1
+"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked: of
+any parameter, and of one that lies along a valley with another"""
+_VALLEY = 0.9
+"""correlation beyond which two parameters lie along a valley, which bends"""
 _INFLATED = 1.5
 """factor by which autocorrelated residuals may make intervals wider: beyond, a disturbance does,
 and the likelihood of white residuals means little"""
 _TOGETHER = 0.99
-"""correlation beyond which two parameters lie along one valley, which bends"""
+"""correlation beyond which what is open of one parameter is open of the other"""
 _BY_CHANCE = 1e-3
 """probability that initial states which are those of rest gain as much of the likelihood"""
 _REST = 1e-6
@@ -190,7 +193,7 @@ def beyond_slopes(
         verdict: what the data determine by the slopes there.
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
     """
-    lacking = {*verdict.undetermined, *verdict.without_effect}
+    lacking = verdict.not_identifiable
     wide = _wide(problem, at, e, verdict, reaches)
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES
@@ -210,10 +213,11 @@ def beyond_slopes(
         line = _line(at, Rows(np.asarray(e.r), J), i, inverse)
         reach = together * float(reaches[i])
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
-        if None in ends:
+        bounded = [t for t in ends if t is not None]
+        if len(bounded) < 2:
             one_sided.append(u.name)
-        elif any(abs(t) != reach * line.sd for t in ends):
-            low, high = sorted(line.value(t) for t in ends)
+        elif any(abs(t) != reach * line.sd for t in bounded):
+            low, high = sorted(line.value(t) for t in bounded)
             limits[u.name] = (low, high)
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
 
@@ -226,16 +230,21 @@ def _wide(
     reaches = reaches[: len(sd)]
     related = np.abs(np.where(np.eye(len(sd)), 0.0, verdict.correlation)).max(1, initial=0.0)
     asked = (reaches < _INFLATED * Z95) | (related > _TOGETHER)
-    lacking = {*verdict.undetermined, *verdict.without_effect}
+    least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
     wide = []
     for i, u in enumerate(unknowns_of(problem, at.layout, e)):
-        if u.name not in problem.free or u.name in lacking or u.at_bound or not asked[i]:
+        if (
+            u.name not in problem.free
+            or u.name in verdict.not_identifiable
+            or u.at_bound
+            or not asked[i]
+        ):
             continue
         low, high = transforms.limits(problem.free[u.name])
         # What acts through a parameter that may be zero may act not at all: slopes beside zero
         # bound what the likelihood there does not.
         may_vanish = u.symmetric and low < 0.0 < high and sd[i] * reaches[i] >= u.distance
-        if (u.logarithmic or u.symmetric) and (sd[i] * reaches[i] > Z95 * _WIDE or may_vanish):
+        if (u.logarithmic or u.symmetric) and (sd[i] * reaches[i] > Z95 * least[i] or may_vanish):
             wide.append((i, u))
     return wide
 
@@ -299,7 +308,7 @@ def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: in
 
 
 def _open_at_rest(
-    problem: Problem, at: Solution, e: Evaluation, lacking: set[str], reaches: np.ndarray
+    problem: Problem, at: Solution, e: Evaluation, lacking: frozenset[str], reaches: np.ndarray
 ) -> list[np.ndarray]:
     """Return directions that nothing but initial states of chance determine.
 

@@ -30,98 +30,50 @@ def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknow
         layout: the order of the unknowns.
         e: their values at the point.
     """
-    return tuple(
-        _unknown(problem, name, float(e.named[i])) for i, name in enumerate(layout.of_interest)
-    )
+    dt = problem.training[0].dt
+    unknowns = []
+    for i, name in enumerate(layout.of_interest):
+        value, free = float(e.named[i]), problem.free.get(name)
+        if name == "time_shift":
+            # A shift is known well where it is known to a sample, whatever its value. The search is
+            # through a tanh, which comes near to its end and never to it.
+            room = MAX_TIME_SHIFT - abs(value)
+            u = Unknown(name, value, False, 1.0, 0.0, is_parameter=False, reference=dt)
+            u = u._replace(at_bound=room < _AT_END * MAX_TIME_SHIFT, room=room / dt)
+        elif free is None:
+            u = Unknown(name, value, True, 1.0, 0.0, is_parameter=False, reference=abs(value))
+        else:
+            u = _parameter(problem, name, value)
+        unknowns.append(u)
+    return tuple(unknowns)
 
 
-def _unknown(problem: Problem, name: str, value: float) -> Unknown:
-    free = problem.free.get(name)
-    if name == "time_shift":
-        # Zero is as good a value as any: one unit is a sample, see `references_of`. The search is
-        # through a tanh, which comes near to its end and never to it.
-        room = MAX_TIME_SHIFT - abs(value)
-        return Unknown(
-            name,
-            value,
-            False,
-            1.0,
-            0.0,
-            is_parameter=False,
-            at_bound=room < _AT_END * MAX_TIME_SHIFT,
-            room=room / problem.training[0].dt,
-        )
-    if free is None:
-        return Unknown(name, value, True, 1.0, 0.0, is_parameter=False)
-    reference, log = _reference(problem, name, value)
-    prior = reference / free.prior.sd if free.prior else 0.0
-    # What a parameter may plausibly do: by its prior, or half its interval.
-    scale = 1.0 / prior if prior else _interval(free.lower, free.upper, log)
-    symmetric = _through_zero(problem, name)
-    # A coordinate in units of the reference becomes log |value| by the reference over the value.
-    per_log = reference / abs(value) if symmetric and log else 1.0
-    distance = abs(value) / reference if symmetric else 1.0
-    return Unknown(
-        name,
-        value,
-        log,
-        scale,
-        prior,
-        per_log=per_log,
-        symmetric=symmetric,
-        distance=distance,
-        at_bound=transforms.at_bound(free, value),
-    )
-
-
-def _interval(lower: float | None, upper: float | None, log: bool) -> float:
-    """Half the interval between the bounds, in relative coordinates."""
-    if log and lower and upper:
-        # Bounds that nearly meet would make a scale of zero, and a null direction of it.
-        return max(0.5 * float(np.log(upper / lower)), 1e-3)
-    return 1.0
-
-
-def _reference(problem: Problem, name: str, value: float) -> tuple[float, bool]:
-    """What one unit of a parameter's relative coordinate is, and whether it is log |value|."""
-    free = problem.free[name]
+def _parameter(problem: Problem, name: str, value: float) -> Unknown:
+    """A free parameter of the model."""
+    free, late = problem.free[name], name in problem.model.delay_parameters
     low, high = free.lower, free.upper
+    # Zero is as good a value as any where the sign may change, and of every delay: one that is
+    # searched as a positive number may still be none at all, of which its logarithm says nothing.
+    symmetric = late or transforms.changes_sign(free)
+    reference, log = abs(value), True
     # Between bounds of both signs neither a logarithm nor the start's size means anything.
     if low is not None and high is not None and low < 0 < high:
-        return 0.5 * (high - low), False
-    if _through_zero(problem, name):
-        # A value near zero is known as soon as it is known to be small beside the start.
-        size = max(abs(value), transforms.scale(free))
-        if name in problem.model.delay_parameters:
-            # Or beside a sample, however small a delay the search began with.
-            size = max(size, problem.training[0].dt)
-        return size, abs(value) > _NEAR_ZERO * size
-    return abs(value), True
-
-
-def _through_zero(problem: Problem, name: str) -> bool:
-    """Whether zero is as good a value as any: where the sign may change, and of every delay.
-
-    A delay that is searched as a positive number may still be none at all. Its logarithm then says
-    nothing of it, while the delay itself is bounded by the record.
-    """
-    late = name in problem.model.delay_parameters
-    return late or transforms.changes_sign(problem.free[name])
-
-
-def references_of(problem: Problem, unknowns: tuple[Unknown, ...]) -> np.ndarray:
-    """What one unit of each relative coordinate is (q,), in the unknowns' own units."""
-    # A shift is known well where it is known to a sample, whatever its value.
-    dt = problem.training[0].dt
-    references = []
-    for u in unknowns:
-        if u.name == "time_shift":
-            references.append(dt)
-        elif u.name in problem.free:
-            references.append(_reference(problem, u.name, u.value)[0])
-        else:
-            references.append(abs(u.value))
-    return np.array(references)
+        reference, log = 0.5 * (high - low), False
+    elif symmetric:
+        # A value near zero is known as soon as it is known to be small beside the start; or beside
+        # a sample, however small a delay the search began with.
+        reference = max(abs(value), transforms.scale(free))
+        reference = max(reference, problem.training[0].dt) if late else reference
+        log = abs(value) > _NEAR_ZERO * reference
+    # What a parameter may plausibly do: by its prior, or half its interval.
+    prior, scale = reference / free.prior.sd if free.prior else 0.0, 1.0
+    if prior:
+        scale = 1.0 / prior
+    elif log and low and high:
+        # Bounds that nearly meet would make a scale of zero, and a null direction of it.
+        scale = max(0.5 * float(np.log(high / low)), 1e-3)
+    at_bound = transforms.at_bound(free, value)
+    return Unknown(name, value, log, scale, prior, True, reference, symmetric, at_bound=at_bound)
 
 
 class Rows(NamedTuple):
@@ -155,10 +107,10 @@ def relative_rows(
     data = J[: J.shape[0] - count - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(
-        references_of(problem, unknowns), slopes, out=np.zeros_like(slopes), where=slopes != 0
+        [u.reference for u in unknowns], slopes, out=np.zeros_like(slopes), where=slopes != 0
     )
     # A parameter of negative sign falls as its logarithm rises; the size is what counts.
-    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * _signs(unknowns)
+    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * [u.sign for u in unknowns]
     return unknowns, Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
 
 
@@ -190,11 +142,6 @@ def _without_weak_priors(
     return WithoutWeakPriors(
         projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
     )
-
-
-def _signs(unknowns: tuple[Unknown, ...]) -> np.ndarray:
-    # log |value| falls as a negative value rises.
-    return np.array([np.sign(u.value) or 1.0 if u.logarithmic else 1.0 for u in unknowns])
 
 
 _WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
@@ -234,8 +181,7 @@ def verdict_of(
     sensitivity = _with_weak_priors(rows, S, N)
     named = weak_unknowns(problem, layout)
     if reported is not None:
-        references = references_of(problem, unknowns)
-        to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
+        to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
         reported = reported * np.outer(to_relative, to_relative)
     # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
     # A second run with a known inertia added sets the scale.

@@ -10,11 +10,12 @@ On the record that the model itself simulates the innovations are zero, and so i
 the Jacobian of the innovations there is that of the response, weighed as the filter weighs it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -26,7 +27,7 @@ from heli_jax.identification.unknowns.layout import FlightData, Layout, Solution
 
 _LEFT = 10.0
 """of a signal's variance, from which on the error of its simulation says that it left the record"""
-MOSTLY = 1.5
+_MOSTLY = 1.5
 """factor between standard deviations by the inputs alone and by all, above which a disturbance
 tells more than the inputs do"""
 _NOISE_ONLY = 1e-6
@@ -67,7 +68,13 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     # Rounding of a column that is none, as that of a disturbance's size, would be scaled to one.
     noise_only = np.linalg.norm(J, axis=0) < _NOISE_ONLY * np.linalg.norm(e.J, axis=0)
     J[:, noise_only] = 0.0
-    return e._replace(J=np.vstack([*_of_noise_alone(at.layout, noise_only, e.J), J]))
+    sds = deviations(e.J)
+    alone = [
+        np.eye(at.layout.size)[i] / sds[i]
+        for i in range(len(at.layout.free))
+        if noise_only[i] and np.isfinite(sds[i])
+    ]
+    return e._replace(J=np.vstack([*alone, J]))
 
 
 def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightData:
@@ -80,87 +87,66 @@ def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightDa
     )
 
 
-def _of_noise_alone(
-    layout: Layout, noise_only: Bool[np.ndarray, " q"], J: Float[np.ndarray, "n q"]
-) -> list[Float[np.ndarray, " q"]]:
-    """Rows with what the innovations tell of free parameters that no response has."""
-    sds = deviations(J)
-    return [
-        np.eye(layout.size)[i] / sds[i]
-        for i in range(len(layout.free))
-        if noise_only[i] and np.isfinite(sds[i])
-    ]
+class ByDisturbance(NamedTuple):
+    """What a disturbance tells of the parameters beside what the inputs do."""
+
+    resting: tuple[str, ...]
+    """parameters that are determined, and are not by the inputs alone"""
+    mostly: dict[str, float]
+    """by parameter that both determine, and of which the disturbance tells more, the standard
+    deviation by the inputs alone over that by all"""
+    wider: tuple[str, ...]
+    """parameters whose standard deviation by the inputs alone is larger by as much"""
 
 
-def not_by_inputs(verdict: Verdict, by_inputs: Verdict) -> tuple[str, ...]:
-    """The parameters that are determined, and are not by the inputs alone.
-
-    Args:
-        verdict: of all that the innovations tell.
-        by_inputs: of what the responses tell.
-    """
-    lacking = {*verdict.undetermined, *verdict.without_effect}
-    alone = {*by_inputs.undetermined, *by_inputs.without_effect}
-    return tuple(n for n in verdict.names if n in alone and n not in lacking)
-
-
-def mostly_by_disturbance(verdict: Verdict, by_inputs: Verdict) -> dict[str, float]:
-    """By parameter of which the disturbance tells more than the inputs do, and which both
-    determine, the standard deviation by the inputs alone over that by all.
+def by_disturbance(verdict: Verdict, by_inputs: Verdict) -> ByDisturbance:
+    """Return what the disturbance tells of the parameters.
 
     Args:
         verdict: of all that the innovations tell.
         by_inputs: of what the responses tell.
     """
-    lacking = {v for of in (verdict, by_inputs) for v in (*of.undetermined, *of.without_effect)}
-    sds = zip(verdict.names, deviations_of(verdict), deviations_of(by_inputs), strict=True)
-    return {n: b / a for n, a, b in sds if n not in lacking and b > MOSTLY * a}
-
-
-def by_inputs_alone(ratios: Mapping[str, float]) -> str:
-    """Why parameters have wider intervals than all that the innovations tell would give.
-
-    Args:
-        ratios: of `mostly_by_disturbance`, with one parameter at least.
-    """
-    ratio = max(ratios.values())
-    return (
-        f"How the disturbance goes through the machine would tell more of {listed(tuple(ratios))} "
-        f"than the inputs do (intervals {ratio:.2g} times as narrow), but only as far as the "
-        "model of the disturbance is right: the intervals are those of the inputs alone."
+    known, alone = verdict.not_identifiable, by_inputs.not_identifiable
+    sds = (np.sqrt(np.maximum(np.diag(v.covariance), 0.0)) for v in (verdict, by_inputs))
+    each = list(zip(verdict.names, *map(np.ndarray.tolist, sds), strict=True))
+    wider = tuple(n for n, all_, inputs in each if inputs > _MOSTLY * all_)
+    return ByDisturbance(
+        tuple(n for n in verdict.names if n in alone and n not in known),
+        {n: b / a for n, a, b in each if n in wider and n not in known | alone},
+        wider,
     )
 
 
-def deviations_of(verdict: Verdict) -> np.ndarray:
-    """Of the parameters (k,), in their coordinates."""
-    return np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-
-
-def resting_on_disturbance(names: Sequence[str]) -> str:
-    """That parameters rest on the model of the disturbance, whose innovations are white."""
-    return (
-        f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: "
-        f"{'it rests' if len(names) == 1 else 'they rest'} on the model of the disturbance."
-    )
-
-
-def not_counted(names: Sequence[str], *, white: bool) -> str:
-    """That what a disturbance tells of parameters does not count.
+def remarks(told: ByDisturbance, names: Sequence[str], *, counts: bool, white: bool) -> list[str]:
+    """Return sentences on parameters that rest on the model of the disturbance.
 
     Args:
-        names: of these, one at least.
+        told: what the disturbance tells.
+        names: the parameters that do.
+        counts: whether that is counted.
         white: whether the innovations are white.
     """
-    if white:
-        return (
-            f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: "
-            f"{'it would rest' if len(names) == 1 else 'they would rest'} on the model of the "
-            "disturbance, which does not count."
+    lines = []
+    if names and not white:
+        lines.append(
+            f"What the colour of the innovations tells of {listed(tuple(names))} does not count, "
+            "since they are not white: disturbance or noise are not what the model says."
         )
-    return (
-        f"What the colour of the innovations tells of {listed(tuple(names))} does not count, since "
-        "they are not white: disturbance or noise are not what the model says."
-    )
+    elif names:
+        they = "it" if len(names) == 1 else "they"
+        rest = f"rest{'s' * (len(names) == 1)}" if counts else "would rest"
+        lines.append(
+            f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: {they} "
+            f"{rest} on the model of the disturbance{'' if counts else ', which does not count'}."
+        )
+    if white and not counts and told.mostly:
+        lines.append(
+            "How the disturbance goes through the machine would tell more of "
+            f"{listed(tuple(told.mostly))} than the inputs do (intervals "
+            f"{max(told.mostly.values()):.2g} times as narrow), but only as far as the model of "
+            "the disturbance is right: the intervals are those of the inputs alone."
+        )
+    return lines
 
 
 @np.errstate(over="ignore", invalid="ignore")

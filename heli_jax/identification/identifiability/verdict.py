@@ -32,14 +32,11 @@ class Unknown(NamedTuple):
     """1 / sd of its prior in that coordinate; 0 without one"""
     is_parameter: bool = True
     """False for gains and time shifts"""
-    per_log: float = 1.0
-    """what turns its relative coordinate into log |value|"""
+    reference: float = 1.0
+    """one unit of its relative coordinate, in its own"""
     symmetric: bool = False
     """whether it may have either sign: its interval is then symmetric about the value, and
     determines nothing where it reaches further than log 10 times its size to either side"""
-    distance: float = 1.0
-    """of zero from the value in its relative coordinate, where it may have either sign; 1 where
-    that coordinate is log |value|"""
     aliased: bool = False
     """whether it moves a mode that the samples do not tell from its aliases"""
     at_bound: bool = False
@@ -47,6 +44,24 @@ class Unknown(NamedTuple):
     room: float = math.inf
     """from the value to the nearer end of a search that no configuration widens, that of a time
     shift, in its relative coordinate"""
+
+    @property
+    def distance(self) -> float:
+        """Of zero from the value in its relative coordinate, where it may have either sign; 1 where
+        that coordinate is log |value|."""
+        return abs(self.value) / self.reference if self.symmetric else 1.0
+
+    @property
+    def per_log(self) -> float:
+        """What turns its relative coordinate into log |value|."""
+        # In units of the reference it becomes that by the reference over the value.
+        return 1.0 / self.distance if self.logarithmic else 1.0
+
+    @property
+    def sign(self) -> float:
+        """-1 where its relative coordinate falls as the value rises: log |value| of a negative
+        value."""
+        return (float(np.sign(self.value)) or 1.0) if self.logarithmic else 1.0
 
 
 class Combination(NamedTuple):
@@ -163,6 +178,11 @@ class Verdict:
     def names(self) -> tuple[str, ...]:
         """Of the unknowns (q,)."""
         return tuple(u.name for u in self.unknowns)
+
+    @property
+    def not_identifiable(self) -> frozenset[str]:
+        """The parameters without a number: undetermined, or without effect."""
+        return frozenset((*self.undetermined, *self.without_effect))
 
     @property
     def resting(self) -> tuple[str, ...]:

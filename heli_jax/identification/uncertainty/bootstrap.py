@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming, stages
 from heli_jax.flights.flight import Flight
@@ -15,7 +15,6 @@ from heli_jax.identification.estimation.frequency_error import ESTIMATOR as FREQ
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
-    Record,
     in_time_of,
     parts_of,
     records_of,
@@ -30,10 +29,12 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, unpack, value_of
 
-# Many records fitted as one call: those of a Monte Carlo study, or repeated runs of a bench.
-
-
 _BATCH = 8
+"""records side by side"""
+_ROUNDS = 3
+"""of residual and spectrum in turn, for an estimate by responses, which has no spectrum of lines"""
+_STEPS = 200
+"""of the optimiser at most, in frequency"""
 
 
 class Refits(NamedTuple):
@@ -69,92 +70,177 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
         ValueError: a record is not like that of the fit, with what differs; a method that estimates
             the noise's spectrum.
     """
-    at = fit.reached
+    at, names = fit.reached, naming.names(fit.reached.layout.model.Inputs)
     if at.layout.estimator.noise_spectrum:
         raise ValueError(f"refit: not available with method {fit.method}")
     if not records:
         raise ValueError("refit: expected one record at least, got none")
-    flights = [_flights(r, f"refit, record {k}") for k, r in enumerate(records)]
-    for k, record in enumerate(flights):
-        _check(at.data, at.layout.holds, record, f"refit, record {k}", at.layout.model)
-    each = tuple(
-        (
-            jax.tree.map(
-                lambda *v: jnp.asarray(np.stack(v), at.z.dtype),
-                *(_inputs(at.layout.model, r[i]) for r in flights),
-            ),
-            {
-                n: jnp.asarray(np.stack([np.asarray(r[i].outputs[n]) for r in flights]), at.z.dtype)
-                for n in flight.outputs
-            },
-        )
-        for i, flight in enumerate(at.data.flights)
+    flights = [_like(at, r, f"refit, record {k}") for k, r in enumerate(records)]
+
+    def stacked(signal: Callable[[Flight], Any], i: int) -> Array:
+        return jnp.asarray(np.stack([np.asarray(signal(r[i])) for r in flights]), at.z.dtype)
+
+    inputs, outputs = [], []
+    for i, flight in enumerate(at.data.flights):
+        each = {n: stacked(lambda f, n=n: f.inputs[n], i) for n in names}
+        inputs.append(at.layout.model.Inputs(**each))
+        outputs.append({n: stacked(lambda f, n=n: f.outputs[n], i) for n in flight.outputs})
+    optima, note = _optima(at, len(flights), tuple(outputs), tuple(inputs))
+    # Of every output as many samples as `fit` asks for; there are none but the fit's outputs.
+    enough = np.array(
+        [
+            all(np.isfinite(y).sum() >= FEWEST_SEEN for f in record for y in f.outputs.values())
+            for record in flights
+        ]
     )
+    converged = np.asarray(optima.converged) & enough
+    values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
+    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan), note)
+
+
+def _optima(
+    at: Solution,
+    count: int,
+    outputs: tuple[dict[str, Array], ...],
+    inputs: tuple[Any, ...] | None = None,
+    prior_means: Array | None = None,
+) -> tuple[Optimum, str]:
+    """Fit `count` records in time, from the optimum; outputs (and inputs, and the means of priors
+    where they are others) have the records as leading axis."""
 
     def data(record: Any) -> Data:
-        changed = tuple(
-            flight._replace(inputs=inputs, outputs=outputs)
-            for flight, (inputs, outputs) in zip(at.data.flights, record, strict=True)
-        )
-        return at.data._replace(flights=changed)
+        by_flight, driven, means = record
+        flights = [f._replace(outputs=y) for f, y in zip(at.data.flights, by_flight, strict=True)]
+        if driven is not None:
+            flights = [f._replace(inputs=u) for f, u in zip(flights, driven, strict=True)]
+        changed = at.data._replace(flights=tuple(flights))
+        return changed if means is None else changed._replace(prior_mean=means)
 
-    starts = jnp.tile(at.z[None, :], (len(flights), 1))
     notes: list[str] = []
+    starts = jnp.tile(at.z[None, :], (count, 1))
+    each = (outputs, inputs, prior_means)
     optima = optimise_many(at, data, starts, each, batch=_BATCH, say=notes.append)
-    enough = np.array([_enough(record) for record in flights])
-    converged = np.asarray(optima.converged) & enough
-    z = jnp.asarray(optima.z)
-    values = {
-        name: np.where(converged, np.asarray(value_of(at.layout, at.data, i, z[:, i])), np.nan)
-        for i, name in enumerate(at.layout.free)
+    return optima, " ".join(notes)
+
+
+def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
+    """By free parameter (records,) at the unknowns (records, q)."""
+    z = jnp.asarray(z)
+    return {
+        n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
+        for i, n in enumerate(at.layout.free)
     }
-    cost = np.where(enough, np.asarray(optima.cost), np.nan)
-    return Refits(values, converged, cost, " ".join(notes))
 
 
-# Any: what a caller gave.
-def _flights(record: Any, where: str) -> list[Flight]:
+def _like(at: Solution, record: Any, where: str) -> list[Flight]:
+    """Return the flights of a record, which have to be like the fit's."""
     flights = [record] if isinstance(record, Flight) else record
     if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
         raise TypeError(f"{where}: expected a Flight or a list of them, got {record!r:.80}")
-    return list(flights)
-
-
-def _enough(record: list[Flight]) -> bool:
-    """Whether of every output as many samples are measured as `fit` asks for."""
-    # Of the fit's outputs alone there are records, see `_check`.
-    return all(
-        np.isfinite(y).sum() >= FEWEST_SEEN for flight in record for y in flight.outputs.values()
-    )
-
-
-def _inputs(model: Any, flight: Flight) -> Any:
-    return model.Inputs(**{n: np.asarray(flight.inputs[n]) for n in naming.names(model.Inputs)})
-
-
-def _check(data: Data, holds: Any, record: list[Flight], where: str, model: Any) -> None:
-    """Refuse a record that is not like the fit's."""
-    if len(record) != len(data.flights):
-        raise ValueError(f"{where}: expected {len(data.flights)} flights, got {len(record)}")
-    for flight, own, hold in zip(record, data.flights, holds, strict=True):
-        names = naming.names(model.Inputs)
-        missing = [n for n in names if n not in flight.inputs]
-        if missing:
+    if len(flights) != len(at.data.flights):
+        raise ValueError(f"{where}: expected {len(at.data.flights)} flights, got {len(flights)}")
+    names = naming.names(at.layout.model.Inputs)
+    for flight, own, hold in zip(flights, at.data.flights, at.layout.holds, strict=True):
+        if missing := [n for n in names if n not in flight.inputs]:
             raise ValueError(f"{where}: expected the input {missing[0]}, got none")
-        samples = next(iter(own.outputs.values())).shape[0]
         expected = {
-            "samples": (samples, flight.n_samples),
+            "samples": (next(iter(own.outputs.values())).shape[0], flight.n_samples),
             "dt": (float(own.dt), float(flight.dt)),
             "outputs": (sorted(own.outputs), sorted(flight.outputs)),
             "hold": (list(hold), [flight.hold[n] for n in names]),
-            "known": (
-                {n: float(v) for n, v in own.known.items()},
-                {n: float(v) for n, v in flight.known.items()},
-            ),
+            "known": tuple({n: float(v) for n, v in f.known.items()} for f in (own, flight)),
         }
         for name, (value, got) in expected.items():
             if value != got:
                 raise ValueError(f"{where}: expected {name} {value} as the fit has, got {got}")
+    return list(flights)
+
+
+class Bootstrap(NamedTuple):
+    """Estimates from simulated records."""
+
+    values: dict[str, np.ndarray]
+    """by free parameter, (runs that converged,)"""
+    failures: int
+    """runs that did not converge"""
+    records: tuple[int, ...] = ()
+    """the numbers of the records that these are of"""
+    note: str = ""
+    """why many records were not fitted by programs of machine code, where they were not"""
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """2.5 and 97.5 % of the values."""
+        low, high = np.percentile(self.values[name], [2.5, 97.5])
+        return float(low), float(high)
+
+
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
+    """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
+
+    Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
+    are autocorrelated, noise with their covariance over time and between outputs. The methods in
+    frequency draw residuals line by line, and estimate the spectrum anew.
+
+    Args:
+        fit: with the estimates, and the optimum that all refits begin from.
+        runs: how many records.
+        seed: of noise and disturbance.
+
+    Raises:
+        ValueError: no run; the time shift is free in a fit in time, or the data do not determine
+            every parameter; in frequency no part of a flight has all outputs.
+    """
+    if runs < 1:
+        raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
+    at = fit.reached
+    in_frequency = at.layout.estimator.noise_spectrum
+    if at.layout.shift and not in_frequency:
+        raise ValueError("bootstrap: not available with a free time shift")
+    if fit.not_identifiable:
+        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
+    rng, note = np.random.default_rng(seed), ""
+    # Priors are measurements too, of another kind: their means are drawn anew as well.
+    values = np.array([fit.estimates[n].value for n in at.layout.free])
+    prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
+    records = () if in_frequency else _records(fit, at, runs, seed, rng)
+    means = values + prior_sd * rng.standard_normal((runs, values.size))
+    if in_frequency:
+        z, converged = _fit_by_lines(at, means, rng)
+    else:
+        optima, note = _optima(at, runs, records, None, jnp.asarray(means, at.z.dtype))
+        z, converged = optima.z, np.asarray(optima.converged)
+    # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
+    # than they are uncertain.
+    fitted = np.flatnonzero(converged)
+    estimates = _values(at, np.asarray(z)[fitted])
+    return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)), note)
+
+
+def _records(
+    fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
+) -> tuple[dict[str, Array], ...]:
+    """By flight and output (runs, N); NaN where the record has it."""
+    u = unpack(at.layout, at.data, at.z)
+    noise_free = at.layout.estimator.records(at, u, runs, seed)
+    records = []
+    each = zip(at.data.flights, at.noise.sd, noise_free, strict=True)
+    for i, (flight, sds, outputs) in enumerate(each):
+        if fit.coloured:
+            residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
+            # All outputs at once: their noises are correlated.
+            coloured = drawn(np.stack(residuals), runs, rng)
+        by_output = {}
+        for n, y in flight.outputs.items():
+            sd = float(sds[n]) * float(u.scales.get(n, 1.0))
+            noise = sd * rng.standard_normal((runs, y.shape[0]))
+            if fit.coloured:
+                noise = coloured[:, at.layout.outputs[i].index(n)]
+            record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
+            # The same gaps: they are part of what the data can tell.
+            record = np.where(np.isnan(np.asarray(y)), np.nan, record)
+            by_output[n] = jnp.asarray(record, at.z.dtype)
+        records.append(by_output)
+    return tuple(records)
 
 
 # Bootstrap of fits in frequency: residuals, drawn line by line, on the estimated response.
@@ -167,32 +253,11 @@ def _check(data: Data, holds: Any, record: list[Flight], where: str, model: Any)
 # Source: Franke and Härdle (1992), On bootstrapping kernel spectral estimates.
 
 
-_ROUNDS = 3
-"""of residual and spectrum in turn, for an estimate by responses, which has no spectrum of lines"""
-_STEPS = 200
-"""of the optimiser at most"""
-
-
-class SpectrumRefits(NamedTuple):
-    """Where fits of records that were drawn ended."""
-
-    z: Float[np.ndarray, "runs q"]
-    converged: Bool[np.ndarray, " runs"]
-
-
-def refits(
+def _fit_by_lines(
     at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator
-) -> SpectrumRefits:
-    """Fit records again that differ in their noise.
-
-    Args:
-        at: where a fit in frequency ended.
-        means: of each record the priors' means of the free parameters.
-        rng: what is drawn from.
-
-    Raises:
-        ValueError: no part of a flight has all outputs.
-    """
+) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
+    """Fit drawn records one by one, each with its means of the priors: unknowns, and whether they
+    converged."""
     z, converged = [], []
     begun = Optimum(
         at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
@@ -201,11 +266,11 @@ def refits(
         search = _FromOptimum(at.layout, data._replace(prior_mean=jnp.asarray(mean, at.z.dtype)))
         # Steps of its search are none of the stage's, which counts records.
         with stages.stage("one record", shown=False):
-            found = relax_noise_covariance(search, at.noise, begun).best
-        z.append(np.asarray(found.z))
-        converged.append(bool(found.converged))
+            best = relax_noise_covariance(search, at.noise, begun).best
+        z.append(np.asarray(best.z))
+        converged.append(bool(best.converged))
         stages.advance()
-    return SpectrumRefits(np.array(z), np.array(converged))
+    return np.array(z), np.array(converged)
 
 
 class _FromOptimum(Search):
@@ -241,35 +306,20 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
         outputs = [{n: y.copy() for n, y in by_name.items()} for by_name in measured]
         for record, e, W in zip(records, errors, noise.whitening, strict=True):
             names = layout.outputs[record.flight]
-            other = freedom * _drawn(pools[names], np.asarray(W), rng) - e
-            _add(outputs[record.flight], names, record, other)
+            pool, K = pools[names], len(e)
+            # Residuals of other lines, with any phase, at the size of each.
+            turned = np.exp(2j * np.pi * rng.random(K))[:, None]
+            drawn_anew = pool[rng.integers(len(pool), size=K)] * turned
+            other = np.linalg.solve(np.asarray(W), drawn_anew[:, :, None])[:, :, 0]
+            columns = in_time_of(freedom * other - e, record.samples).T
+            for name, column in zip(names, columns, strict=True):
+                outputs[record.flight][name][record.first : record.last] += column
         yield at.data._replace(
             flights=tuple(
                 f._replace(outputs={n: jnp.asarray(y, at.z.dtype) for n, y in by_name.items()})
                 for f, by_name in zip(at.data.flights, outputs, strict=True)
             )
         )
-
-
-def _drawn(
-    pool: Complex[np.ndarray, "n p"], W: Complex[np.ndarray, "K p p"], rng: np.random.Generator
-) -> Complex[np.ndarray, "K p"]:
-    """Residuals of other lines at the size of each."""
-    K = len(W)
-    turned = np.exp(2j * np.pi * rng.random(K))[:, None]
-    white = pool[rng.integers(len(pool), size=K)] * turned
-    return np.linalg.solve(W, white[:, :, None])[:, :, 0]
-
-
-def _add(
-    outputs: dict[str, Float[np.ndarray, " N"]],
-    names: tuple[str, ...],
-    record: Record,
-    lines: Complex[np.ndarray, "K p"],
-) -> None:
-    """What is at the lines to the samples of a record."""
-    for name, column in zip(names, in_time_of(lines, record.samples).T, strict=True):
-        outputs[name][record.first : record.last] += column
 
 
 def _in_lines(at: Solution) -> tuple[Layout, Noise]:
@@ -294,113 +344,3 @@ def _in_lines(at: Solution) -> tuple[Layout, Noise]:
     for _ in range(_ROUNDS):
         _, noise = FREQUENCY_ERROR.relax(layout, data, None, noise, z)
     return layout, noise
-
-
-class Bootstrap(NamedTuple):
-    """Estimates from simulated records."""
-
-    values: dict[str, np.ndarray]
-    """by free parameter, (runs that converged,)"""
-    failures: int
-    """runs that did not converge"""
-    records: tuple[int, ...] = ()
-    """the numbers of the records that these are of"""
-    note: str = ""
-    """why many records were not fitted by programs of machine code, where they were not"""
-
-    def interval(self, name: str) -> tuple[float, float]:
-        """2.5 and 97.5 % of the values."""
-        low, high = np.percentile(self.values[name], [2.5, 97.5])
-        return float(low), float(high)
-
-
-def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
-    """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
-
-    Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs. The methods in
-    frequency draw from the whitened residual's lines (`spectrum_bootstrap`).
-
-    Args:
-        fit: with the estimates, and the optimum that all refits begin from.
-        runs: how many records.
-        seed: of noise and disturbance.
-
-    Raises:
-        ValueError: no run; the time shift is free in a fit in time, or the data do not determine
-            every parameter.
-    """
-    if runs < 1:
-        raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
-    at = fit.reached
-    in_frequency = at.layout.estimator.noise_spectrum
-    if at.layout.shift and not in_frequency:
-        raise ValueError("bootstrap: not available with a free time shift")
-    if fit.not_identifiable:
-        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
-    rng = np.random.default_rng(seed)
-    notes: list[str] = []
-    if in_frequency:
-        optima = refits(at, _prior_means(fit, at, runs, rng), rng)
-    else:
-        outputs = _records(fit, at, runs, seed, rng)
-        # Every refit from the optimum, which is where the record was simulated.
-        starts = jnp.tile(at.z[None, :], (runs, 1))
-        each = (outputs, jnp.asarray(_prior_means(fit, at, runs, rng), at.z.dtype))
-        optima = optimise_many(at, _data_of(at), starts, each, batch=_BATCH, say=notes.append)
-    converged = np.asarray(optima.converged)
-    # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
-    # than they are uncertain.
-    estimates = {
-        name: np.asarray(value_of(at.layout, at.data, i, jnp.asarray(optima.z[converged, i])))
-        for i, name in enumerate(at.layout.free)
-    }
-    fitted = tuple(int(i) for i in np.flatnonzero(converged))
-    return Bootstrap(estimates, runs - len(fitted), fitted, " ".join(notes))
-
-
-def _prior_means(fit: Fit, at: Solution, runs: int, rng: np.random.Generator) -> np.ndarray:
-    """(runs, p) means of priors, drawn anew as well: they are measurements too, of another kind."""
-    values = np.array([fit.estimates[n].value for n in at.layout.free])
-    prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
-    return values + prior_sd * rng.standard_normal((runs, values.size))
-
-
-def _data_of(at: Solution) -> Callable[[tuple[tuple[dict[str, Array], ...], Array]], Data]:
-    """The numbers of the problem with a record and the means of priors that were drawn for it."""
-
-    def data(record: tuple[tuple[dict[str, Array], ...], Array]) -> Data:
-        flights = tuple(
-            flight._replace(outputs=outputs)
-            for flight, outputs in zip(at.data.flights, record[0], strict=True)
-        )
-        return at.data._replace(flights=flights, prior_mean=record[1])
-
-    return data
-
-
-def _records(
-    fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], ...]:
-    """By flight and output (runs, N); NaN where the record has it."""
-    u = unpack(at.layout, at.data, at.z)
-    noise_free = at.layout.estimator.records(at, u, runs, seed)
-    records = []
-    each = zip(at.data.flights, at.noise.sd, noise_free, strict=True)
-    for i, (flight, sds, outputs) in enumerate(each):
-        if fit.coloured:
-            residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
-            # All outputs at once: their noises are correlated.
-            coloured = drawn(np.stack(residuals), runs, rng)
-        by_output = {}
-        for n, y in flight.outputs.items():
-            sd = float(sds[n]) * float(u.scales.get(n, 1.0))
-            noise = sd * rng.standard_normal((runs, y.shape[0]))
-            if fit.coloured:
-                noise = coloured[:, at.layout.outputs[i].index(n)]
-            record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
-            # The same gaps: they are part of what the data can tell.
-            record = np.where(np.isnan(np.asarray(y)), np.nan, record)
-            by_output[n] = jnp.asarray(record, at.z.dtype)
-        records.append(by_output)
-    return tuple(records)

@@ -88,20 +88,9 @@ def intervals(
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):
             posterior = nuts(fit, draws, seed=seed)
-    by_parameter = _by_parameter(fit, profiled, booted, posterior)
-    sentences += _sentences(fit, by_parameter, booted, posterior)
-    return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))
-
-
-def _by_parameter(
-    fit: Fit,
-    profiled: dict[str, Profile],
-    booted: Bootstrap | None,
-    posterior: Posterior | None,
-) -> dict[str, dict[str, tuple[float, float]]]:
-    """As `Intervals` has them; nothing of a parameter that is not identifiable."""
     by_parameter: dict[str, dict[str, tuple[float, float]]] = {}
     for name, estimate in fit.estimates.items():
+        # Nothing of a parameter that is not identifiable.
         if estimate.lower95 is None or estimate.upper95 is None:
             continue
         by_parameter[name] = {"gaussian": (estimate.lower95, estimate.upper95)}
@@ -112,7 +101,8 @@ def _by_parameter(
             by_parameter[name]["bootstrap"] = booted.interval(name)
         if posterior is not None:
             by_parameter[name]["nuts"] = posterior.interval(name)
-    return by_parameter
+    sentences += _sentences(fit, by_parameter, booted, posterior)
+    return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))
 
 
 def apart(first: tuple[float, float], second: tuple[float, float]) -> float:
@@ -157,20 +147,19 @@ def _sentences(
             f"expected below {RHAT}, above {EFFECTIVE} and none, got {posterior.rhat:.3f}, "
             f"{posterior.effective:.0f} and {posterior.divergent}): take more draws."
         )
-    for name, by in by_parameter.items():
-        others = {m: i for m, i in by.items() if m != "gaussian"}
-        far = [m for m, i in others.items() if apart(by["gaussian"], i) > _limit(m, name, booted)]
-        # With coloured residuals they differ for the reason that was given above.
-        if far and not fit.coloured:
+    # With coloured residuals they differ for the reason that was given above.
+    for name, by in () if fit.coloured else by_parameter.items():
+        others = {method: ends for method, ends in by.items() if method != "gaussian"}
+        far = []
+        for method, ends in others.items():
+            limit = DIFFERENT
+            if method == "bootstrap" and booted is not None:
+                limit = max(limit, _OF_QUANTILES / booted.values[name].size ** 0.5)
+            if apart(by["gaussian"], ends) > limit:
+                far.append(method)
+        if far:
             sentences.append(f"{name}: {_which(far, others, booted, posterior)}")
     return sentences
-
-
-def _limit(method: str, name: str, booted: Bootstrap | None) -> float:
-    """By which part of its width an interval may differ from the Gaussian one."""
-    if method != "bootstrap" or booted is None:
-        return DIFFERENT
-    return max(DIFFERENT, _OF_QUANTILES / booted.values[name].size ** 0.5)
 
 
 def _which(
@@ -185,36 +174,35 @@ def _which(
         far: the methods that differ.
         others: intervals of all methods but the Gaussian one.
     """
-    names = " and ".join(far)
     verb = "differ" if len(far) > 1 else "differs"
     by = f"by more than {percent(DIFFERENT, 0)} of its width"
-    text = f"{names} {verb} from the Gaussian interval {by}. "
+    text = f"{' and '.join(far)} {verb} from the Gaussian interval {by}. "
     profiled = others.get("profile")
     if profiled is not None and not np.isfinite(profiled).all():
-        return text + (
+        why = (
             "It is practically not identifiable: within nine standard deviations the likelihood "
             "bounds it to one side at most, and no interval says more."
         )
     # All against the Gaussian one: it is the parabola that is wrong, not one of their assumptions.
-    if len(far) == len(others):
-        best = "profile" if profiled is not None else far[0]
-        return text + (
+    elif len(far) == len(others):
+        why = (
             "The log-likelihood is not quadratic here (few samples, strong correlation or a "
-            f"bound): believe the {best}."
+            f"bound): believe the {'profile' if profiled is not None else far[0]}."
         )
-    if far == ["bootstrap"]:
-        return text + (
+    elif far == ["bootstrap"] and booted is not None and booted.failures:
+        why = "Records that could not be fitted are missing from it: believe the others."
+    elif far == ["bootstrap"]:
+        why = (
             "The estimate scatters differently from what the curvature says (few samples, or a "
             "bias of the method): believe the bootstrap."
-            if booted is not None and not booted.failures
-            else "Records that could not be fitted are missing from it: believe the others."
         )
-    if far == ["nuts"]:
-        fine = posterior is not None and posterior.trusted
-        return text + (
+    elif far == ["nuts"] and not (posterior is not None and posterior.trusted):
+        why = "Its chains have not settled: believe the others."
+    elif far == ["nuts"]:
+        why = (
             "The prior, flat in the logarithm, or the noise's own uncertainty is felt: NUTS is "
             "right if that prior is meant."
-            if fine
-            else "Its chains have not settled: believe the others."
         )
-    return text + "Believe the profile, which follows the likelihood itself."
+    else:
+        why = "Believe the profile, which follows the likelihood itself."
+    return text + why

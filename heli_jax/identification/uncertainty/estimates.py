@@ -13,7 +13,7 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import combined_deviations, deviations, evaluate
 from heli_jax.identification.estimation.filter_error import innovation_sums
 from heli_jax.identification.estimation.simulated_flights import measured_count
-from heli_jax.identification.identifiability.sensitivity import references_of, unknowns_of
+from heli_jax.identification.identifiability.sensitivity import unknowns_of
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
@@ -95,7 +95,6 @@ def estimates_of(
         wider: (q,) by which the standard deviations of white residuals are multiplied.
     """
     unknowns = unknowns_of(problem, layout, e)
-    references = references_of(problem, unknowns)
     insensitivity = _insensitivity(e)
     estimates = {}
     for i, u in enumerate(unknowns):
@@ -103,14 +102,14 @@ def estimates_of(
         # Relative to its reference: the size of the value, or a sample for the time shift.
         white = float(np.sqrt(verdict.covariance[i, i]))
         relative = white * float(wider[i])
-        sd, low, high = _interval95(u, relative, references[i], float(quantiles[i]))
+        sd, low, high = _interval95(u, relative, float(quantiles[i]))
         if free is not None and u.name in problem.model.delay_parameters:
             # Symmetric, as that of what may be zero; what it was not searched for it cannot be.
             low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
         if u.at_bound and free is not None:
             low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
         low, high = _searched(u.name, (low, high))
-        not_identifiable = u.name in verdict.undetermined or u.name in verdict.without_effect
+        not_identifiable = u.name in verdict.not_identifiable
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
         estimates[u.name] = Estimate(
             value=u.value,
@@ -121,8 +120,8 @@ def estimates_of(
             start=start,
             prior_share=verdict.prior_share[u.name],
             at_bound=u.at_bound,
-            sd_white=None if not_identifiable else float(white * references[i]),
-            sd_alone=None if not_identifiable else float(white * references[i] * insensitivity[i]),
+            sd_white=None if not_identifiable else float(white * u.reference),
+            sd_alone=None if not_identifiable else float(white * u.reference * insensitivity[i]),
         )
     return estimates
 
@@ -164,10 +163,8 @@ def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
     return np.minimum(1.0, np.divide(1.0, product, where=known, out=np.ones_like(norms)))
 
 
-def _interval95(
-    u: Unknown, relative: float, reference: float, quantile: float
-) -> tuple[float, float, float]:
-    sd = float(relative * reference)
+def _interval95(u: Unknown, relative: float, quantile: float) -> tuple[float, float, float]:
+    sd = float(relative * u.reference)
     # Symmetric in the coordinate of the search: in the parameter of one sign, by equal factors.
     if u.symmetric or not u.logarithmic:
         return sd, u.value - quantile * sd, u.value + quantile * sd

@@ -1,7 +1,7 @@
 """How sure the numbers at an optimum are: Cramér-Rao's bound, or wider."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.identifiability.analysis import Around
+from heli_jax.identification.identifiability.analysis import Around, with_combinations
 from heli_jax.identification.identifiability.equivalents import Valley
 from heli_jax.identification.identifiability.profile import (
     AS_SLOPES,
@@ -20,13 +20,8 @@ from heli_jax.identification.identifiability.profile import (
 )
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.through_inputs import (
-    MOSTLY,
-    by_inputs_alone,
-    deviations_of,
-    mostly_by_disturbance,
-    not_by_inputs,
-    not_counted,
-    resting_on_disturbance,
+    by_disturbance,
+    remarks,
     through_inputs,
 )
 from heli_jax.identification.identifiability.verdict import (
@@ -89,18 +84,20 @@ def standard_errors(
         optimum: whether the point is one, about which the likelihood may be asked.
     """
     around = Around(frozenset(aliased), second, Valley(problem, at, e))
+
+    def slopes(e: Evaluation, around: Around) -> StandardErrors:
+        return _by_slopes(problem, at, e, before, around, white=white)
+
+    errors = slopes(e, around)
     inputs = through_inputs(at, e) if optimum else None
     if inputs is not None:
-        return _with_process_noise(problem, at, e, inputs, around, white=white)
-    errors = _by_slopes(problem, at, e, before, around, white=white)
+        return _with_process_noise(problem, at, e, inputs, errors, around, slopes, white=white)
     if not optimum:
         return errors
     beyond = beyond_slopes(problem, at, e, errors.verdict, errors.wider * errors.quantiles)
-    if beyond is AS_SLOPES:
-        return errors
-    around = around._replace(**beyond._asdict())
-    errors = _by_slopes(problem, at, e, before, around, white=white)
-    return errors._replace(limits=beyond.limits)
+    if beyond is not AS_SLOPES:
+        errors = slopes(e, around._replace(**beyond._asdict()))._replace(limits=beyond.limits)
+    return errors
 
 
 def _with_process_noise(
@@ -108,7 +105,9 @@ def _with_process_noise(
     at: Solution,
     e: Evaluation,
     inputs: Evaluation,
+    errors: StandardErrors,
     around: Around,
+    slopes: Callable[[Evaluation, Around], StandardErrors],
     *,
     white: bool,
 ) -> StandardErrors:
@@ -120,52 +119,42 @@ def _with_process_noise(
         at: the optimum.
         e: what it tells.
         inputs: what inputs and initial states tell there, of `through_inputs`.
+        errors: by the slopes of all that the innovations tell.
         around: what is known of points other than the optimum.
+        slopes: makes the errors by the slopes.
         white: whether the innovations are white.
     """
-    layout = at.layout
     # Neither names combinations, which take time to look for.
-    slopes = around._replace(combined=False)
-    by_all = verdict_of(problem, layout, e, around=slopes)
-    by_inputs = verdict_of(problem, layout, inputs, around=slopes)
-    resting, mostly = not_by_inputs(by_all, by_inputs), mostly_by_disturbance(by_all, by_inputs)
+    by_all, by_inputs = (
+        verdict_of(problem, at.layout, told, around=around._replace(combined=False))
+        for told in (e, inputs)
+    )
+    told = by_disturbance(by_all, by_inputs)
     # Of several outputs one that is pushed moves the others, which is an answer to a motion that
     # was measured. Of one the disturbance has its spectrum alone, as far as its model is right:
     # that adds to what the inputs tell, and does not speak in their place.
-    spectrum_alone = all(len(outputs) == 1 for outputs in layout.outputs)
-    counts = white and not (spectrum_alone and (resting or mostly))
-    errors = _by_slopes(problem, at, e, by_all, around, white=white)
-    asked = errors.verdict
+    spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
+    counts = white and not (spectrum_alone and (told.resting or told.mostly))
+    asked, names = errors.verdict, told.resting
     if not counts:
         lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
         asked = replace(asked, undetermined=tuple(lacking))
     beyond = beyond_slopes(problem, at, e, asked, errors.wider * errors.quantiles)
-    if counts:
-        if beyond is not AS_SLOPES:
-            around = around._replace(**beyond._asdict())
-            errors = _by_slopes(problem, at, e, by_all, around, white=True)
-        said = [resting_on_disturbance(resting)] if resting else []
-        return _saying(said, errors)._replace(limits=beyond.limits)
-    # The likelihood has the colour in it: its ends are those of parameters that rest on responses.
-    wider = deviations_of(by_inputs) > MOSTLY * deviations_of(by_all)
-    limits = {n: v for n, v in beyond.limits.items() if not wider[by_all.names.index(n)]}
-    around = around._replace(**beyond._replace(limits=limits)._asdict())
-    said = []
-    if resting or len(by_inputs.null_directions) > len(by_all.null_directions):
-        # The colour has put the optimum where it is along directions that no input shows: slopes
-        # there name combinations that do not hold where the machine is.
-        around = around._replace(combined=False)
-        said = [not_counted(resting or by_inputs.undetermined, white=white)]
-    if white and mostly:
-        said.append(by_inputs_alone(mostly))
-    errors = _by_slopes(problem, at, inputs, by_all, around, white=white)
-    return _saying(said, errors)._replace(limits=limits, by=inputs)
-
-
-def _saying(sentences: list[str], errors: StandardErrors) -> StandardErrors:
-    """With further sentences at the end of the verdict."""
-    verdict = replace(errors.verdict, sentences=(*errors.verdict.sentences, *sentences))
-    return errors._replace(verdict=verdict)
+    if not counts:
+        # The likelihood has the colour in it: its ends are those of parameters that rest on
+        # responses.
+        limits = {n: ends for n, ends in beyond.limits.items() if n not in told.wider}
+        beyond = beyond._replace(limits=limits)
+        if names or len(by_inputs.null_directions) > len(by_all.null_directions):
+            # The colour has put the optimum where it is along directions that no input shows:
+            # slopes there name combinations that do not hold where the machine is.
+            around = around._replace(combined=False)
+            names = names or by_inputs.undetermined
+    if not (counts and beyond is AS_SLOPES):
+        errors = slopes(e if counts else inputs, around._replace(**beyond._asdict()))
+    said = (*errors.verdict.sentences, *remarks(told, names, counts=counts, white=white))
+    verdict = replace(errors.verdict, sentences=said)
+    return errors._replace(verdict=verdict, limits=beyond.limits, by=None if counts else inputs)
 
 
 def _by_slopes(
@@ -178,16 +167,7 @@ def _by_slopes(
     white: bool,
 ) -> StandardErrors:
     """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
-    estimated, the sandwich.
-
-    Args:
-        problem: what was fitted.
-        at: the optimum.
-        e: what it tells.
-        before: the verdict at the first guess, which stands where the optimum has no Jacobian.
-        around: what is known of points other than the optimum.
-        white: whether the residuals are white and independent between outputs.
-    """
+    estimated, the sandwich; the arguments are those of `standard_errors`."""
     layout, estimator = at.layout, at.layout.estimator
     usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
@@ -204,58 +184,26 @@ def _by_slopes(
     errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)
-    # The rule of the factor of ten has to see the intervals that are reported.
-    reported = _reported(errors, layout, quantiles)
+    # The rule of the factor of ten has to see the intervals that are reported, of which a verdict
+    # takes 1.96 standard deviations.
+    k = len(layout.of_interest)
+    factor = quantiles[:k] / Z95
+    reported = errors.covariance(np.eye(layout.size)[:k]) * np.outer(factor, factor)
     verdict = verdict_of(problem, layout, e, reported, around)
-    verdict = _widened(verdict, errors, _along(verdict, layout, e))
-    wide = frozenset(c.name for c in verdict.combinations if not c.is_bounded)
-    if wide:
-        around = around._replace(open_combinations=wide)
-        verdict = verdict_of(problem, layout, e, reported, around)
-        verdict = _widened(verdict, errors, _along(verdict, layout, e))
+    verdict = with_combinations(verdict, lambda c: _widened(c, errors, layout, e))
     return StandardErrors(verdict, errors.inflation(), quantiles, True)
 
 
-def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
-    """The verdict's combinations, of products the logarithms, as directions (k, q) of the
-    unknowns."""
+def _widened(c: Combination, errors: Sandwich, layout: Layout, e: Evaluation) -> Combination:
+    """The combination with an interval that allows for autocorrelated residuals."""
     # d log p / dz: products of powers are sums in logarithms, and z is either the logarithm itself
     # or, with bounds or a free sign, another coordinate.
-    along = np.zeros((len(verdict.combinations), layout.size))
-    for k, c in enumerate(verdict.combinations):
-        for name, power in c.exponents.items():
-            i = layout.of_interest.index(name)
-            along[k, i] = power * e.slopes[i] / (e.named[i] if c.kind == "product" else 1.0)
-    return along
-
-
-def _reported(
-    errors: Sandwich, layout: Layout, quantiles: Float[np.ndarray, " q"]
-) -> Float[np.ndarray, "k k"]:
-    """Covariance of the unknowns of interest with autocorrelated residuals, as wide as the
-    intervals that are reported."""
-    of_interest = np.eye(layout.size)[: len(layout.of_interest)]
-    # Whoever reads it takes 1.96 standard deviations for an interval.
-    factor = quantiles[: len(layout.of_interest)] / Z95
-    return errors.covariance(of_interest) * np.outer(factor, factor)
-
-
-def _widened(verdict: Verdict, errors: Sandwich, along: np.ndarray) -> Verdict:
-    """The verdict with intervals of its combinations, directions (k, q), that allow for
-    autocorrelated residuals."""
-    if not verdict.combinations:
-        return verdict
-    wider = errors.inflation(along)
-    reach = wider * errors.quantile(along) / Z95
-    combinations = tuple(
-        _wider(c, float(w), float(r))
-        for c, w, r in zip(verdict.combinations, wider, reach, strict=True)
-    )
-    return replace(verdict, combinations=combinations)
-
-
-def _wider(c: Combination, sd: float, reach: float) -> Combination:
-    """A combination with its sd and the reach of its interval multiplied."""
+    along = np.zeros((1, layout.size))
+    for name, weight in c.exponents.items():
+        i = layout.of_interest.index(name)
+        along[0, i] = weight * e.slopes[i] / (e.named[i] if c.kind == "product" else 1.0)
+    wider = float(errors.inflation(along)[0])
+    reach = wider * float(errors.quantile(along)[0]) / Z95
 
     def end(at: float) -> float:
         # The ends of an interval of a product lie at equal factors, not distances.
@@ -267,4 +215,4 @@ def _wider(c: Combination, sd: float, reach: float) -> Combination:
             return math.exp(log) if log < _LARGEST else math.inf
         return c.value + (at - c.value) * reach
 
-    return c._replace(sd=c.sd * sd, lower95=end(c.lower95), upper95=end(c.upper95))
+    return c._replace(sd=c.sd * wider, lower95=end(c.lower95), upper95=end(c.upper95))
