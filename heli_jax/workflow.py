@@ -21,11 +21,13 @@ from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import FirstGuess, check, findings, first_guess, fit, rates
+from heli_jax.identification.estimation.multistart import FirstGuess
+from heli_jax.identification.fit import check, findings, fit, rates
 from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose, with_likelier_hold
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
+from heli_jax.identification.search import first_guess
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
 from heli_jax.report import files

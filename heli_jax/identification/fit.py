@@ -5,43 +5,18 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import UNIT_IN_DOUBT, Finding, note
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
-from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.disturbance_search import (
-    disturbance_or_none,
-    likely_gusts,
-    those_that_show,
-)
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.disturbance_search import likely_gusts
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import FirstGuess, StartRow, first_optima
-from heli_jax.identification.estimation.noise_covariance import (
-    RelaxedOptimum,
-    better_of_two_guesses,
-    first_noise,
-    relax_noise_covariance,
-)
-from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
-from heli_jax.identification.further_starts import SAID as SAID_FURTHER
-from heli_jax.identification.further_starts import (
-    SAID_STABLE,
-    better_of_same_responses,
-    better_of_stable,
-    explains_little,
-    further_starts,
-    left_stability,
-)
+from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
+from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.sentences import listed
@@ -49,15 +24,9 @@ from heli_jax.identification.identifiability.through_inputs import of_disturbanc
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status, concluded
-from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import (
-    Data,
-    Layout,
-    Noise,
-    Solution,
-    layout_of,
-    scales_of,
-)
+from heli_jax.identification.search import first_guess, search
+from heli_jax.identification.unknowns.initial_guess import labels
+from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.aliases import excitation_notes
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
@@ -93,47 +62,6 @@ __all__ = [
     "rates",
     "windows",
 ]
-
-_FIRST_STEPS = 40
-"""of filter error, until it is known that there is a disturbance to find"""
-
-
-def first_guess(problem: Problem) -> FirstGuess:
-    """The problem at its start values, with a first guess of the noise.
-
-    Args:
-        problem: model, vehicle, flights and what is free.
-    """
-    # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
-    # with both can a coarse search compare starts.
-    layout = layout_of(problem, problem.training)
-    data = data_of(problem, problem.training, layout)
-    noise = first_noise(problem, problem.training)
-    begun = layout.estimator.begins_with(data)
-    z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
-    e = evaluate(layout, data, noise, z)
-    level = layout.estimator.with_level(data, e, noise)
-    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
-        z, e = _in_free_motion(layout, data, noise, z, e)
-    # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
-    if level is not noise:
-        noise = level
-        e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e, begun)
-
-
-def _in_free_motion(
-    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
-) -> tuple[Array, Evaluation]:
-    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
-    from rest at zero no parameter would have any effect."""
-    own = slice(layout.first_nuisance, layout.size)
-    if not (layout.initial_state and np.isfinite(e.J).all()):
-        return z, e
-    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
-    moved = z.at[own].add(step)
-    after = evaluate(layout, data, noise, moved)
-    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -295,13 +223,13 @@ def fit(
     # A model that is unstable where the search passes overflows, in time as in its powers; that is
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
-        search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
+        found = search(problem, guess, starts, seed, max_steps, report)
     about_record = (*cautions(problem), *record_doubts(problem))
-    optimum = optimum._replace(notes=(*about_record, *optimum.notes))
+    optimum = found.optimum._replace(notes=(*about_record, *found.optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        run = OptimizationRun(before, points, optima, seed, timing)
-        estimate = assemble(problem, search, optimum, run)
+        run = OptimizationRun(before, found.points, found.optima, seed, timing)
+        estimate = assemble(problem, found.search, optimum, run)
         return concluded(_with_doubtful_signals(problem, guess, estimate))
 
 
@@ -326,63 +254,6 @@ def _with_doubtful_signals(problem: Problem, guess: FirstGuess, estimate: Fit) -
                 f = f._replace(distrusts=tuple(estimate.estimates))
         findings.append(f)
     return dataclasses.replace(estimate, findings=tuple(findings))
-
-
-def _search(
-    problem: Problem,
-    guess: FirstGuess,
-    starts: int | None,
-    seed: int,
-    max_steps: int,
-    report: starting.Progress,
-) -> tuple[starting.Search, Float[Array, "s q"], list[Optimum], RelaxedOptimum]:
-    """The search with its layout and data, its starts, an optimum for each, and where it ended.
-
-    Where these explain little others are gone to, unless a number of starts is asked for.
-    """
-    layout, data, noise = guess.layout, guess.data, guess.noise
-
-    def begin(quick: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
-        if starts is None:
-            return delay_starts(problem, layout, guess.begun, quick, guess.z, known)
-        return draw(layout, problem, guess.z, starts, seed)
-
-    disturbed = bool(layout.sigmas)
-    # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
-    # and goes on only where there is one.
-    search = starting.Search(
-        problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
-    )
-    first, quick, points, optima = first_optima(search, guess, begin, report)
-    best, notes = min(optima, key=starting.rank), ()
-    # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
-    shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
-    if shooting is not None:
-        best, notes = shooting, (BY_WINDOWS,)
-    if starts is None and explains_little(first, quick, best):
-        report(SAID_FURTHER)
-        more = further_starts(layout, problem, guess.z, seed)
-        optima += first.run(quick, more, report, nearing=layout.estimator.nearing)
-        points = jnp.concatenate([points, more])
-        better = min(optima, key=starting.rank)
-        if starting.rank(better) < starting.rank(best):
-            best, notes = better, ()
-    optimum = relax_noise_covariance(search, quick, best)
-    optimum = optimum._replace(notes=(*notes, *optimum.notes))
-    # Relaxation ends where its first weights of the outputs lead: tried from others too.
-    optimum = better_of_two_guesses(search, points, optimum, problem.training)
-    search.max_steps = max_steps
-    # A search that began with a part of the data has not tried where all of them lead.
-    again = [] if quick is noise else [points]
-    if (starts is None or again) and left_stability(problem, search, optimum):
-        report(SAID_STABLE)
-        again += [further_starts(layout, problem, guess.z, seed)] if starts is None else []
-        optimum = better_of_stable(problem, search, noise, jnp.concatenate(again), optimum)
-    if disturbed:
-        several = len(disturbances_of(problem.model)) > 1
-        which = those_that_show if several else disturbance_or_none
-        optimum = better_of_same_responses(problem, search, which(search, optimum))
-    return search, points, optima, optimum
 
 
 def cautions(problem: Problem) -> tuple[Finding, ...]:
