@@ -126,7 +126,7 @@ def test_imports_point_one_way(name):
 ROOMS = (
     "methods", "free", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "validation", "equation_error", "result", "uncertainty",
-    "agreement", "fit_notes", "assemble", "further_starts", "search", "fit",
+    "agreement", "fit_notes", "assemble", "restarts", "search", "fit",
     "frequency_start", "method_comparison", "model_selection",
 )  # fmt: skip
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding, weighed
@@ -21,8 +20,8 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
-from heli_jax.identification.estimation.multistart import Search, table
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.estimation.multistart import Search, StartRow
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum, unless_stuck
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes, open_directions
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
@@ -356,10 +355,8 @@ class OptimizationRun(NamedTuple):
 
     before: Verdict
     """what the flights can determine, at the first guess"""
-    points: Float[Array, "starts q"]
-    """in the optimiser's coordinates"""
-    optima: list[Optimum]
-    """one for each start"""
+    runs: tuple[StartRow, ...]
+    """every run from a start"""
     seed: int
     timing: dict[str, float]
     """[s], by what was done"""
@@ -523,7 +520,7 @@ def assemble(
         adequacy=judged.adequacy,
         coloured=errors.coloured,
         responses=judged.responses,
-        starts=table(layout, search.data, run.points, run.optima),
+        starts=run.runs,
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
         # Of several outputs and flights the same is said once.

@@ -193,11 +193,9 @@ def fit(
     Args:
         problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
-            within the bounds, or about a factor of three around the start. None: one, or where a
-            delay is free the deepest valleys of the misfit over the delay, three at most; of a
-            linear model by output error six others are tried where the best of these explains less
-            than half of the outputs, and by frequency error where a stable model became unstable:
-            what equation error makes of the record, and five that are drawn.
+            within the bounds, or about a factor of three around the start. None: one, where a
+            delay is free in the deepest valley of the misfit over the delay; others only as
+            `restarts.RESTARTS` has them.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -228,7 +226,7 @@ def fit(
     optimum = found.optimum._replace(notes=(*about_record, *found.optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        run = OptimizationRun(before, found.points, found.optima, seed, timing)
+        run = OptimizationRun(before, found.runs, seed, timing)
         estimate = assemble(problem, found.search, optimum, run)
         return concluded(_with_doubtful_signals(problem, guess, estimate))
 

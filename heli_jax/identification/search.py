@@ -2,38 +2,34 @@
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.identification.estimation import multistart as starting
+from heli_jax.finding import note
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.disturbance_search import (
-    disturbance_or_none,
-    those_that_show,
-)
+from heli_jax.identification.estimation.disturbance_search import significant_disturbances
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import FirstGuess, first_optima
+from heli_jax.identification.estimation.multistart import (
+    FirstGuess,
+    Progress,
+    Run,
+    Search,
+    StartRow,
+    first_optima,
+    named_values,
+    rank,
+    table,
+)
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
-    better_of_two_guesses,
     first_noise,
+    log_likelihood_of,
     relax_noise_covariance,
 )
-from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
-from heli_jax.identification.further_starts import SAID as SAID_FURTHER
-from heli_jax.identification.further_starts import (
-    SAID_STABLE,
-    better_of_same_responses,
-    better_of_stable,
-    explains_little,
-    further_starts,
-    left_stability,
-)
+from heli_jax.identification.estimation.starts import coarse_guess, delay_start, draw
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
 
@@ -53,7 +49,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
     begun = layout.estimator.begins_with(data)
-    z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
+    z = coarse_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
@@ -82,13 +78,11 @@ def _in_free_motion(
 class SearchResult(NamedTuple):
     """Where a search ended and how it came there."""
 
-    search: starting.Search
+    search: Search
     """with its layout and data"""
-    points: Float[Array, "s q"]
-    """the starts"""
-    optima: list[Optimum]
-    """one for each start"""
     optimum: RelaxedOptimum
+    runs: tuple[StartRow, ...]
+    """every run from a start, the chosen one first"""
 
 
 def search(
@@ -97,11 +91,9 @@ def search(
     starts: int | None,
     seed: int,
     max_steps: int,
-    report: starting.Progress,
+    report: Progress,
 ) -> SearchResult:
-    """Search for the optimum of a problem from its first guess.
-
-    Where the starts explain little others are gone to, unless a number of starts is asked for.
+    """Search for the optimum of a problem from its first guess, then by each restart that applies.
 
     Args:
         problem: what is fitted.
@@ -111,46 +103,86 @@ def search(
         max_steps: of the optimiser, in each of its runs.
         report: called with a line of text before each longer part of the work.
     """
-    layout, data, noise = guess.layout, guess.data, guess.noise
+    layout, data = guess.layout, guess.data
 
-    def begin(quick: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
+    def points(noise: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
         if starts is None:
-            return delay_starts(problem, layout, guess.begun, quick, guess.z, known)
+            return delay_start(problem, layout, guess.begun, noise, guess.z, known)[None]
         return draw(layout, problem, guess.z, starts, seed)
 
-    disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
-    over = starting.Search(
-        problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
-    )
-    first, quick, points, optima = first_optima(over, guess, begin, report)
-    best, notes = min(optima, key=starting.rank), ()
-    # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
-    shooting = by_windows(problem, over, noise, guess.e, guess.z, best)
-    if shooting is not None:
-        best, notes = shooting, (BY_WINDOWS,)
-    if starts is None and explains_little(first, quick, best):
-        report(SAID_FURTHER)
-        more = further_starts(layout, problem, guess.z, seed)
-        optima += first.run(quick, more, report, nearing=layout.estimator.nearing)
-        points = jnp.concatenate([points, more])
-        better = min(optima, key=starting.rank)
-        if starting.rank(better) < starting.rank(best):
-            best, notes = better, ()
-    optimum = relax_noise_covariance(over, quick, best)
-    optimum = optimum._replace(notes=(*notes, *optimum.notes))
-    # Relaxation ends where its first weights of the outputs lead: tried from others too.
-    optimum = better_of_two_guesses(over, points, optimum, problem.training)
+    first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
+    over = Search(problem, layout, data, first_steps)
+    first = first_optima(over, guess, points, report)
+    best = relax_noise_covariance(over, first.noise, min(first.optima, key=rank))
     over.max_steps = max_steps
-    # A search that began with a part of the data has not tried where all of them lead.
-    again = [] if quick is noise else [points]
-    if (starts is None or again) and left_stability(problem, over, optimum):
-        report(SAID_STABLE)
-        again += [further_starts(layout, problem, guess.z, seed)] if starts is None else []
-        optimum = better_of_stable(problem, over, noise, jnp.concatenate(again), optimum)
-    if disturbed:
-        several = len(disturbances_of(problem.model)) > 1
-        which = those_that_show if several else disturbance_or_none
-        optimum = better_of_same_responses(problem, over, which(over, optimum))
-    return SearchResult(over, points, optima, optimum)
+    if layout.sigmas:
+        best = significant_disturbances(over, best)
+    name = "start" if len(first.optima) == 1 else "starts"
+    runs = [Run(name, z, run) for z, run in zip(first.points, first.optima, strict=True)]
+    chosen = min(runs, key=lambda run: rank(run.optimum))
+    state = SearchState(problem, over, guess, best, starts, seed)
+    for restart in RESTARTS:
+        if not restart.when(state):
+            continue
+        report(f"the search begins again: {restart.name}")
+        begun = state.best
+        for start in restart.points(state):
+            [run] = over.run(start.noise, start.z[None, :])
+            runs.append(Run(restart.name, start.z, run))
+            other = relax_noise_covariance(over, start.noise, run)
+            if is_better(problem, over, other, state.best):
+                state, chosen = state._replace(best=other), runs[-1]
+        if state.best is begun:
+            continue
+        notes = []
+        if restart.words:
+            before, after = (log_posterior(over, o) for o in (begun, state.best))
+            words = restart.words.format(before=before, after=after)
+            notes = [note(f"search.{restart.name}", words)]
+        state = state._replace(best=state.best.after(begun, *notes))
+    return SearchResult(over, state.best, table(layout, data, runs, chosen))
+
+
+_BETTER = 0.1
+"""log-posterior by which an optimum is better than another"""
+
+
+def is_better(
+    problem: Problem, over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum
+) -> bool:
+    """True if an optimum is to be chosen before another.
+
+    It has converged and the other has not; or both have, and it alone is stable where the start
+    was; or it has the higher log-posterior.
+
+    Args:
+        problem: what is fitted.
+        over: the search.
+        optimum: the one.
+        other: the other, which stays where there is no difference.
+    """
+
+    def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
+        unstable = problem.model.linear and left_stability(problem, over, o)
+        return bool(o.best.converged), not unstable
+
+    if passes(optimum) != passes(other):
+        return passes(optimum) > passes(other)
+    return log_posterior(over, optimum) > log_posterior(over, other) + _BETTER
+
+
+def log_posterior(over: Search, optimum: RelaxedOptimum) -> float:
+    """The log-likelihood less what priors hold against the free parameters, but for a constant;
+    -inf where it is not finite.
+
+    Args:
+        over: the search.
+        optimum: where it ended.
+    """
+    values = named_values(over.layout, over.data, optimum.best.z)
+    priors = {n: f.prior for n, f in over.problem.free.items() if f.prior is not None}
+    against = sum(((values[n] - prior.mean) / prior.sd) ** 2 for n, prior in priors.items())
+    posterior = log_likelihood_of(over, optimum) - 0.5 * against
+    return posterior if np.isfinite(posterior) else -np.inf

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -172,8 +171,7 @@ def _slow_residual(problem: Problem, output: OutputAdequacy) -> str:
 def _at_start(problem: Problem, flight: Flight, name: str) -> np.ndarray:
     """The output (N,) simulated at the start values from the model's own initial state."""
     # In one piece even where the fit has windows: the sign of a response shows from its beginning.
-    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    params = naming.replace(problem.start_params(), **known)
+    params = problem.start_params(flight.known)
     run = simulate(problem.model, params, flight, substeps=problem.substeps)
     return np.asarray(getattr(run.outputs, name))
 
