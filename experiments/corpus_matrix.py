@@ -56,17 +56,6 @@ ABLATIONS: tuple[Ablation, ...] = (
         lambda problem, fit, refit: (problem, fit),
     ),
     Ablation(
-        "further_starts", f"{_IDENTIFICATION}.further_starts:explains_little", lambda *_: False
-    ),
-    Ablation(
-        "better_of_stable", f"{_IDENTIFICATION}.further_starts:left_stability", lambda *_: False
-    ),
-    Ablation(
-        "better_of_same_responses",
-        f"{_IDENTIFICATION}.further_starts:better_of_same_responses",
-        lambda problem, search, optimum: optimum,
-    ),
-    Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",
         lambda *_, **__: (),

@@ -128,7 +128,7 @@ ROOMS = (
     "methods", "free", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
-    "agreement", "diagnostics", "further_starts", "fit",
+    "agreement", "diagnostics", "restarts", "search", "fit",
     "frequency_start", "method_comparison", "model_selection",
 )  # fmt: skip
 

@@ -30,7 +30,7 @@ from heli_jax import Problem, fit
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.multistart import Search, first_optima
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
-from heli_jax.identification.fit import first_guess
+from heli_jax.identification.search import first_guess
 
 jax.config.update("jax_enable_x64", True)
 COMPILED = "/jax/core/compile/backend_compile_duration"

@@ -5,11 +5,8 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, distrusted
 from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.design.accuracy import starting_at_zero, unstated_gusts
@@ -19,38 +16,11 @@ from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.excitation import gusts_guessed
 from heli_jax.identification.diagnostics.timing import of_rates
 from heli_jax.identification.estimation import multistart as starting
-from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.disturbance_search import (
-    disturbance_or_none,
-    likely_gusts,
-    those_that_show,
-)
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.disturbance_search import likely_gusts
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
-from heli_jax.identification.estimation.multistart import (
-    FirstGuess,
-    StartRow,
-    first_optima,
-    table,
-)
-from heli_jax.identification.estimation.noise_covariance import (
-    RelaxedOptimum,
-    better_of_two_guesses,
-    first_noise,
-    relax_noise_covariance,
-    unless_stuck,
-)
-from heli_jax.identification.estimation.starts import BY_WINDOWS, by_windows, delay_starts, draw
-from heli_jax.identification.further_starts import SAID as SAID_FURTHER
-from heli_jax.identification.further_starts import (
-    SAID_STABLE,
-    better_of_same_responses,
-    better_of_stable,
-    explains_little,
-    further_starts,
-    left_stability,
-)
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
+from heli_jax.identification.estimation.noise_covariance import first_noise, unless_stuck
 from heli_jax.identification.identifiability.analysis import Around
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.sensitivity import verdict_of
@@ -58,8 +28,8 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
-from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.search import SearchResult, first_guess, search
+from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.messages import sentence
 from heli_jax.stages import stage
@@ -76,47 +46,6 @@ __all__ = [
     "rates",
     "windows",
 ]
-
-_FIRST_STEPS = 40
-"""of filter error, until it is known that there is a disturbance to find"""
-
-
-def first_guess(problem: Problem) -> FirstGuess:
-    """The problem at its start values, with a first guess of the noise.
-
-    Args:
-        problem: model, vehicle, flights and what is free.
-    """
-    # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
-    # with both can a coarse search compare starts.
-    layout = layout_of(problem, problem.training)
-    data = data_of(problem, problem.training, layout)
-    noise = first_noise(problem, problem.training)
-    begun = layout.estimator.begins_with(data)
-    z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
-    e = evaluate(layout, data, noise, z)
-    level = layout.estimator.with_level(data, e, noise)
-    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
-        z, e = _in_free_motion(layout, data, noise, z, e)
-    # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
-    if level is not noise:
-        noise = level
-        e = evaluate(layout, data, noise, z)
-    return FirstGuess(layout, data, noise, z, e, begun)
-
-
-def _in_free_motion(
-    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
-) -> tuple[Array, Evaluation]:
-    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
-    from rest at zero no parameter would have any effect."""
-    own = slice(layout.first_nuisance, layout.size)
-    if not (layout.initial_state and np.isfinite(e.J).all()):
-        return z, e
-    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
-    moved = z.at[own].add(step)
-    after = evaluate(layout, data, noise, moved)
-    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
@@ -227,11 +156,9 @@ def fit(
     Args:
         problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
-            within the bounds, or about a factor of three around the start. None: one, or where a
-            delay is free the deepest valleys of the misfit over the delay, three at most; of a
-            linear model by output error six others are tried where the best of these explains less
-            than half of the outputs, and by frequency error where a stable model became unstable:
-            what equation error makes of the record, and five that are drawn.
+            within the bounds, or about a factor of three around the start. None: one, where a
+            delay is free in the deepest valley of the misfit over the delay; others only as
+            `restarts.RESTARTS` has them.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -257,22 +184,18 @@ def fit(
     # A model that is unstable where the search passes overflows, in time as in its powers; that is
     # told by what is not finite, and no warning of NumPy's says it better.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
-        search, points, optima, optimum = _search(problem, guess, starts, seed, max_steps, report)
+        ended = search(problem, guess, starts, seed, max_steps, report)
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"), np.errstate(over="ignore", invalid="ignore"):
-        c = _where_ended(problem, guess, before, search, optimum)
-        return _result(c, table(search.layout, search.data, points, optima), seed, timing)
+        c = _where_ended(problem, guess, before, ended)
+        return _result(c, ended.runs, seed, timing)
 
 
 def _where_ended(
-    problem: Problem,
-    guess: FirstGuess,
-    before: Verdict,
-    search: starting.Search,
-    optimum: RelaxedOptimum,
+    problem: Problem, guess: FirstGuess, before: Verdict, ended: SearchResult
 ) -> Context:
     """What is known where the search ended."""
-    layout, data = search.layout, search.data
+    layout, data, optimum = ended.search.layout, ended.search.data, ended.optimum
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
     optimum = unless_stuck(layout, optimum, e, problem.free)
 
@@ -336,60 +259,3 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
         seed=seed,
         timing=timing,
     )
-
-
-def _search(
-    problem: Problem,
-    guess: FirstGuess,
-    starts: int | None,
-    seed: int,
-    max_steps: int,
-    report: starting.Progress,
-) -> tuple[starting.Search, Float[Array, "s q"], list[Optimum], RelaxedOptimum]:
-    """The search with its layout and data, its starts, an optimum for each, and where it ended.
-
-    Where these explain little others are gone to, unless a number of starts is asked for.
-    """
-    layout, data, noise = guess.layout, guess.data, guess.noise
-
-    def begin(quick: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
-        if starts is None:
-            return delay_starts(problem, layout, guess.begun, quick, guess.z, known)
-        return draw(layout, problem, guess.z, starts, seed)
-
-    disturbed = bool(layout.sigmas)
-    # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
-    # and goes on only where there is one.
-    search = starting.Search(
-        problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
-    )
-    first, quick, points, optima = first_optima(search, guess, begin, report)
-    best, notes = min(optima, key=starting.rank), ()
-    # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
-    shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
-    if shooting is not None:
-        best, notes = shooting, (BY_WINDOWS,)
-    if starts is None and explains_little(first, quick, best):
-        report(SAID_FURTHER)
-        more = further_starts(layout, problem, guess.z, seed)
-        optima += first.run(quick, more, report, nearing=layout.estimator.nearing)
-        points = jnp.concatenate([points, more])
-        better = min(optima, key=starting.rank)
-        if starting.rank(better) < starting.rank(best):
-            best, notes = better, ()
-    optimum = relax_noise_covariance(search, quick, best)
-    optimum = optimum._replace(notes=(*notes, *optimum.notes))
-    # Relaxation ends where its first weights of the outputs lead: tried from others too.
-    optimum = better_of_two_guesses(search, points, optimum, problem.training)
-    search.max_steps = max_steps
-    # A search that began with a part of the data has not tried where all of them lead.
-    again = [] if quick is noise else [points]
-    if (starts is None or again) and left_stability(problem, search, optimum):
-        report(SAID_STABLE)
-        again += [further_starts(layout, problem, guess.z, seed)] if starts is None else []
-        optimum = better_of_stable(problem, search, noise, jnp.concatenate(again), optimum)
-    if disturbed:
-        several = len(disturbances_of(problem.model)) > 1
-        which = those_that_show if several else disturbance_or_none
-        optimum = better_of_same_responses(problem, search, which(search, optimum))
-    return search, points, optima, optimum

@@ -90,7 +90,10 @@ def alternatives(
         if not free:
             continue
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            problems[words + ending] = _disturbed(replace(problem, free=free), machine, axis, poles)
+            disturbed = with_disturbance(machine, axis, max(poles, 1))
+            problems[words + ending] = _by_filter_error(
+                replace(problem, free=free), disturbed, silent=not poles
+            )
             # One pole is no special case of two: both of these have the same time constant.
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
@@ -100,24 +103,37 @@ def alternatives(
     return Alternatives(problems, tuple(nested))
 
 
-def _disturbed(problem: Problem, model: Model, axis: str, poles: int) -> Problem:
-    """The problem by filter error, with a disturbance of so many poles, or all but none."""
-    disturbed = with_disturbance(model, axis, max(poles, 1))
+def _by_filter_error(problem: Problem, model: Model, *, silent: bool = False) -> Problem:
+    """The problem by filter error with a disturbed model, starts of disturbances as it has them.
+
+    Args:
+        problem: gives the vehicle's values, and the starts of the disturbances that it has too.
+        model: the disturbed one.
+        silent: fix its one disturbance at all but nothing: the measurement noise is then laid out
+            as in the others, and the likelihoods can be compared.
+    """
     vehicle = naming.asdict(problem.vehicle)
-    known = {n: vehicle[n] for n in naming.names(disturbed.Params) if n in vehicle}
-    fixed = tuple(n for n in problem.fixed_noise if poles)
-    if not poles:
-        # So little that it is none, and by filter error too: the measurement noise is then laid out
-        # as in the others, and the likelihoods can be compared.
-        known |= {"sigma_w": jnp.asarray(1e-9 * problem.motion), "tau_w": jnp.asarray(1.0)}
-        fixed = ("sigma_w", "tau_w", *(n for n in problem.fixed_noise if n == "sigma_y"))
+    own = {n for d in disturbances_of(model) for n in (d.sigma, d.tau)}
+    known = {n: vehicle[n] for n in naming.names(model.Params) if n in vehicle and n not in own}
+    if silent:
+        [d] = disturbances_of(model)
+        # Not zero: the logarithm of a size is what the layout holds. A billionth of the motion
+        # moves no digit of the likelihood.
+        known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
+        fixed = (d.sigma, d.tau)
+    else:
+        # Starts that were stated for a disturbance hold in every candidate that has it, whatever it
+        # is called there: alone it has the plain names.
+        same = same_parameters(model, problem.model)
+        known |= {n: vehicle[m] for n, m in same.items()}
+        fixed = tuple(n for n, m in same.items() if m in problem.fixed_noise)
     return replace(
         problem,
-        model=disturbed,
-        vehicle=disturbed.Params(**known),
+        model=model,
+        vehicle=model.Params(**known),
         method="filter-error",
         instrument=None,
-        fixed_noise=fixed,
+        fixed_noise=(*fixed, *(n for n in problem.fixed_noise if n == "sigma_y")),
     )
 
 
@@ -387,70 +403,28 @@ def disturbed_sets(
     listed = ", ".join(names)
     # A model with one disturbance, not the model without: the same estimator, the same noise and so
     # a likelihood that can be set beside the others'.
-    problems = {"no disturbance": _none(problem, with_disturbance(model, names[0]))}
+    problems = {
+        "no disturbance": _by_filter_error(problem, with_disturbance(model, names[0]), silent=True)
+    }
     everything = f"all: {listed}"
     for name in names:
         rest = [n for n in names if n != name]
         disturbed = with_disturbance(model, rest)
-        problems[f"without {name}: {', '.join(rest)}"] = _of(problem, disturbed)
+        problems[f"without {name}: {', '.join(rest)}"] = _by_filter_error(problem, disturbed)
     if 0 < len(stated) < len(names) - 1:
         only = f"only {', '.join(stated)}"
-        problems[only] = _of(problem, with_disturbance(model, stated))
+        problems[only] = _by_filter_error(problem, with_disturbance(model, stated))
     # What is within all of them, with nothing of its own: only of such pairs does a likelihood
     # ratio have a known distribution.
     smaller = list(problems)[1:]
-    problems[everything] = _of(problem, with_disturbance(model, names))
+    problems[everything] = _by_filter_error(problem, with_disturbance(model, names))
     two = f"{everything}; two poles"
-    problems[two] = _of(problem, with_disturbance(model, names, 2))
+    problems[two] = _by_filter_error(problem, with_disturbance(model, names, 2))
     # Two poles are no extension of one: both have as many parameters, so the two are compared by
     # AIC and not by a test.
     nested = [("no disturbance", name) for name in (*smaller, everything, two)]
     nested += [(name, everything) for name in smaller]
     return Alternatives(problems, tuple(nested))
-
-
-def _of(problem: Problem, disturbed: Model) -> Problem:
-    """The problem by filter error with that model, its noise's starts where there are some."""
-    vehicle, known = naming.asdict(problem.vehicle), _known(problem, disturbed)
-    same = same_parameters(disturbed, problem.model)
-    # Starts that were stated for a disturbance hold in every candidate that has it, whatever it is
-    # called there: alone it has the plain names.
-    known |= {n: vehicle[m] for n, m in same.items()}
-    fixed = [n for n, m in same.items() if m in problem.fixed_noise]
-    return replace(
-        problem,
-        model=disturbed,
-        vehicle=disturbed.Params(**known),
-        method="filter-error",
-        instrument=None,
-        fixed_noise=(*fixed, *(n for n in problem.fixed_noise if n == "sigma_y")),
-    )
-
-
-def _none(problem: Problem, disturbed: Model) -> Problem:
-    """The problem by filter error with a model whose one disturbance is fixed at all but nothing:
-    the measurement noise is then laid out as in the others, and the likelihoods can be compared."""
-    [d] = disturbances_of(disturbed)
-    known = _known(problem, disturbed)
-    # Not zero: the logarithm of a size is what the layout holds. A billionth of the motion moves no
-    # digit of the likelihood.
-    known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
-    kept = (n for n in problem.fixed_noise if n == "sigma_y")
-    return replace(
-        problem,
-        model=disturbed,
-        vehicle=disturbed.Params(**known),
-        method="filter-error",
-        instrument=None,
-        fixed_noise=(d.sigma, d.tau, *kept),
-    )
-
-
-def _known(problem: Problem, disturbed: Model) -> dict[str, object]:
-    """The vehicle's values of what that model has, without the disturbances' own."""
-    vehicle = naming.asdict(problem.vehicle)
-    own = {n for d in disturbances_of(disturbed) for n in (d.sigma, d.tau)}
-    return {n: vehicle[n] for n in naming.names(disturbed.Params) if n in vehicle and n not in own}
 
 
 # What an input does between samples, by the record where the log leaves it open.

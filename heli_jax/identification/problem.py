@@ -233,9 +233,13 @@ class Problem:
         """The flights that are fitted."""
         return tuple(f for f in self.flights if not f.hold_out)
 
-    def start_params(self) -> Any:
-        """The vehicle with the free parameters at their starts."""
-        return self.params_with({n: f.start for n, f in self.free.items()})
+    def start_params(self, known: Mapping[str, Any] | None = None) -> Any:
+        """The vehicle with the free parameters at their starts.
+
+        Args:
+            known: other values by name, SI, such as those known of a flight.
+        """
+        return self.params_with({n: f.start for n, f in self.free.items()} | dict(known or {}))
 
     def params_with(self, values: Mapping[str, Any]) -> Any:
         """The vehicle with other values of parameters that are free, or known of a flight.

@@ -228,13 +228,14 @@ def starts(fit: Fit) -> Table:
             number(s.cost, 7),
             str(s.steps),
             f"optimum {s.optimum}" if s.converged else "failed",
+            f"{s.reason}, chosen" if s.chosen else s.reason,
         )
         for i, s in enumerate(fit.starts)
     ]
     # Starts beside ends: whether equal costs come from equal parameters is what several starts are
     # for.
     ends = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
-    return Table(("", *ends, "cost", "steps", "led to"), rows)
+    return Table(("", *ends, "cost", "steps", "led to", "run of"), rows)
 
 
 def agreement(

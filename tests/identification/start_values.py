@@ -1,9 +1,9 @@
 """A problem at its start values, as `check` has it."""
 
-from heli_jax.identification import fit
+from heli_jax.identification.search import first_guess
 from heli_jax.identification.unknowns.layout import Solution
 
 
 def at_start(problem):
-    guess = fit.first_guess(problem)
+    guess = first_guess(problem)
     return Solution(*guess[:4]), guess.e

@@ -9,6 +9,7 @@ import pytest
 from heli_jax import Free, Problem, fit
 from heli_jax.identification.diagnostics.search import search_stopped
 from heli_jax.identification.estimation import multistart
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import gain_left
 from tests.identification.test_equation_error import ROLL, Params, record
 
@@ -38,7 +39,7 @@ def test_what_a_modest_step_would_take_away():
 
 
 def _stays(layout, data, noise, z0, max_steps=200, **_):
-    at = multistart.residual_and_jacobian(layout, data, noise, z0)
+    at = residual_and_jacobian(layout, data, noise, z0)
     cost = np.mean(np.square(np.asarray(at.r)))
     return multistart.Optimum(z0, cost, np.asarray(9), np.asarray(True))
 

@@ -11,7 +11,7 @@ from heli_jax.identification.estimation.frequency_lines import blocks_of
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.multistart import Search, first_optima
-from heli_jax.identification.fit import first_guess
+from heli_jax.identification.search import first_guess
 
 
 def test_blocks_hold_all_lines_and_a_quarter_of_them_is_whole_blocks():

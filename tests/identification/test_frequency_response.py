@@ -13,7 +13,7 @@ from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
 from heli_jax.identification.estimation.residual import differentiate, rows_of
 from heli_jax.identification.estimation.response_weights import Machine, forgets
-from heli_jax.identification.fit import first_guess
+from heli_jax.identification.search import first_guess
 from tests.identification.bench import BENCH, record, vehicle
 from tests.test_log_responses import CONFIG
 from tests.test_log_responses import record as logged

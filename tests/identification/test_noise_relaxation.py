@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from heli_jax.identification.estimation.estimator import Nearing
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     relax_noise_covariance,
 )
-from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.unknowns.layout import Noise
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from heli_jax.identification.estimation.optimiser_step import (
+from heli_jax.identification.estimation.levenberg_marquardt import (
     ARRIVED,
     LevenbergMarquardt,
     gain_ahead,

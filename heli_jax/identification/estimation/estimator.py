@@ -18,7 +18,6 @@ from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.estimation.simulated_flights import (
     Run,
     least_noise,
@@ -61,6 +60,16 @@ class Residuals(NamedTuple):
     """by flight the simulated `Run`s on whose way the rows came; None where none was simulated"""
     innovations: tuple[Innovations, ...] = ()
     """by flight, where predictions one step ahead are what is compared"""
+
+
+class Nearing(NamedTuple):
+    """How a search ends after which the noise is estimated anew, and another one begins."""
+
+    unchecked: float
+    """gain in joint standard deviations squared below which a whole step is the last, taken without
+    an evaluation of where it leads: the next search begins with that"""
+    damping: float = 1.0
+    """of the first step, in the optimiser's units: little near an optimum"""
 
 
 class Estimator(abc.ABC):

@@ -27,7 +27,12 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.estimator import (
+    Estimator,
+    Evaluation,
+    Nearing,
+    Residuals,
+)
 from heli_jax.identification.estimation.evaluation import least_share
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
@@ -59,7 +64,6 @@ from heli_jax.identification.estimation.linearised_flights import (
     condition_of,
     linearisation_notes,
 )
-from heli_jax.identification.estimation.optimiser_step import Nearing
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (

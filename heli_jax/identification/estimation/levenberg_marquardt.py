@@ -1,37 +1,512 @@
-"""Levenberg-Marquardt by optimistix on the one residual, from one start or many."""
+"""Levenberg-Marquardt by optimistix on the one residual, from one start or many.
+
+Each step goes by a triangle of the residuals and their Jacobian, so that its program is the same
+for records of any length. Around optimistix's solver stand the units of the unknowns, a trust
+region that opens faster, and a test of convergence in standard deviations of the estimates
+(`experiments/benchmarks/optimiser.py` compares with the plain solver).
+"""
 
 import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
 
 from heli_jax import stages
-from heli_jax.identification.estimation.optimiser_step import (
-    SINGLE,
-    Compiled,
-    Constants,
-    Nearing,
-    Scaling,
-    State,
-    advance,
-    awakened,
-    begin,
-    compressed,
-    constants_of,
-    nothing_trusted,
-    point,
-    scaling,
-    trusted_columns,
-)
+from heli_jax.identification.estimation.estimator import Nearing
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
 from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 from heli_jax.numerics.jitted import jitted
+
+# Units in which Levenberg-Marquardt sees the unknowns, and which unknowns may move at all.
+
+
+COLUMN = 300.0
+"""Column norm of the scaled Jacobian at the start: optimistix begins with damping 1, which is
+then a hundred-thousandth of J'J; a step that fails raises it tenfold."""
+
+_SMALL = 1e-12
+"""part of the largest column norm below which a column may be what rounding leaves of none"""
+_TRIAL = 1e-3
+"""part of the residuals' norm by which a small column should change them when it is tried"""
+
+
+class Scaling(NamedTuple):
+    """Units in which the optimiser sees a start: z = z0 + unit * xi, residuals / residual_norm."""
+
+    unit: Float[Array, " q"]
+    """0 for an unknown that stays put"""
+    residual_norm: Float[Array, ""]
+
+
+@jax.jit
+def scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"], trusted: Bool[Array, " q"]) -> Scaling:
+    """Columns of equal norm and a cost of order one; an unknown without effect stays put.
+
+    Args:
+        r0: residuals at the start.
+        J0: their Jacobian.
+        trusted: the unknowns whose column counts however small it is beside the others.
+    """
+    norms = jnp.linalg.norm(J0, axis=0)
+    # A column that overflowed has no size: its unknown stays put too.
+    norms = jnp.where(jnp.isfinite(norms), norms, 0.0)
+    usable = (norms > _SMALL * jnp.max(norms)) | (trusted & (norms > 0))
+    # Zero at the truth of a simulated record without noise.
+    size = jnp.maximum(jnp.linalg.norm(r0), 1e-300)
+    return Scaling(jnp.where(usable, COLUMN * size / jnp.where(usable, norms, 1.0), 0.0), size)
+
+
+def without_size(layout: Layout) -> np.ndarray:
+    """(q,) the unknowns that are no logarithms and so have no size of their own."""
+    linear = [kind == "linear" for kind in layout.kinds] + [True] * len(layout.gains)
+    return np.array(linear + [False] * (layout.size - len(linear)), bool)
+
+
+def nothing_trusted(layout: Layout) -> np.ndarray:
+    """(q,) of False."""
+    return np.zeros(layout.size, bool)
+
+
+def trusted_columns(
+    layout: Layout,
+    evaluate: Callable[[Array], tuple[Array, Array]],
+    z: Float[Array, " q"],
+    r: Float[Array, " n"],
+    J: Float[Array, "n q"],
+) -> np.ndarray:
+    """(q,) the unknowns without a size of their own whose columns are small beside the largest, and
+    yet say what the residuals do.
+
+    Args:
+        layout: what stands where in z.
+        evaluate: residuals and Jacobian at a point.
+        z: where.
+        r: the residuals there.
+        J: their Jacobian.
+    """
+    # Of parameters of 1e6 and 1e-8 the columns differ by 1e14 for their units alone. Rounding may
+    # leave as little of a column that is zero; it does not foretell what the residuals do.
+    trusted = nothing_trusted(layout)
+    norms = np.linalg.norm(np.asarray(J), axis=0)
+    small = (norms > 0) & (norms <= _SMALL * np.max(norms, initial=0.0)) & without_size(layout)
+    for i in np.flatnonzero(small):
+        step = _TRIAL * max(float(jnp.linalg.norm(r)), 1.0) / norms[i]
+        foretold = np.asarray(J)[:, i] * step
+        with np.errstate(all="ignore"):  # so small a column that the step overflows
+            change = np.asarray(evaluate(z.at[i].add(step))[0]) - np.asarray(r)
+            missed = np.linalg.norm(change - foretold)
+        trusted[i] = bool(missed < 0.5 * np.linalg.norm(foretold))
+    return trusted
+
+
+def awakened(unit: np.ndarray, J: np.ndarray, trusted: np.ndarray) -> np.ndarray:
+    """(q,) the unknowns that stayed put in a run and have an effect where it ended.
+
+    Args:
+        unit: (q,) of the run, 0 for what stayed put.
+        J: (n, q) the Jacobian at its end.
+        trusted: (q,) whose column there counts however small it is.
+    """
+    norms = np.linalg.norm(J, axis=0)
+    usable = (norms > _SMALL * np.max(norms, initial=0.0)) | trusted
+    return (unit == 0) & usable & np.isfinite(norms)
+
+
+# optimistix's Levenberg-Marquardt with a trust region that opens faster and knows rounding.
+
+
+# Annotated Any: what optimistix hands from step to step, records of its own without public names.
+
+_ROUNDING = 1e-12
+"""Part of the sum of squares below which a change is rounding."""
+
+
+_GROWTH = 3.0
+"""times the change of the residuals by a step that did as predicted may the next one make"""
+ARRIVED = 1e-4
+"""of joint standard deviations, squared: no interval shows a hundredth of one, and steps that
+shrink by a fifth each take ten more to come to a thousandth"""
+
+
+class _Region(NamedTuple):
+    """How far to go next."""
+
+    step_size: Float[Array, ""]
+    """one over the damping"""
+    radius: Float[Array, ""]
+    """by how much the residuals may change; inf as long as no step was refused"""
+
+
+class _TrustRegion(optx.ClassicalTrustRegion):
+    """optimistix's trust region, but a step whose gain would drown in rounding is accepted, and
+    after one that is refused there is a radius as well as more damping.
+
+    Otherwise a step of negligible gain, which is the last, is rejected at random and the search
+    lingers. Damping alone does nothing until it comes to the size of what the data say: a search
+    that goes well has next to none, and tenfold of that would try a refused step again, time after
+    time. The radius is of the residuals' change, which directions that the data leave open do not
+    make.
+    """
+
+    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
+        """As optimistix: a `_Region` without a radius.
+
+        Args:
+            y: the unknowns.
+            f_info_struct: shapes of residuals and Jacobian.
+        """
+        begin = super().init(y, f_info_struct)
+        return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
+
+    def step(
+        self,
+        first_step: Bool[Array, ""],
+        y: Float[Array, " q"],
+        y_eval: Float[Array, " q"],
+        f_info: Any,
+        f_eval_info: Any,
+        state: Any,
+    ) -> Any:
+        """As optimistix: the next step size, whether the step counts, and two records of its own.
+
+        Args:
+            first_step: whether nothing has been tried yet.
+            y: the unknowns at the last point that was accepted.
+            y_eval: the unknowns at the point that is judged.
+            f_info, f_eval_info: residuals and Jacobian at each.
+            state: the step size so far.
+        """
+        size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        cost = f_info.as_min()
+        gain = self.predict_reduction(y_eval - y, f_info)
+        change = f_eval_info.as_min() - cost
+        # Both: a small predicted gain alone would also let a step pass that raises the cost.
+        negligible = (gain > -_ROUNDING * cost) & (change < _ROUNDING * cost)
+        accept |= negligible
+        moved = f_info.jac.mv(y_eval - y)
+        slope = jnp.sum(f_info.residual * moved)
+        # Where the parabola by slope and cost is lowest, within a tenth and a half (More, 1978).
+        part = -slope / (2.0 * (change - slope))
+        part = jnp.where(jnp.isfinite(part), jnp.clip(part, 0.1, 0.5), 0.1)
+        grown = jnp.where(change < self.high_cutoff * gain, _GROWTH * _norm2(moved), 0.0)
+        radius = jnp.where(accept, jnp.maximum(state.radius, grown), part * _norm2(moved))
+        return size, accept, result, _Region(size, radius)
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """optimistix's Levenberg-Marquardt with a trust region that opens faster.
+
+    The default waits for an all but perfect model (ratio 0.99) before it lowers the damping.
+    """
+
+    rtol: float
+    atol: Float[Array, "..."]
+    norm: Callable[[Array], Array]
+    descent: optx.AbstractDescent
+    search: optx.AbstractSearch
+    verbose: Callable[..., None]
+
+    def __init__(
+        self, rtol: float, atol: Float[Array, "..."], convergence_mask: Bool[Array, " q"]
+    ) -> None:
+        """With the tolerances below whose sum a change is the last.
+
+        Args:
+            rtol: relative to the unknown, or to the size of the residuals.
+            atol: in the optimiser's units.
+            convergence_mask: the unknowns whose changes count.
+        """
+        self.rtol, self.atol = rtol, atol
+        self.norm = _norm(convergence_mask)
+        # QR of the rows and not Cholesky of J'J, whose condition number is the square of theirs.
+        self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
+        # A hundred times the region where three quarters of the gain came that was predicted
+        # (optimistix: 3.5 times): the damping of 1 to begin with is gone within a few steps.
+        self.search = _TrustRegion(
+            high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
+        )
+        self.verbose = lambda **_: None
+
+
+def within_reach(
+    state: Any, y: Float[Array, " q"], reach: Float[Array, " q"], unit: Float[Array, " q"]
+) -> Any:
+    """The solver's state, its next point no further from y than `reach` in each unknown by itself.
+
+    A bound on the whole step would let one unknown that runs away stop all others.
+
+    Args:
+        state: after a step.
+        y: the unknowns at the last point that was accepted.
+        reach: by unknown, inf where there is no bound.
+        unit: of the unknowns y, in which reach is not given; 0 where one stays put.
+    """
+    reach = reach / jnp.where(unit > 0, unit, 1.0)
+    # In each unknown by itself: the others go as far as they wanted, and the direction is bent
+    # rather than shortened.
+    nearer = jnp.clip(state.y_eval, y - reach, y + reach)
+    return eqx.tree_at(lambda s: s.y_eval, state, nearer)
+
+
+def within_radius(state: Any, y: Float[Array, " q"], limited: Bool[Array, ""] | bool = True) -> Any:
+    """The solver's state, its next point no further from y than its radius.
+
+    Args:
+        state: after a step.
+        y: the unknowns at the last point that was accepted.
+        limited: whether there is to be a radius at all.
+    """
+    step = state.y_eval - y
+    size = _norm2(state.f_info.jac.mv(step))
+    radius = jnp.where(limited, state.search_state.radius, jnp.inf)
+    nearer = y + step * jnp.minimum(1.0, radius / jnp.where(size > 0, size, 1.0))
+    # Where there is no radius the point is the solver's own, to the last digit.
+    return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
+
+
+def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]:
+    """What a full Gauss-Newton step would take off the sum of squares, as the parabola has it.
+
+    That gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations.
+    Unlike the length of a step it asks for no unit, and a direction that the data leave all but
+    open is not polished. An unknown that runs off, as the size of a disturbance that is none, has
+    such a gain for ever: then the length of the others' steps has to tell.
+
+    Args:
+        f_info: residuals and Jacobian at the last point that was accepted.
+        residual_norm: by which the residuals are divided, those of a variance of 1.
+    """
+    J = f_info.jac.as_matrix()
+    # A column of zeros, that of an unknown that stays put, has no direction: behind the others in
+    # the triangle it takes nothing from them.
+    moves = jnp.any(J != 0, axis=0)
+    order = jnp.argsort(~moves)
+    R = jnp.linalg.qr(jnp.concatenate([J[:, order], f_info.residual[:, None]], axis=1), mode="r")
+    gain = jnp.sum(jnp.where(moves[order], jnp.square(R[:-1, -1]), 0.0))
+    return gain * residual_norm**2
+
+
+def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(jnp.square(v)))
+
+
+def _norm(convergence_mask: Bool[Array, " q"]) -> Callable[[Array], Array]:
+    def norm(x: Array) -> Array:
+        # optimistix asks once with the q unknowns and once with the 2 q + 1 rows; their shape
+        # tells which. Of the rows the first is the size of the residuals, see `_compressed`.
+        unknowns = x.shape == convergence_mask.shape
+        return optx.max_norm(jnp.where(convergence_mask, x, 0.0) if unknowns else x[0])
+
+    return norm
+
+
+_TIKHONOV_SD = 100.0
+"""sd, in the coordinates of the free parameters (logarithms), of the Tikhonov regularisation that
+ties them to the start: a factor of e^100 is no prior, but it tells one end of a valley from the
+other"""
+
+_TIKHONOV_SDS_LINEAR = 1e6
+"""the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
+that the data would give it at the start if all else were known"""
+
+_REACH = 3.0
+"""of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
+
+
+_WHOLE = 0.9
+"""part of the gain that a whole step of Gauss and Newton makes at least"""
+
+
+class Constants(NamedTuple):
+    """What stays the same throughout one run."""
+
+    z0: Float[Array, " q"]
+    scaling: Scaling
+    tikhonov: Float[Array, " q"]
+    """one over the sd of the tie to the start, 0 without"""
+    convergence_mask: Bool[Array, " q"]
+    """the unknowns whose steps say whether the optimiser has arrived"""
+    reach: Float[Array, " q"]
+    """how far one step may go, by unknown"""
+    with_radius: Bool[Array, ""]
+    """whether a refused step shortens the next ones, beside what damping does"""
+    damping: Float[Array, ""]
+    """of the first step, in the optimiser's units"""
+    unchecked: Float[Array, ""]
+    """gain, in joint standard deviations squared, of a step that is taken as the last one without
+    an evaluation of where it leads"""
+
+
+class _Rows(NamedTuple):
+    """The residuals about one point, as the optimiser sees them: r + J (xi - at)."""
+
+    at: Float[Array, " q"]
+    r: Float[Array, " k"]
+    J: Float[Array, "k q"]
+
+
+class State(NamedTuple):
+    """Where a run stands."""
+
+    xi: Float[Array, " q"]
+    """the last point that was accepted, in the optimiser's units"""
+    solver: Any
+    """optimistix's own"""
+    done: Bool[Array, ""]
+    arrived: Bool[Array, ""]
+    """whether it is done because it arrived"""
+    ahead: Float[Array, ""]
+    """what the last step, not evaluated, took off the sum of squares in the optimiser's units"""
+
+
+def _linear(xi: Array, rows: _Rows) -> tuple[Array, None]:
+    return rows.r + jnp.sum(rows.J * (xi - rows.at)[None, :], axis=1), None
+
+
+_OPTIONS: dict[str, Any] = {"jac": "bwd"}
+"""a Jacobian of numbers, which can be handed from step to step"""
+
+
+def _solver(constants: Constants) -> LevenbergMarquardt:
+    # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
+    # and smaller gains drown in the rounding of the sum of squares. In the optimiser's units a
+    # standard deviation is 1 / (column norm * residual norm).
+    atol = 1e-3 / (COLUMN * constants.scaling.residual_norm)
+    return LevenbergMarquardt(1e-9, atol, constants.convergence_mask)
+
+
+def compressed(
+    constants: Constants, r: Float[Array, " n"], J: Float[Array, "n q"]
+) -> Float[Array, "k k"]:
+    # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
+    # decomposition of [r J]: as many rows as unknowns, and one. The optimiser sees these rows; the
+    # first is the size of r, the others are zero but for their derivatives. Its program is then
+    # the same for records of any length.
+    columns = jnp.concatenate([r[:, None], J * constants.scaling.unit[None, :]], axis=1)
+    R = jnp.linalg.qr(columns / constants.scaling.residual_norm, mode="r")
+    # QR leaves the sign open; a size that changed it would look like a change of the residuals.
+    return R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
+
+
+def _rows(constants: Constants, R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
+    # Where the data leave a direction of the parameters open, the weakest of regularisations keeps
+    # them from drifting along it.
+    (unit, norm), tikhonov = constants.scaling, constants.tikhonov
+    tie = -unit * xi * tikhonov / norm
+    pull = -jnp.diag(tikhonov * unit) / norm
+    return _Rows(xi, jnp.concatenate([R[:, 0], tie]), jnp.concatenate([R[:, 1:], pull]))
+
+
+def begin(constants: Constants) -> State:
+    q = constants.z0.shape[0]
+    xi = jnp.zeros_like(constants.z0)
+    # The first step accepts whatever is at z0, so that of these rows only the shapes count.
+    rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
+    shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
+    solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
+    size = (1.0 / constants.damping).astype(xi.dtype)
+    solver = eqx.tree_at(lambda s: s.search_state.step_size, solver, size)
+    return State(xi, solver, jnp.asarray(False), jnp.asarray(False), jnp.zeros((), xi.dtype))
+
+
+def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
+    """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
+    rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
+    xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
+    new = within_radius(new, xi, constants.with_radius)
+    new = within_reach(new, xi, constants.reach, constants.scaling.unit)
+    done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
+    fine = result == optx.RESULTS.successful
+    gain = gain_ahead(new.f_info, constants.scaling.residual_norm)
+    foreseen = _fall(new.f_info, new.y_eval - xi)
+    # Damped or shortened, a step says that the parabola is not to be relied on.
+    whole = foreseen * constants.scaling.residual_norm**2 > _WHOLE * gain
+    last = (gain < constants.unchecked) & whole & fine
+    done |= (gain < ARRIVED) | last
+    xi = jnp.where(last, new.y_eval, xi)
+    stepped = State(xi, new, done | ~fine, done & fine, jnp.where(last, foreseen, 0.0))
+    # Side by side a run that is done stays, while the slowest goes on.
+    return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), stepped, state)
+
+
+def _fall(f_info: Any, step: Float[Array, " q"]) -> Float[Array, ""]:
+    """What a step takes off the sum of squares, as the linear residuals have it."""
+    moved = f_info.jac.mv(step)
+    return -jnp.sum((2.0 * f_info.residual + moved) * moved)
+
+
+def point(constants: Constants, xi: Array) -> Array:
+    return constants.z0 + constants.scaling.unit * xi
+
+
+class Compiled(NamedTuple):
+    """The optimiser's own arithmetic, for one run or for many side by side."""
+
+    compressed: Callable[..., Array]
+    begin: Callable[..., State]
+    advance: Callable[..., State]
+    point: Callable[..., Array]
+
+
+# Compiled apart from the residuals: the same for all problems of as many unknowns and rows.
+_ARITHMETIC = (compressed, begin, advance, point)
+SINGLE = Compiled(*(jax.jit(f) for f in _ARITHMETIC))
+BATCHED = Compiled(*(jax.jit(jax.vmap(f)) for f in _ARITHMETIC))
+
+
+class _Kinds(NamedTuple):
+    """What the optimiser has to know of each unknown, (q,)."""
+
+    tikhonov: Float[np.ndarray, " q"]
+    """one over the sd of the tie to the start, where a coordinate has a size of its own"""
+    linear: Bool[np.ndarray, " q"]
+    """those without one"""
+    mask: Bool[np.ndarray, " q"]
+    """as `Constants.convergence_mask`"""
+    reach: Float[np.ndarray, " q"]
+
+
+def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
+    return _constants(z0, units, _kinds_of(layout, z0.dtype))
+
+
+@jax.jit
+def _constants(z0: Array, units: Scaling, kinds: _Kinds) -> Constants:
+    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
+    usable = units.unit > 0
+    # The norms of the columns at the start, that is one over the sd of each unknown alone.
+    norms = COLUMN * units.residual_norm / jnp.where(usable, units.unit, 1.0)
+    ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
+    tikhonov = jnp.where(kinds.linear, ties, kinds.tikhonov)
+    mask, reach = jnp.asarray(kinds.mask), jnp.asarray(kinds.reach)
+    one, none = jnp.ones((), z0.dtype), jnp.zeros((), z0.dtype)
+    return Constants(z0, units, tikhonov, mask, reach, jnp.asarray(True), one, none)
+
+
+def _kinds_of(layout: Layout, dtype: np.dtype) -> _Kinds:
+    at = np.arange(layout.size)
+    # Nuisances have weak priors of their own; time shift and disturbance have limits.
+    logarithmic = np.where(at < len(layout.free), 1.0 / _TIKHONOV_SD, 0.0)
+    # Not the noise's: a disturbance that is hardly there may wander on where it changes nothing
+    # else, since no likelihood has a maximum there.
+    mask = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
+    # Of several noises one may vanish, where its logarithm runs off: each by itself.
+    last = layout.first_nuisance - (0 if layout.filtered else len(layout.scaled))
+    noises = (at >= len(layout.of_interest)) & (at < last)
+    reach = np.where(noises & (len(layout.sizes) > 1), _REACH, np.inf)
+    return _Kinds(logarithmic.astype(dtype), without_size(layout), mask, reach.astype(dtype))
+
+
+# A whole run.
 
 
 class Optimum(NamedTuple):

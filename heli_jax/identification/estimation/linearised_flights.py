@@ -60,9 +60,8 @@ def cannot_linearise(problem: Problem) -> str | None:
         condition = condition_of(problem.model, flight)
         if condition is None:
             continue
-        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
         try:
-            trim(problem.model, naming.replace(problem.start_params(), **known), condition)
+            trim(problem.model, problem.start_params(flight.known), condition)
         except ValueError as e:
             return f"the model cannot be linearised for {flight.name or 'a flight'}: {e}"
     return None

@@ -16,14 +16,12 @@ from heli_jax.fused.kernel import Kernel, lanes_for
 from heli_jax.fused.sensitivities import Products, Sensitive, full
 from heli_jax.fused.traced import Traced, traced
 from heli_jax.identification.estimation.levenberg_marquardt import (
-    Optimum,
-    descend,
-    residual_and_jacobian,
-)
-from heli_jax.identification.estimation.optimiser_step import (
     BATCHED,
+    Optimum,
     Scaling,
     constants_of,
+    descend,
+    residual_and_jacobian,
     scaling,
     trusted_columns,
 )

@@ -3,170 +3,26 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.dynamics.model import Disturbance
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.estimator import Evaluation, Nearing
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
     optimise,
-    residual_and_jacobian,
 )
-from heli_jax.identification.estimation.optimiser_step import Nearing
-from heli_jax.identification.estimation.residual import rows_of
-from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack, within_bounds
-from heli_jax.numerics.jitted import jitted
-
-# A first guess of the disturbances: the greatest likelihood on a coarse grid.
-
-
-_DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
-"""by which the coarse search moves sigma_w"""
-_FINER, _ROUNDS = 0.2, 3
-"""decades between the points of a finer search, and how often it is done: a round reaches 0.4
-decades up and 0.6 down"""
-_TAUS = 3
-"""correlation times between a few samples and a part of the record, from which a search that ran
-to an end is begun again; with the decades as many points as the coarse search has"""
-
-
-def noise_guess_at(
-    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
-) -> Float[Array, " q"]:
-    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it; of several
-    disturbances first all together, then each by itself.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: where the grid has its middle.
-    """
-    z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
-    # A grid over all at once would have 18 to the power of their number.
-    several = [d for d in disturbances_of(layout.model) if d.sigma in layout.disturbance]
-    for d in several if len(several) > 1 else []:
-        z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau))
-    return z
-
-
-def one_noise_guess(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    z0: Float[Array, " q"],
-    names: tuple[str, ...],
-    width: float = 1.0,
-) -> Float[Array, " q"]:
-    """z0 with the named parameters of disturbances moved together, by the same factors of every
-    sigma and of every tau, to the greatest likelihood on a coarse grid about it.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: where the grid has its middle.
-        names: of the parameters; those that are no unknowns stay.
-        width: of the grid, in decades between its points.
-    """
-    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
-    steps = {
-        "sigma": _DECADES,
-        "tau": np.log(10.0) * np.arange(-1, 2),
-    }
-    # One factor for all sigmas and one for all taus: the grid stays two-dimensional however many
-    # disturbances there are.
-    kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
-    used = [k for k in steps if k in kinds.values()]
-    grid = np.stack(np.meshgrid(*(steps[k] for k in used), indexing="ij"), axis=-1)
-    grid = grid.reshape(-1, len(used))
-    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
-    for name, kind in kinds.items():
-        points[:, layout.disturbance_at(name)] += width * grid[:, used.index(kind)]
-    costs = np.asarray(costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
-    # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
-    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    return jnp.asarray(points[best], z0.dtype)
-
-
-def finer_noise_guess(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> Float[Array, " q"]:
-    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z: of the coarse search.
-    """
-    # As many points as the coarse search has: what was compiled for it serves here too.
-    for _ in range(_ROUNDS):
-        for d in disturbances_of(layout.model):
-            if {d.sigma, d.tau} & set(layout.disturbance):
-                z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau), _FINER)
-    return z
-
-
-def noise_guesses_by_tau(
-    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"], d: Disturbance
-) -> list[Float[Array, " q"]]:
-    """z0 with one disturbance at correlation times from five samples to a fifth of the longest
-    record, sigma_w of the greatest likelihood on a coarse grid for each; the most likely first.
-
-    Args:
-        layout: what the unknowns are, d.tau among them.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: where the grid of sigma_w has its middle.
-        d: the disturbance.
-    """
-    dt = min(float(f.dt) for f in data.flights)
-    longest = max(float(f.dt) * next(iter(f.outputs.values())).shape[0] for f in data.flights)
-    first, last = sorted((5.0 * dt, 0.2 * longest))
-    decades = _DECADES if d.sigma in layout.disturbance else np.zeros(1)
-    points = np.tile(np.asarray(z0), (_TAUS, decades.size, 1))
-    points[..., layout.disturbance_at(d.tau)] = np.log(np.geomspace(first, last, _TAUS))[:, None]
-    if d.sigma in layout.disturbance:
-        points[..., layout.disturbance_at(d.sigma)] += decades
-    flat = jnp.asarray(points.reshape(-1, points.shape[-1]), z0.dtype)
-    costs = np.asarray(costs_at(layout, data, noise, flat)).reshape(points.shape[:2])
-    costs = np.where(np.isfinite(costs), costs, np.inf)
-    best = points[np.arange(_TAUS), np.argmin(costs, axis=1)]
-    return [jnp.asarray(best[i], z0.dtype) for i in np.argsort(costs.min(axis=1))]
-
-
-@jitted
-def costs_at(
-    layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
-) -> Float[Array, " s"]:
-    """The mean of the squared rows at each of some points.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        points: in the layout's coordinates.
-    """
-    # One point after another: side by side they would need the memory of as many filters, for a
-    # search of a few points.
-    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
-
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, within_bounds
 
 Progress = Callable[[str], None]
 
 
 class StartRow(NamedTuple):
-    """Where one start led."""
+    """Where one run of the optimiser led."""
 
     start: dict[str, float]
     end: dict[str, float]
@@ -174,96 +30,24 @@ class StartRow(NamedTuple):
     steps: int
     converged: bool
     optimum: int
-    """1 for the best optimum, 2 for the next, ...; 0 where it did not converge"""
+    """1 for the best optimum of that reason, 2 for the next, ...; 0 where it did not converge"""
+    reason: str = "start"
+    """why it was made: 'start', 'starts' of several, or the name of a restart"""
+    chosen: bool = False
+    """whether the fit is the end of this run"""
 
 
-_SHIFTS = 41
-"""time shifts tried first, 20 ms apart"""
-_NEAR = 0.1
-"""standard deviations from the optimum at which it counts as reached"""
-_AGAIN = 3
-"""times that an optimiser which stopped short of the optimum is sent on"""
+class Run(NamedTuple):
+    """One run of the optimiser."""
+
+    reason: str
+    """as in `StartRow`"""
+    start: Float[Array, " q"]
+    optimum: Optimum
+
+
 _GOOD = 10.0
 """cost up to which a run explains something whatever there is to explain"""
-_FAINT = 0.3
-"""one over the sd of the logarithm of a disturbance's parameter below which it is none"""
-
-
-def first_guess(
-    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
-) -> Float[Array, " q"]:
-    """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
-    linear least squares; what is not among the unknowns stays.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: the start values.
-    """
-    z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
-    if not (layout.shift or len(layout.gains) == 1):
-        return z0
-    grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
-    # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
-    # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
-    coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
-    if data.flights[0].by_instrument is not None and not layout.gains:
-        # By the rows: of a machine that somebody holds a simulation by its inputs drifts off.
-        points = np.tile(np.asarray(z0), (_SHIFTS, 1))
-        points[:, len(layout.free)] = coordinate
-        costs, gains = costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)), coordinate
-    else:
-        costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
-    costs = np.where(np.isfinite(costs), costs, np.inf)
-    best = int(np.argmin(costs))
-    if not np.isfinite(costs[best]):
-        return z0
-    q = len(layout.free)
-    if len(layout.gains) == 1:
-        z0 = z0.at[q].set(gains[best])
-    if layout.shift:
-        z0 = z0.at[q + len(layout.gains)].set(coordinate[best])
-    return z0
-
-
-@eqx.filter_jit
-def _scan(
-    layout: Layout, data: Data, noise: Noise, z0: Array, shifts: Array
-) -> tuple[Array, Array]:
-    """Cost and best single gain for each time shift.
-
-    Means are taken off both signals: biases are not known yet.
-    """
-    q = len(layout.free)
-
-    def at(shift: Array) -> tuple[Array, Array]:
-        z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
-        runs = predict(layout, data, unpack(layout, data, z))
-        ys, ms = [], []
-        for flight, names, run, s in zip(data.flights, layout.outputs, runs, noise.sd, strict=True):
-            for n, y in flight.outputs.items():
-                m = run.outputs[names.index(n)]
-                seen = jnp.isfinite(y)
-                # Over the noise, as in the fit itself: otherwise the output with the largest
-                # numbers would choose the time shift.
-                ys.append(_centred(y, seen) / s[n])
-                ms.append(_centred(m, seen) / s[n])
-        y, m = jnp.concatenate(ys), jnp.concatenate(ms)
-        # The simulation is linear in a single gain, so that its best value is a quotient.
-        gain = jnp.ones_like(y[0])
-        if len(layout.gains) == 1:
-            power = jnp.sum(m * m)
-            gain = jnp.where(power > 0, jnp.sum(y * m) / jnp.where(power > 0, power, 1.0), gain)
-        return jnp.mean(jnp.square(y - gain * m)), gain
-
-    return jax.lax.map(at, shifts)
-
-
-def _centred(signal: Array, seen: Array) -> Array:
-    """Less its mean over the samples seen; zero elsewhere."""
-    mean = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
-    return jnp.where(seen, signal - mean, 0.0)
 
 
 class Search:
@@ -339,10 +123,6 @@ class Search:
             )
             # z stays on the device, from where the next program takes it.
             run = jax.device_get(optimum)._replace(z=optimum.z)
-            if not bool(run.converged) and layout.estimator.least_squares:
-                near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
-                run = run._replace(converged=np.asarray(near))
-            run = self._arrived(layout, noise, run)
             runs.append(run)
             if progress is not None and points.shape[0] > 1:
                 progress(f"{i + 1} of {points.shape[0]} starts done")
@@ -357,39 +137,6 @@ class Search:
         if layout.model.linear or layout.estimator.nuisances_in_rows:
             return None
         return np.arange(layout.size) >= layout.first_nuisance
-
-    def _arrived(self, layout: Layout, noise: Noise, run: Optimum) -> Optimum:
-        """A run with several noises, gone on with until no step would gain anything.
-
-        The optimiser stops where its last step moved no parameter; next to variances that vanish
-        that step may have been short for another reason.
-        """
-        if len(layout.sizes) < 2:
-            return run
-        for _ in range(_AGAIN):
-            at = residual_and_jacobian(layout, self.data, noise, run.z)
-            J, faint = np.asarray(at.J), np.zeros(run.z.shape[0], bool)
-            noises = slice(len(layout.of_interest), len(layout.of_interest) + len(layout.noises))
-            # Of a variance that vanishes the slope says less than its bounds do.
-            faint[noises] = ~(np.linalg.norm(J[:, noises], axis=0) > _FAINT)
-            gain = gauss_newton_gain(at.r, J[:, ~faint])
-            if not (bool(run.converged) and gain > _NEAR**2):
-                break
-            again = optimise(layout, self.data, noise, run.z, self.max_steps)
-            steps = run.steps + again.steps
-            run = jax.device_get(again)._replace(z=again.z, steps=np.asarray(steps))
-        return run
-
-    def _is_near(self, layout: Layout, noise: Noise, z: Array) -> bool:
-        """Whether the optimum is within a tenth of a standard deviation of every unknown.
-
-        Along a valley that weak priors alone close the optimiser goes on in steps that change no
-        likelihood. What a Gauss-Newton step would gain there is the squared distance to the
-        optimum in standard deviations of whichever unknown lies furthest.
-        """
-        at = residual_and_jacobian(layout, self.data, noise, z)
-        gain = gauss_newton_gain(at.r, at.J)
-        return bool(np.isfinite(gain) and gain < _NEAR**2)
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
@@ -469,35 +216,38 @@ def named_values(
     }
 
 
-def table(
-    layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
-) -> tuple[StartRow, ...]:
-    """Start, end and cost of every run, best first; equal optima share a number.
+def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[StartRow, ...]:
+    """Start, end and cost of every run: the chosen one first, then by reason, best first; equal
+    optima of one reason share a number.
 
     Args:
         layout: what the unknowns are.
         data: the numbers of the problem.
-        points: where the runs began.
-        runs: their ends, in the same order.
+        runs: in the order in which they were made.
+        chosen: the one that the fit is the end of.
     """
-    order = sorted(range(len(runs)), key=lambda i: rank(runs[i]))
+    reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
-    for i in order:
-        cost, converged = _cost(runs[i]), bool(runs[i].converged)
+    for run in sorted(runs, key=lambda run: (reasons.index(run.reason), rank(run.optimum))):
+        cost, converged = _cost(run.optimum), bool(run.optimum.converged)
+        if rows and rows[-1].reason != run.reason:
+            optimum, last = 0, None
         # By their costs: along a direction that the data leave open, equal optima differ in place.
         if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
             optimum, last = optimum + 1, cost
         rows.append(
             StartRow(
-                named_values(layout, data, points[i]),
-                named_values(layout, data, runs[i].z),
+                named_values(layout, data, run.start),
+                named_values(layout, data, run.optimum.z),
                 cost,
-                int(runs[i].steps),
+                int(run.optimum.steps),
                 converged,
                 optimum if converged else 0,
+                run.reason,
+                run is chosen,
             )
         )
-    return tuple(rows)
+    return tuple(sorted(rows, key=lambda row: not row.chosen))
 
 
 def rank(run: Optimum) -> tuple[bool, float]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -18,7 +18,7 @@ from heli_jax.identification.free import Free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.identification.unknowns.layout import Layout, Noise
 from heli_jax.numbers import percent
 from heli_jax.numerics.white_noise import noise_guess
 
@@ -41,10 +41,6 @@ _SLOWER = 3.0
 _NEAR = 1.0
 """such a move, above which the fall after it says nothing: what moves fast is then done, and what
 moves slowly is still to come"""
-_EXPLAINED = 2.0
-"""times the noise that a record shows by itself up to which its residual is that noise"""
-_WORTH_TELLING = 0.1
-"""log-likelihood by which two optima differ"""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -233,75 +229,6 @@ def log_likelihood_of(search: Search, optimum: RelaxedOptimum) -> float:
     layout, data = search.layout, search.data
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
     return layout.estimator.log_likelihood(layout, data, optimum.noise, e)
-
-
-def better_of_two_guesses(
-    search: Search,
-    points: Float[Array, "s q"],
-    optimum: RelaxedOptimum,
-    flights: Sequence[Flight],
-) -> RelaxedOptimum:
-    """The better of an optimum and of one whose noise is relaxed from the scale of the signals.
-
-    Relaxation weighs several outputs by the noise, and ends in the optimum that its first guess
-    leads to. That guess, from the third differences, is the end of the story where the model
-    explains a record to its noise. Where it does not, a smooth output of little noise has had all
-    the say, and outputs weighed by their own size may lead elsewhere. One output has no weights.
-
-    Args:
-        search: the optimiser over the problem.
-        points: the starts; the first is begun from again.
-        optimum: that the guess from differences led to.
-        flights: those fitted.
-    """
-    layout = search.layout
-    guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
-    # One output has no weights, and a filter's noise is not relaxed output by output.
-    several = sum(len(o) for o in layout.outputs) > 1
-    if not layout.estimator.least_squares or not several or _explained(optimum.noise, guesses):
-        return optimum
-    dtype = optimum.noise.log_variance_ratio.dtype
-    sd = tuple(
-        {n: np.asarray(float(np.nanstd(f.outputs[n])) or guess[n], dtype) for n in sorted(guess)}
-        for f, guess in zip(flights, guesses, strict=True)
-    )
-    other = relaxed_from(search, Noise(sd, optimum.noise.log_variance_ratio), points[0])
-    first, second = (_log_posterior(layout, search.data, o) for o in (optimum, other))
-    # An optimum is not given up for a point on the way to one, however likely that is.
-    worse = bool(optimum.best.converged) and not bool(other.best.converged)
-    if worse or not second > first + _WORTH_TELLING:
-        return optimum._replace(trace=(*optimum.trace, *other.trace))
-    return other.after(
-        optimum,
-        note(
-            "search.better-weights",
-            "Weighing the outputs by their size first led to a better optimum than the noise of "
-            f"their differences did (log-likelihood {second:.1f} for {first:.1f}): this fit is the "
-            "better one.",
-        ),
-    )
-
-
-def _explained(noise: Noise, guesses: list[dict[str, float]]) -> bool:
-    """Whether every residual is about as small as the noise that its record shows by itself."""
-    return all(
-        float(sd[n]) <= _EXPLAINED * guess[n]
-        for sd, guess in zip(noise.sd, guesses, strict=True)
-        for n in guess
-    )
-
-
-def _log_posterior(layout: Layout, data: Data, optimum: RelaxedOptimum) -> float:
-    """The log-likelihood, less what the priors hold against the parameters."""
-    e = evaluate(layout, data, optimum.noise, optimum.best.z)
-    # Scaled by the noise that is in the rows: what is left of their squares are the priors'.
-    measured = sum(
-        float(np.nansum((np.asarray(r) / float(sd[n])) ** 2))
-        for by_name, sd in zip(e.raw, optimum.noise.sd, strict=True)
-        for n, r in by_name.items()
-    )
-    of_priors = float(np.sum(np.square(np.asarray(e.r, np.float64)))) - measured
-    return layout.estimator.log_likelihood(layout, data, optimum.noise, e) - 0.5 * of_priors
 
 
 # Whether a search that says so has arrived at an optimum.

@@ -1,29 +1,218 @@
-"""Points to start a search from: drawn, over the delays, and from short windows."""
+"""Points to start a search from: coarse searches of disturbances and delays, and draws."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax import naming
-from heli_jax.finding import note
-from heli_jax.identification.estimation import multistart as starting
-from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.estimation.levenberg_marquardt import (
-    Optimum,
     residual_and_jacobian,
+    without_size,
 )
-from heli_jax.identification.estimation.optimiser_step import without_size
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns import transforms as coordinates
-from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.numerics.jitted import jitted
+
+# A first guess of the disturbances: the greatest likelihood on a coarse grid.
+
+
+_DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
+"""by which the coarse search moves sigma_w"""
+_FINER, _ROUNDS = 0.2, 3
+"""decades between the points of a finer search, and how often it is done: a round reaches 0.4
+decades up and 0.6 down"""
+
+
+def noise_guess_at(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it; of several
+    disturbances first all together, then each by itself.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+    """
+    z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
+    # A grid over all at once would have 18 to the power of their number.
+    several = [d for d in disturbances_of(layout.model) if d.sigma in layout.disturbance]
+    for d in several if len(several) > 1 else []:
+        z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau))
+    return z
+
+
+def one_noise_guess(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    z0: Float[Array, " q"],
+    names: tuple[str, ...],
+    width: float = 1.0,
+) -> Float[Array, " q"]:
+    """z0 with the named parameters of disturbances moved together, by the same factors of every
+    sigma and of every tau, to the greatest likelihood on a coarse grid about it.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+        names: of the parameters; those that are no unknowns stay.
+        width: of the grid, in decades between its points.
+    """
+    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
+    steps = {
+        "sigma": _DECADES,
+        "tau": np.log(10.0) * np.arange(-1, 2),
+    }
+    # One factor for all sigmas and one for all taus: the grid stays two-dimensional however many
+    # disturbances there are.
+    kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
+    used = [k for k in steps if k in kinds.values()]
+    grid = np.stack(np.meshgrid(*(steps[k] for k in used), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(used))
+    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
+    for name, kind in kinds.items():
+        points[:, layout.disturbance_at(name)] += width * grid[:, used.index(kind)]
+    costs = np.asarray(costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    return jnp.asarray(points[best], z0.dtype)
+
+
+def finer_noise_guess(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z: of the coarse search.
+    """
+    # As many points as the coarse search has: what was compiled for it serves here too.
+    for _ in range(_ROUNDS):
+        for d in disturbances_of(layout.model):
+            if {d.sigma, d.tau} & set(layout.disturbance):
+                z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau), _FINER)
+    return z
+
+
+@jitted
+def costs_at(
+    layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
+) -> Float[Array, " s"]:
+    """The mean of the squared rows at each of some points.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        points: in the layout's coordinates.
+    """
+    # One point after another: side by side they would need the memory of as many filters, for a
+    # search of a few points.
+    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
+
+
+# A first guess of the time shift, with a single gain.
+
+
+_SHIFTS = 41
+"""time shifts tried first, 20 ms apart"""
+
+
+def coarse_guess(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
+    linear least squares; what is not among the unknowns stays.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: the start values.
+    """
+    z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
+    if not (layout.shift or len(layout.gains) == 1):
+        return z0
+    grid = (
+        np.linspace(-_SHIFT_RANGE, _SHIFT_RANGE, _SHIFTS) * MAX_TIME_SHIFT
+        if layout.shift
+        else np.zeros(1)
+    )
+    # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
+    # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
+    coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
+    if data.flights[0].by_instrument is not None and not layout.gains:
+        # By the rows: of a machine that somebody holds a simulation by its inputs drifts off.
+        points = np.tile(np.asarray(z0), (_SHIFTS, 1))
+        points[:, len(layout.free)] = coordinate
+        costs, gains = costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)), coordinate
+    else:
+        costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        return z0
+    q = len(layout.free)
+    if len(layout.gains) == 1:
+        z0 = z0.at[q].set(gains[best])
+    if layout.shift:
+        z0 = z0.at[q + len(layout.gains)].set(coordinate[best])
+    return z0
+
+
+@eqx.filter_jit
+def _scan(
+    layout: Layout, data: Data, noise: Noise, z0: Array, shifts: Array
+) -> tuple[Array, Array]:
+    """Cost and best single gain for each time shift.
+
+    Means are taken off both signals: biases are not known yet.
+    """
+    q = len(layout.free)
+
+    def at(shift: Array) -> tuple[Array, Array]:
+        z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
+        runs = predict(layout, data, unpack(layout, data, z))
+        ys, ms = [], []
+        for flight, names, run, s in zip(data.flights, layout.outputs, runs, noise.sd, strict=True):
+            for n, y in flight.outputs.items():
+                m = run.outputs[names.index(n)]
+                seen = jnp.isfinite(y)
+                # Over the noise, as in the fit itself: otherwise the output with the largest
+                # numbers would choose the time shift.
+                ys.append(_centred(y, seen) / s[n])
+                ms.append(_centred(m, seen) / s[n])
+        y, m = jnp.concatenate(ys), jnp.concatenate(ms)
+        # The simulation is linear in a single gain, so that its best value is a quotient.
+        gain = jnp.ones_like(y[0])
+        if len(layout.gains) == 1:
+            power = jnp.sum(m * m)
+            gain = jnp.where(power > 0, jnp.sum(y * m) / jnp.where(power > 0, power, 1.0), gain)
+        return jnp.mean(jnp.square(y - gain * m)), gain
+
+    return jax.lax.map(at, shifts)
+
+
+def _centred(signal: Array, seen: Array) -> Array:
+    """Less its mean over the samples seen; zero elsewhere."""
+    mean = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
+    return jnp.where(seen, signal - mean, 0.0)
+
 
 # Starts about the given one, drawn within the bounds.
 
@@ -49,9 +238,9 @@ def draw(
     dtype = z0.dtype
     for i, (free, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
         values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
-        sign = jnp.asarray(coordinates.sign_or_scale(free), dtype)
-        low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
-        rows[1:, i] = np.asarray(coordinates.to_coordinate(kind, values, sign, low, high))
+        sign = jnp.asarray(transforms.sign_or_scale(free), dtype)
+        low, high = (jnp.asarray(b, dtype) for b in transforms.limits(free))
+        rows[1:, i] = np.asarray(transforms.to_coordinate(kind, values, sign, low, high))
     return jnp.asarray(rows, dtype)
 
 
@@ -70,30 +259,29 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
     # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
-    if coordinates.changes_sign(free):
+    if transforms.changes_sign(free):
         values = _either_sign(free, width, rng.standard_normal((2, size)))
     # A single bound does not shape the draw: what lies beyond it begins at the start value instead.
-    return np.where([coordinates.inside(free, float(v)) for v in values], values, free.start)
+    return np.where([transforms.inside(free, float(v)) for v in values], values, free.start)
 
 
 def _either_sign(free: Free, width: float, drawn: np.ndarray) -> np.ndarray:
     """Values of the start's size; about the prior's mean where there is one, which knows more."""
     if free.prior is not None:
         return free.prior.mean + 2.0 * free.prior.sd * drawn[0]
-    return coordinates.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
+    return transforms.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
 
 
-# Starts where a delay is free: a misfit has a valley for each period of the motion by which a delay
-# is wrong, and in a loop a narrow one about the truth alone.
+# The start where a delay is free: a misfit has a valley for each period of the motion by which a
+# delay is wrong, and in a loop a narrow one about the truth alone.
 #
 # The misfit is scanned over each delay with the other unknowns solved for at each of its values by
-# a Gauss-Newton step (variable projection: Golub and Pereyra, 1973); the deepest valleys are
-# starts.
+# a Gauss-Newton step (variable projection: Golub and Pereyra, 1973).
 
 
 _EARLIEST, _LATEST = -0.1, 0.2
 """s: range of a delay without bounds; to twice its start at least"""
-_SHIFTS = 0.8
+_SHIFT_RANGE = 0.8
 """of the largest time shift: at the bounds themselves the coordinate is infinite"""
 _OFF_BOUNDS = 0.02
 """of the range between two bounds, for the same reason"""
@@ -109,10 +297,6 @@ _FACTOR = 2.0
 """of a logarithm: the farthest that one step takes it"""
 _PARTS = (1.0, 0.25, 0.06)
 """of the step, of which the first that leads down is taken"""
-_DEEP = 0.5
-"""of the depth of the deepest valley, from which on another one is a start too"""
-_VALLEYS = 3
-"""starts at most"""
 
 
 class _Tried(NamedTuple):
@@ -122,22 +306,22 @@ class _Tried(NamedTuple):
     z: np.ndarray
 
 
-def delay_starts(
+def delay_start(
     problem: Problem,
     layout: Layout,
     data: Data,
     noise: Noise,
     z0: Float[Array, " q"],
     known: tuple[Any, Any],
-) -> Float[Array, "s q"]:
-    """Starts (s, q): z0 alone, or where a delay or the time shift is free the deepest valleys.
+) -> Float[Array, " q"]:
+    """z0, or where a delay or the time shift is free the deepest valley of the misfit over it.
 
     Args:
         problem: with the free parameters and the model that says which are delays.
         layout: what the unknowns are.
         data: the numbers of the problem.
         noise: of the measurements.
-        z0: the first start.
+        z0: the start values.
         known: residuals and Jacobian there.
     """
 
@@ -145,17 +329,12 @@ def delay_starts(
         at = residual_and_jacobian(layout, data, noise, jnp.asarray(z, z0.dtype))
         return np.asarray(at.r, np.float64), np.asarray(at.J, np.float64)
 
-    first = np.asarray(z0, np.float64)
-    base, valleys = first, []
+    best = _Tried(np.inf, np.asarray(z0, np.float64))
     for i, values in _grids(problem, layout, data, np.asarray(known[1])).items():
+        base = best.z
         tried = [_solved(layout, evaluate, base, i, value) for value in values]
-        found = _valleys(tried)
-        valleys = [*found, *valleys]
-        base = found[0].z if found else base
-    # Valleys of a delay that was scanned before others lack what these found.
-    valleys = sorted(valleys, key=lambda v: v.cost)[:_VALLEYS]
-    points = np.stack([v.z for v in valleys]) if valleys else first[None, :]
-    return jnp.asarray(points, z0.dtype)
+        best = min([best, *tried], key=lambda t: t.cost)
+    return jnp.asarray(best.z, z0.dtype)
 
 
 def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[int, np.ndarray]:
@@ -178,7 +357,7 @@ def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[
         grids[i] = np.asarray(transforms.to_coordinate(layout.kinds[i], values, *limits))
     if layout.shift:
         i = len(layout.free) + len(layout.gains)
-        ends = -_SHIFTS * MAX_TIME_SHIFT, _SHIFTS * MAX_TIME_SHIFT
+        ends = -_SHIFT_RANGE * MAX_TIME_SHIFT, _SHIFT_RANGE * MAX_TIME_SHIFT
         values = _between(*ends, _step(layout, data, J, i))
         grids[i] = np.arctanh(values / MAX_TIME_SHIFT)
     return grids
@@ -227,108 +406,3 @@ def _solved(
         if np.isfinite(r).all() and r @ r < begun.cost:
             return _Tried(float(r @ r), z + part * step)
     return begun
-
-
-def _valleys(tried: list[_Tried]) -> list[_Tried]:
-    """The valleys among points along one line, the deepest first."""
-    costs = np.array([t.cost for t in tried])
-    beside = np.minimum(np.r_[np.inf, costs[:-1]], np.r_[costs[1:], np.inf])
-    lowest = [t for t, b in zip(tried, beside, strict=True) if np.isfinite(t.cost) and t.cost <= b]
-    lowest = sorted(lowest, key=lambda t: t.cost)
-    if not lowest:
-        return []
-    top = float(np.median(costs[np.isfinite(costs)]))
-    least = top - _DEEP * (top - lowest[0].cost)
-    return [t for t in lowest if t.cost <= least][:_VALLEYS]
-
-
-# A start where the model's simulation diverges: parameters from short windows first.
-#
-# Where a damping begins with the wrong sign, a simulation over the whole record grows by many
-# powers of ten, and least squares finds no way back: the gradient is all in the growth. Over short
-# windows, each from an initial state of its own, nothing has the time to grow (multiple shooting;
-# Bock, 1983).
-
-
-FAR_WORSE = 10.0
-"""times the misfit of no model at all from which a start is taken for one that diverges"""
-_WINDOWS = 16
-"""of the shortest flight, unless they had too few samples each"""
-_PER_STATE = 5
-"""samples that a window has at least for each initial state that it brings"""
-_STEPS = 60
-"""of the optimiser over the windows: what has not arrived by then is only a start"""
-
-BY_WINDOWS = note(
-    "search.by-windows",
-    "The simulation diverges at the start values, so the parameters were first fitted to short "
-    "windows of the record (multiple shooting), and the fit began from there.",
-)
-
-
-def by_windows(
-    problem: Problem, search: starting.Search, noise: Noise, e: Evaluation, z0: Array, best: Optimum
-) -> Optimum | None:
-    """The optimum from the parameters that short windows give, where the search from z0 failed
-    and the simulation diverges there; None where that is not so or windows do not help.
-
-    Args:
-        problem: what is fitted.
-        search: the optimiser over the whole record.
-        noise: that it searches with.
-        e: at z0.
-        z0: the start.
-        best: the best optimum so far.
-    """
-    # Only where the ordinary way failed: windows bring unknowns of their own and a program to
-    # compile.
-    if bool(best.converged) or not _applies(problem) or not _diverges(search, noise, e):
-        return None
-    cut = _cut(problem)
-    short = None if cut is None else _fit_of_windows(cut, search.layout, noise, z0)
-    if short is None:
-        return None
-    # The windows' initial states stay behind: they were free to take up what the parameters missed.
-    [run] = search.run(noise, z0.at[: short.size].set(short)[None, :])
-    return run if starting.rank(run) < starting.rank(best) else None
-
-
-def _fit_of_windows(cut: Problem, whole: Layout, noise: Noise, z0: Array) -> Array | None:
-    """What the flights share, fitted to the windows; None where that is not finite."""
-    layout = layout_of(cut, cut.training)
-    data = data_of(cut, cut.training, layout)
-    # It stands first in z in either layout; behind it windows have more.
-    z = start_vector(layout, data, cut)
-    z = z.at[: whole.first_nuisance].set(z0[: whole.first_nuisance])
-    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
-    # Not whether it converged: half a way out of the growth is enough to begin from.
-    finite = np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))
-    return short.z[: whole.first_nuisance] if finite else None
-
-
-def _applies(problem: Problem) -> bool:
-    # What `Problem` accepts with windows, and has none yet.
-    return (
-        estimator_of(problem.method).windows
-        and problem.window is None
-        and problem.nuisance.initial_state
-    )
-
-
-def _diverges(search: starting.Search, noise: Noise, e: Evaluation) -> bool:
-    """Whether the misfit is far larger than that of no model at all."""
-    # Squares of a run that diverged may overflow: infinity is past the limit too.
-    with np.errstate(all="ignore"):
-        misfit = float(np.sum(np.square(np.asarray(e.r, np.float64))))
-    return misfit > FAR_WORSE * search.misfit_of_nothing(noise)
-
-
-def _cut(problem: Problem) -> Problem | None:
-    """The problem in windows; None where the record is too short for them."""
-    states = len(naming.names(problem.model.State))
-    flights = problem.training
-    dt = max(f.dt for f in flights)
-    shortest = min(f.n_samples * f.dt for f in flights)
-    # Short enough that nothing grows, long enough that a window's samples outnumber its unknowns.
-    window = max(shortest / _WINDOWS, max(8, _PER_STATE * states) * dt)
-    return replace(problem, window=window) if window < 0.5 * shortest else None

@@ -136,8 +136,7 @@ def _agreement(
 def _at_start(problem: Problem, flight: Flight, name: str) -> np.ndarray:
     """The output (N,) simulated at the start values from the model's own initial state."""
     # In one piece even where the fit has windows: the sign of a response shows from its beginning.
-    start = {n: free.start for n, free in problem.free.items()}
-    params = problem.params_with(start | flight.known)
+    params = problem.start_params(flight.known)
     run = simulate(problem.model, params, flight, substeps=problem.substeps)
     return np.asarray(getattr(run.outputs, name))
 

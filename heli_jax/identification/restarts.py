@@ -1,0 +1,240 @@
+"""Restarts: where a search begins again, when it does, and why."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax import naming
+from heli_jax.identification.equation_error.start import equation_error_start
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE, with_noise_guess
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.estimation.starts import draw
+from heli_jax.identification.identifiability.equivalents import same_responses
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.validation.advice import is_unstable
+
+
+class SearchState(NamedTuple):
+    """How far a search has come."""
+
+    problem: Problem
+    search: Search
+    guess: FirstGuess
+    best: RelaxedOptimum
+    """the best optimum so far"""
+    drawn: int | None
+    """how many starts were asked for; None where they are left to the search"""
+    seed: int
+    """of a draw of starts"""
+
+
+class StartPoint(NamedTuple):
+    """Where a run of the optimiser begins."""
+
+    noise: Noise
+    z: Float[Array, " q"]
+
+
+class Restart(NamedTuple):
+    """One reason to run the optimiser again; the best of all runs is taken (`search.better`)."""
+
+    name: str
+    """in `Fit.starts`, and of the code 'search.NAME' of its finding"""
+    when: Callable[[SearchState], bool]
+    points: Callable[[SearchState], Iterable[StartPoint]]
+    words: str
+    """the finding where it led to the best optimum; none where empty"""
+
+
+# By windows: where a damping begins with the wrong sign, a simulation over the whole record grows
+# by many powers of ten, and least squares finds no way back: the gradient is all in the growth.
+# Over short windows, each from an initial state of its own, nothing has the time to grow (multiple
+# shooting; Bock, 1983).
+
+_FAR_WORSE = 10.0
+"""times the misfit of no model at all from which a start is taken for one that diverges"""
+_WINDOWS = 16
+"""of the shortest flight, unless they had too few samples each"""
+_PER_STATE = 5
+"""samples that a window has at least for each initial state that it brings"""
+_STEPS = 60
+"""of the optimiser over the windows: what has not converged by then is only a start"""
+
+
+def _diverges(at: SearchState) -> bool:
+    """True if the search failed, the simulation diverges at its start and windows are possible."""
+    problem, guess = at.problem, at.guess
+    possible = (
+        estimator_of(problem.method).windows
+        and problem.window is None
+        and problem.nuisance.initial_state
+    )
+    if bool(at.best.best.converged) or not possible:
+        return False
+    # Squares of a run that diverged may overflow: infinity is past the limit too.
+    with np.errstate(all="ignore"):
+        misfit = float(np.sum(np.square(np.asarray(guess.e.r, np.float64))))
+    return misfit > _FAR_WORSE * at.search.misfit_of_nothing(guess.noise)
+
+
+def _by_windows(at: SearchState) -> list[StartPoint]:
+    """What the flights share, fitted to short windows."""
+    problem, guess = at.problem, at.guess
+    dt = max(f.dt for f in problem.training)
+    shortest = min(f.n_samples * f.dt for f in problem.training)
+    # Short enough that nothing grows, long enough that a window's samples outnumber its unknowns.
+    states = len(naming.names(problem.model.State))
+    window = max(shortest / _WINDOWS, max(8, _PER_STATE * states) * dt)
+    if window >= 0.5 * shortest:
+        return []
+    cut = replace(problem, window=window)
+    layout = layout_of(cut, cut.training)
+    data = data_of(cut, cut.training, layout)
+    # It stands first in z in either layout; behind it windows have more.
+    shared = guess.layout.first_nuisance
+    z = start_vector(layout, data, cut).at[:shared].set(guess.z[:shared])
+    [short] = Search(cut, layout, data, _STEPS).run(guess.noise, z[None, :])
+    # Not whether it converged: half a way out of the growth is enough to begin from.
+    if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
+        return []
+    # The windows' initial states stay behind: they were free to take up what the parameters missed.
+    return [StartPoint(guess.noise, guess.z.at[:shared].set(short.z[:shared]))]
+
+
+# Further starts: a mode far from where it is sought leaves no slope towards it. Relaxation, which
+# weighs several outputs by the noise, ends in the optimum that its first guess of the noise leads
+# to, where a smooth output of little noise has had all the say. In frequency a pole and its mirror
+# image have the same gain, so that where inputs tell little a spectrum which is estimated leaves
+# the likelihood an optimum on either side.
+
+_LITTLE = 0.5
+"""part of the outputs' variance below which an optimum explains little"""
+_DRAWN = 5
+
+
+def _needs_further_starts(at: SearchState) -> bool:
+    """True if a linear model explains less than half of the outputs' variance, or became unstable
+    in a search in frequency."""
+    layout, best = at.search.layout, at.best
+    if at.drawn is not None or not layout.model.linear or layout.disturbance:
+        return False
+    if layout.estimator.rows_are_samples:
+        # By the noise of the first guess: with the relaxed one each output would leave as much.
+        e, noise = evaluate(layout, at.search.data, best.noise, best.best.z), at.guess.noise
+        left = sum(
+            float(np.nansum(np.square(r / np.asarray(sd[n]))))
+            for raw, sd in zip(e.raw, noise.sd, strict=True)
+            for n, r in raw.items()
+        )
+        explained = 1.0 - left / at.search.variation(noise)
+        return not (bool(best.best.converged) and explained > _LITTLE)
+    return layout.estimator.noise_spectrum and left_stability(at.problem, at.search, best)
+
+
+def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) -> bool:
+    """True if the start values were stable and an optimum is not.
+
+    Args:
+        problem: what is fitted.
+        search: over it.
+        optimum: of a linear model.
+    """
+    values = named_values(search.layout, search.data, optimum.best.z)
+    return is_unstable(problem, problem.params_with(values)) and not is_unstable(
+        problem, problem.start_params()
+    )
+
+
+def _further_starts(at: SearchState) -> list[StartPoint]:
+    """What equation error makes of the record, where it can, and values drawn about the start."""
+    problem, guess, layout = at.problem, at.guess, at.guess.layout
+    points = np.array(draw(layout, problem, guess.z, 1 + _DRAWN, at.seed))
+    try:
+        with np.errstate(all="ignore"):
+            regressed = equation_error_start(
+                problem.model, problem.vehicle, problem.training, problem.free
+            )
+        values = {n: regressed.values[n].value for n in problem.free}
+        points[0] = _with_values(at, np.array(guess.z), values)
+    # Nothing can be regressed: no state was measured, say.
+    except (ValueError, np.linalg.LinAlgError):
+        points = points[1:]
+    return [StartPoint(guess.noise, jnp.asarray(z, guess.z.dtype)) for z in points]
+
+
+def _with_values(at: SearchState, z: np.ndarray, values: dict[str, float]) -> np.ndarray:
+    """The unknowns with values of the free parameters; what is out of bounds stays."""
+    for i, (name, free) in enumerate(at.problem.free.items()):
+        coordinate = transforms.coordinate(free, at.guess.layout.kinds[i], values[name])
+        z[i] = z[i] if coordinate is None else coordinate
+    return z
+
+
+# Same responses: two modes may exchange their parts. A heave mode and an inflow with a slow damping
+# and a quick lag answer a collective like one with a quick damping and a slow lag. A disturbance
+# tells them apart, as it acts through one of them alone; but a search that began on the wrong side
+# ends there, with white innovations and a likelihood that lacks a few units.
+
+_MOST_PARAMETERS = 8
+"""of which equal responses are sought: more take long"""
+_OTHERS = 2
+"""other values that a filter is begun from"""
+
+
+def _has_one_disturbance(at: SearchState) -> bool:
+    layout, best = at.search.layout, at.best
+    return (
+        bool(best.best.converged)
+        and len(layout.sigmas) == 1
+        # Where the record shows no disturbance nothing tells such values apart.
+        and (best.ratio is None or best.ratio > NO_DISTURBANCE)
+        and at.problem.model.linear
+        and len(layout.free) <= _MOST_PARAMETERS
+    )
+
+
+def _same_responses(at: SearchState) -> list[StartPoint]:
+    """Other values with the same responses to the inputs."""
+    search, best, layout = at.search, at.best, at.search.layout
+    here = named_values(layout, search.data, best.best.z)
+    points = []
+    for values in same_responses(at.problem, here)[:_OTHERS]:
+        z = _with_values(at, np.array(best.best.z), values)
+        # Initial states are those of the other values too: from zero they follow.
+        z[layout.first_nuisance :] = 0.0
+        z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))
+        e = evaluate(layout, search.data, best.noise, z)
+        points.append(StartPoint(layout.estimator.with_level(search.data, e, best.noise), z))
+    return points
+
+
+RESTARTS: tuple[Restart, ...] = (
+    Restart(
+        "by-windows",
+        _diverges,
+        _by_windows,
+        "The simulation diverges at the start values, so the parameters were first fitted to short "
+        "windows of the record (multiple shooting), and the fit began from there.",
+    ),
+    Restart("further-starts", _needs_further_starts, _further_starts, ""),
+    Restart(
+        "same-responses",
+        _has_one_disturbance,
+        _same_responses,
+        "Other parameter values have the same responses to the inputs: begun from these the filter "
+        "found a better optimum (log-likelihood {after:.1f} for {before:.1f}), and this fit is the "
+        "better one.",
+    ),
+)
+"""in the order in which they are asked"""

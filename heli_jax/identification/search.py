@@ -1,0 +1,188 @@
+"""Search for the optimum of a problem: first guess, starts, noise and disturbance."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.finding import note
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.disturbance_search import significant_disturbances
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.multistart import (
+    FirstGuess,
+    Progress,
+    Run,
+    Search,
+    StartRow,
+    first_optima,
+    named_values,
+    rank,
+    table,
+)
+from heli_jax.identification.estimation.noise_covariance import (
+    RelaxedOptimum,
+    first_noise,
+    log_likelihood_of,
+    relax_noise_covariance,
+)
+from heli_jax.identification.estimation.starts import coarse_guess, delay_start, draw
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+
+_FIRST_STEPS = 40
+"""of filter error, until it is known that there is a disturbance to find"""
+
+
+def first_guess(problem: Problem) -> FirstGuess:
+    """The problem at its start values, with a first guess of the noise.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+    """
+    # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
+    # with both can a coarse search compare starts.
+    layout = layout_of(problem, problem.training)
+    data = data_of(problem, problem.training, layout)
+    noise = first_noise(problem, problem.training)
+    begun = layout.estimator.begins_with(data)
+    z = coarse_guess(layout, begun, noise, start_vector(layout, data, problem))
+    e = evaluate(layout, data, noise, z)
+    level = layout.estimator.with_level(data, e, noise)
+    if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
+        z, e = _in_free_motion(layout, data, noise, z, e)
+    # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
+    if level is not noise:
+        noise = level
+        e = evaluate(layout, data, noise, z)
+    return FirstGuess(layout, data, noise, z, e, begun)
+
+
+def _in_free_motion(
+    layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
+) -> tuple[Array, Evaluation]:
+    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    from rest at zero no parameter would have any effect."""
+    own = slice(layout.first_nuisance, layout.size)
+    if not (layout.initial_state and np.isfinite(e.J).all()):
+        return z, e
+    step = np.linalg.lstsq(e.J[:, own], -e.r, rcond=1e-10)[0]
+    moved = z.at[own].add(step)
+    after = evaluate(layout, data, noise, moved)
+    return (moved, after) if after.r @ after.r < e.r @ e.r else (z, e)
+
+
+class SearchResult(NamedTuple):
+    """Where a search ended and how it came there."""
+
+    search: Search
+    """with its layout and data"""
+    optimum: RelaxedOptimum
+    runs: tuple[StartRow, ...]
+    """every run from a start, the chosen one first"""
+
+
+def search(
+    problem: Problem,
+    guess: FirstGuess,
+    starts: int | None,
+    seed: int,
+    max_steps: int,
+    report: Progress,
+) -> SearchResult:
+    """Search for the optimum of a problem from its first guess, then by each restart that applies.
+
+    Args:
+        problem: what is fitted.
+        guess: of `first_guess`.
+        starts: how many points to start from, as `fit` takes it.
+        seed: of their draw.
+        max_steps: of the optimiser, in each of its runs.
+        report: called with a line of text before each longer part of the work.
+    """
+    layout, data = guess.layout, guess.data
+
+    def points(noise: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
+        if starts is None:
+            return delay_start(problem, layout, guess.begun, noise, guess.z, known)[None]
+        return draw(layout, problem, guess.z, starts, seed)
+
+    # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
+    # and goes on only where there is one.
+    first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
+    over = Search(problem, layout, data, first_steps)
+    first = first_optima(over, guess, points, report)
+    best = relax_noise_covariance(over, first.noise, min(first.optima, key=rank))
+    over.max_steps = max_steps
+    if layout.sigmas:
+        best = significant_disturbances(over, best)
+    name = "start" if len(first.optima) == 1 else "starts"
+    runs = [Run(name, z, run) for z, run in zip(first.points, first.optima, strict=True)]
+    chosen = min(runs, key=lambda run: rank(run.optimum))
+    state = SearchState(problem, over, guess, best, starts, seed)
+    for restart in RESTARTS:
+        if not restart.when(state):
+            continue
+        report(f"the search begins again: {restart.name}")
+        begun = state.best
+        for start in restart.points(state):
+            [run] = over.run(start.noise, start.z[None, :])
+            runs.append(Run(restart.name, start.z, run))
+            other = relax_noise_covariance(over, start.noise, run)
+            if is_better(problem, over, other, state.best):
+                state, chosen = state._replace(best=other), runs[-1]
+        if state.best is begun:
+            continue
+        notes = []
+        if restart.words:
+            before, after = (log_posterior(over, o) for o in (begun, state.best))
+            words = restart.words.format(before=before, after=after)
+            notes = [note(f"search.{restart.name}", words)]
+        state = state._replace(best=state.best.after(begun, *notes))
+    return SearchResult(over, state.best, table(layout, data, runs, chosen))
+
+
+_BETTER = 0.1
+"""log-posterior by which an optimum is better than another"""
+
+
+def is_better(
+    problem: Problem, over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum
+) -> bool:
+    """True if an optimum is to be chosen before another.
+
+    It has converged and the other has not; or both have, and it alone is stable where the start
+    was; or it has the higher log-posterior.
+
+    Args:
+        problem: what is fitted.
+        over: the search.
+        optimum: the one.
+        other: the other, which stays where there is no difference.
+    """
+
+    def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
+        unstable = problem.model.linear and left_stability(problem, over, o)
+        return bool(o.best.converged), not unstable
+
+    if passes(optimum) != passes(other):
+        return passes(optimum) > passes(other)
+    return log_posterior(over, optimum) > log_posterior(over, other) + _BETTER
+
+
+def log_posterior(over: Search, optimum: RelaxedOptimum) -> float:
+    """The log-likelihood less what priors hold against the free parameters, but for a constant;
+    -inf where it is not finite.
+
+    Args:
+        over: the search.
+        optimum: where it ended.
+    """
+    values = named_values(over.layout, over.data, optimum.best.z)
+    priors = {n: f.prior for n, f in over.problem.free.items() if f.prior is not None}
+    against = sum(((values[n] - prior.mean) / prior.sd) ** 2 for n, prior in priors.items())
+    posterior = log_likelihood_of(over, optimum) - 0.5 * against
+    return posterior if np.isfinite(posterior) else -np.inf
