@@ -426,7 +426,7 @@ def input_shift(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
     for name, (place, _) in found.items():
         there = _shifted(there, (name,), place * dt)
     first = max((place for place, _ in found.values()), key=abs)
-    moved = _step(evaluate(at.layout, there, at.noise, at.z)) - _step(e)
+    moved = _next_step(evaluate(at.layout, there, at.noise, at.z)) - _next_step(e)
     names = tuple(n for n, (place, _) in found.items() if place * first > 0)
     gain = max(one for _, one in found.values())
     return Shift(names, -first * dt, gain, _in_units(at, e, moved))
@@ -526,7 +526,7 @@ def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
     return data._replace(flights=tuple(flights))
 
 
-def _step(e: Evaluation) -> Float[np.ndarray, " q"]:
+def _next_step(e: Evaluation) -> Float[np.ndarray, " q"]:
     return -pseudoinverse(np.asarray(e.J)) @ np.asarray(e.r)
 
 
