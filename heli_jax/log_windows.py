@@ -12,10 +12,6 @@ from heli_jax.config.logs import require_flights, with_log
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import located
 from heli_jax.finding import note
-from heli_jax.identification.fit import windows
-from heli_jax.identification.methods import estimator_of
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.design.accuracy import GUESSED, too_good
 from heli_jax.identification.design.windows import (
     DETERMINES,
@@ -24,6 +20,10 @@ from heli_jax.identification.design.windows import (
     Window,
     window_samples,
 )
+from heli_jax.identification.fit import windows
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
 from heli_jax.terminal import print_table, tell

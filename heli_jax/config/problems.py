@@ -174,8 +174,8 @@ def with_chosen_windows(problem: Problem) -> Problem:
     if not chosen:
         return problem
     # Not before it is needed: it imports the optimiser, which takes a second.
-    from heli_jax.identification.fit import windows
     from heli_jax.identification.design.windows import window_flights
+    from heli_jax.identification.fit import windows
 
     # By what these flights say alone: the others are fitted whatever they say.
     asked = dataclasses.replace(problem, flights=chosen)

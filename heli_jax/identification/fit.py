@@ -15,6 +15,12 @@ from heli_jax.finding import UNIT_IN_DOUBT, Finding, note
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
+from heli_jax.identification.design.accuracy import (
+    guessed_gusts,
+    starting_at_zero,
+    unstated_gusts,
+)
+from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import (
@@ -61,17 +67,11 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.validation.aliases import excitation_notes
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, bands
-from heli_jax.identification.design.accuracy import (
-    guessed_gusts,
-    starting_at_zero,
-    unstated_gusts,
-)
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import doubtful_inputs, record_doubts, scaled_by
 from heli_jax.identification.validation.other_hold import other_hold
-from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
     RATE_AGAINST_ANGLE,
     RATE_SCALE,

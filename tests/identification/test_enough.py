@@ -12,10 +12,10 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.flights import Signal, read_flight
 from heli_jax.flights.signal_facts import quantum
+from heli_jax.identification.design.next_flight import look_at_missing, plan_next_flight
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, signal_quality
 from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
-from heli_jax.identification.design.next_flight import look_at_missing, plan_next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, rails
 from heli_jax.models import with_filters
 from heli_jax.naming import Scalar

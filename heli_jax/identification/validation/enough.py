@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from heli_jax.finding import Finding
+from heli_jax.identification.design.next_flight import missing_outputs, next_flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -21,7 +22,6 @@ from heli_jax.identification.validation.logging_rate import (
     loop_between_samples,
 )
 from heli_jax.identification.validation.misread import doubtful_inputs, misread
-from heli_jax.identification.design.next_flight import missing_outputs, next_flight
 from heli_jax.identification.validation.signal_quality import (
     quantisation,
     saturation,
