@@ -13,7 +13,6 @@ from heli_jax.errors import InputError
 from heli_jax.flights import Source
 from heli_jax.flights.cut import part
 from heli_jax.identification.design import windows as record_windows
-from heli_jax.identification.design.windows import Exclusions
 from heli_jax.identification.fit import check, windows
 from tests.identification.test_enough import DT, problem, response, steps
 
@@ -61,9 +60,7 @@ def test_the_expected_sd_is_that_of_a_check_of_the_window_alone(ranked):
 
 def test_windows_of_a_part_count_from_the_beginning_of_its_log():
     late = replace(excited(100, 400, 500), t0=112.0, source=Source("log", "0", first_time=100.0))
-    span = record_windows._Span(0, 100, 200)
-    window = record_windows._window(problem(late), span, np.ones(3), "")
-    assert (window.start, window.end) == pytest.approx((14.0, 15.98))
+    assert record_windows._times(late, 100, 200) == pytest.approx((14.0, 15.98))
 
 
 @pytest.mark.slow
@@ -98,7 +95,7 @@ def test_damaged_windows_are_left_out_with_the_reason(ranked):
     y = np.full(2000, np.nan)
     y[::5] = f.outputs["phi"][::5]
     sparse = replace(f, outputs={"phi": f.outputs["phi"], "p": f.outputs["phi"]})
-    assert Exclusions((replace(sparse, outputs={"phi": y}, sd={}),)).of(0, 100, 300) == ""
+    assert why_excluded(replace(sparse, outputs={"phi": y}, sd={}), 100, 300) == ""
 
 
 CONFIG = """

@@ -1,8 +1,14 @@
-"""What expected standard deviations rest on, in words: on the noise, which may be guessed."""
+"""Expected standard deviations before a fit, from what parts of a record tell at the start values.
+
+Rows of the whitened Jacobian are samples, so the information of a part of the record (some outputs,
+a window) is that of its rows, with what belongs to the part alone (initial states, biases, input
+offsets) projected out. Information is carried as a triangle R, where R'R is Fisher's matrix: that
+of two parts together is the triangle of both, one above the other.
+"""
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,20 +17,17 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations
+from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
 from heli_jax.identification.identifiability.directions import projected
-from heli_jax.identification.identifiability.sensitivity import relative_rows
+from heli_jax.identification.identifiability.sensitivity import relative_rows, verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Layout
+from heli_jax.identification.unknowns.layout import Data, Layout
 from heli_jax.identification.unknowns.transforms import scale
 
-# What parts of a record say of the parameters, at the start values: expected standard deviations.
-#
-# Rows of the whitened Jacobian are samples, so the information of a part of the record (some
-# outputs, a window) is that of its rows, with what belongs to the part alone (initial states,
-# biases, input offsets) projected out. Information is carried as a triangle R, where R'R is
-# Fisher's matrix: that of two parts together is the triangle of both, one above the other.
+FREE = 1e-3
+"""weight of a weak prior that holds nothing up; not zero, where directions would be rounding"""
 
 
 class Sensitivity(NamedTuple):
@@ -37,9 +40,17 @@ class Sensitivity(NamedTuple):
     own: Float[np.ndarray, "n k"]
     """by initial states, biases and input offsets, in sds of their weak priors"""
 
+    def part(self, rows: np.ndarray) -> "Sensitivity":
+        """Return some of the rows.
+
+        Args:
+            rows: their numbers, or True for each of them.
+        """
+        return self._replace(shared=self.shared[rows], own=self.own[rows])
+
 
 def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
-    """The rows of the data of an evaluation.
+    """Return the rows of the data of an evaluation.
 
     Args:
         problem: bounds, priors and starts.
@@ -53,41 +64,66 @@ def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivi
     return Sensitivity(unknowns, shared, rows.nuisances[:, count:])
 
 
-def triangle(
-    s: Sensitivity, rows: Sequence[int] | np.ndarray | slice = slice(None)
-) -> Float[np.ndarray, "s s"]:
-    """What some rows say of the shared unknowns, where all else is free but for its weak prior.
+def row_places(layout: Layout, data: Data, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flight and the sample of each row of a `Sensitivity`, (n,) each; -1 for none.
 
     Args:
-        s: all rows.
-        rows: which of them.
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        count: of the rows. Behind those of the samples stand a filter's variances, one a sample, or
+            the defects between windows, which belong to a flight alone.
     """
-    shared, own = s.shared[rows], s.own[rows]
+    numbers = signal_numbers(layout, data)
+    flights = np.array([i for i, _ in signals(layout)])
+    begins = np.searchsorted(numbers, np.arange(flights.size))
+    of_samples = np.array([flights[numbers], np.arange(numbers.size) - begins[numbers]])
+    places = np.full((2, count), -1)
+    places[:, : numbers.size] = of_samples
+    if not layout.estimator.rows_are_samples and count >= 2 * numbers.size:
+        places[:, count - numbers.size :] = of_samples
+    elif layout.continuity is not None:
+        defects = [(windows - 1) * len(layout.states) for windows, _ in layout.windows]
+        places[0, numbers.size :] = np.repeat(np.arange(len(defects)), defects)
+    return places[0], places[1]
+
+
+# Any: of NumPy or of JAX.
+def own_unknowns(layout: Layout, z: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return by flight the initial states (windows, states), and the biases and offsets, in z.
+
+    Args:
+        layout: what stands where.
+        z: the unknowns (q,).
+    """
+    z, at, k, parts = np.asarray(z), layout.first_nuisance, len(layout.states), []
+    for (windows, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        first, size = at + windows * k, layout.constants(outputs)
+        parts.append((z[at:first].reshape(windows, k), z[first : first + size]))
+        at = first + size
+    return parts
+
+
+def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:
+    """Return what the rows say of the shared unknowns, where all else is free but for its weak
+    prior."""
     # What these rows do not feel is no unknown of theirs: in long records that is nearly all.
-    own = own[:, np.any(own != 0.0, axis=0)]
-    count = own.shape[1]
-    if not count:
-        return together(shared)
-    stacked = np.vstack([shared, np.zeros((count, shared.shape[1]))])
-    return projected(stacked, np.vstack([own, np.eye(count)]))
+    own = s.own[:, np.any(s.own != 0.0, axis=0)]
+    priors = np.eye(own.shape[1])
+    nothing = np.zeros((len(priors), s.shared.shape[1]))
+    return projected(np.vstack([s.shared, nothing]), np.vstack([own, priors]))
 
 
 def together(*triangles: np.ndarray) -> Float[np.ndarray, "s s"]:
-    """The triangle of several parts of the data, whose shared unknowns are the same."""
-    R = np.linalg.qr(np.vstack(triangles), mode="r")
-    return _square(R, R.shape[1])
-
-
-def repeated(R: Float[np.ndarray, "s s"], times: float) -> Float[np.ndarray, "s s"]:
-    """The triangle of the same data taken several times, each time with new noise."""
-    return np.sqrt(times) * R
+    """Return the triangle of several parts of the data, whose shared unknowns are the same."""
+    rows = np.vstack(triangles)
+    return projected(rows, np.zeros((len(rows), 0)))
 
 
 def expected_sd(
     unknowns: tuple[Unknown, ...], R: Float[np.ndarray, "s s"]
 ) -> Float[np.ndarray, " q"]:
-    """Expected standard deviations of the parameters of interest, in relative coordinates (of log
-    |value| where they have a sign); infinite where the data and the priors say nothing.
+    """Return expected standard deviations of the parameters of interest, in relative coordinates
+    (of log |value| where they have a sign); infinite where the data and the priors say nothing.
 
     Args:
         unknowns: the parameters, with their priors.
@@ -102,8 +138,16 @@ def expected_sd(
     return deviations(rows[:, felt])[:q]
 
 
-def _square(R: np.ndarray, size: int) -> np.ndarray:
-    return np.vstack([R, np.zeros((max(size - R.shape[0], 0), R.shape[1]))])
+def not_determined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str, ...]:
+    """Return the parameters that the whole record does not determine: then none of its parts does.
+
+    Args:
+        problem: what is free.
+        layout: what stands where.
+        e: the evaluation there.
+    """
+    verdict = verdict_of(problem, layout, e)
+    return (*verdict.undetermined, *verdict.without_effect)
 
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
@@ -117,7 +161,7 @@ _WORTH_DOUBT = 0.1
 def too_good(
     sds: Sequence[float] | np.ndarray, guessed: bool, *, nothing_follows: bool = False
 ) -> str:
-    """A sentence where expected sds are too small to be true; empty where they are not.
+    """Return a sentence where expected sds are too small to be true; empty where they are not.
 
     Args:
         sds: relative.
@@ -140,8 +184,8 @@ def too_good(
 
 
 def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
-    """By free parameter that starts at zero the size [SI] that its expected sd is relative to, and
-    its unit: of zero itself nothing is a part.
+    """Return, by free parameter that starts at zero, the size [SI] that its expected sd is relative
+    to, and its unit.
 
     Args:
         problem: what is to be fitted.
@@ -154,7 +198,7 @@ def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
 
 
 def unstated_gusts(problem: Problem) -> list[str]:
-    """The names of the sizes of disturbances that nobody stated; none without process noise.
+    """Return the names of the sizes of disturbances that nobody stated; none without process noise.
 
     Args:
         problem: with its vehicle, where a size may be stated.
@@ -162,8 +206,5 @@ def unstated_gusts(problem: Problem) -> list[str]:
     if not estimator_of(problem.method).process_noise:
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]
-    return [n for n in sizes if not _is_stated(float(getattr(problem.vehicle, n)))]
-
-
-def _is_stated(value: float) -> bool:
-    return math.isfinite(value) and value > 0.0
+    stated = {n: float(getattr(problem.vehicle, n)) for n in sizes}
+    return [n for n, size in stated.items() if not (math.isfinite(size) and size > 0.0)]

@@ -1,13 +1,13 @@
-"""What to fly next: the manoeuvre that narrows the widest interval most, by Fisher's information.
+"""What to fly next, by Fisher's information at the start values: further outputs and manoeuvres.
 
-Candidates of the same duration and amplitude as the record are put into the model at the start
-values, one input moved at a time: doublets, 3-2-1-1 steps and a chirp, and the record once more for
-comparison (input design over a few manoeuvres that a pilot can fly: Mehra, 1974; Jategaonkar, 2006,
-chapter 2).
+The Jacobian gets the rows of outputs that the log lacks, as the model shows them; and candidates of
+the same duration and amplitude as the record are flown, one input at a time: doublets, 3-2-1-1
+steps and a chirp, and the record once more for comparison (input design over a few manoeuvres that
+a pilot can fly: Mehra, 1974; Jategaonkar, 2006, chapter 2).
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,12 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.accuracy import (
+    FREE,
     Sensitivity,
     expected_sd,
-    repeated,
+    not_determined,
+    own_unknowns,
+    row_places,
     sensitivity_at,
     together,
     triangle,
@@ -28,16 +31,9 @@ from heli_jax.identification.design.windows import DETERMINES
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
-from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Solution, layout_of
 from heli_jax.simulation.inputs import chirp, multistep_3211
-
-# What outputs would tell that the model has and the log lacks, by Fisher's information.
-#
-# The Jacobian at the start values is that of the fit, with rows of further outputs as the model
-# shows them; how much narrower each interval would be follows from the rows alone.
-
 
 TYPICAL = {"rad": 0.01, "rad/s": 0.01, "m": 0.5, "m/s": 0.1, "m/s^2": 0.3}
 """noise of small autopilots' sensors (attitude, gyro, GPS position and velocity, accelerometer),
@@ -59,8 +55,8 @@ class MissingOutput(NamedTuple):
 def look_at_missing(
     problem: Problem, at: Solution
 ) -> tuple[tuple[str, ...], list[MissingOutput]] | None:
-    """The parameters of interest, and for each output that no flight has what it would do; None
-    where the method's rows are not samples of one output each.
+    """Return the parameters of interest, and for each output that no flight has what it would do;
+    None where the method's rows are not samples of one output each.
 
     Args:
         problem: what is free.
@@ -77,40 +73,58 @@ def look_at_missing(
     # Of noise one here: rows are divided by the right one once the simulation shows it.
     noise = at.noise._replace(sd=tuple({**sd, **dict.fromkeys(lacking, 1.0)} for sd in at.noise.sd))
     noise = jax.tree.map(lambda v: np.asarray(v, z.dtype), noise)
-    evaluation = evaluate(layout, data, noise, z)
-    sds = _noises(problem, at, evaluation.simulated, lacking)
-    if not sds:
-        return at.layout.of_interest, []
-    s = _weighed(sensitivity_at(problem, layout, evaluation), layout, data, evaluation, sds)
-    return at.layout.of_interest, _ratios(layout, data, s, lacking, sds)
+    e = evaluate(layout, data, noise, z)
+    sds = _noises(problem, at, e.simulated, lacking)
+    s = sensitivity_at(problem, layout, e)
+    # The output of each row; what follows the samples belongs to every choice.
+    numbers, named = signal_numbers(layout, data), np.array([n for _, n in signals(layout)])
+    output = np.concatenate([named[numbers], np.full(len(s.shared) - numbers.size, "")])
+    columns = own_unknowns(layout, np.arange(layout.size) - layout.first_nuisance)
+    shared, own = s.shared.copy(), s.own.copy()
+    for name, sd in sds.items():
+        shared[output == name] /= sd
+        own[output == name] /= sd
+        for (_, constants), outputs, run in zip(columns, layout.outputs, e.simulated, strict=True):
+            if layout.bias:
+                # A weak prior of ten times the signal, as of the outputs that are measured.
+                rms = float(np.sqrt(np.mean(run[name] ** 2)))
+                own[:, constants[outputs.index(name)]] *= 10.0 * rms
+    s = s._replace(shared=shared, own=own)
+    used = ~np.isin(output, lacking)
+    before, results = expected_sd(s.unknowns, triangle(s.part(used))), []
+    for name, sd in sds.items():
+        after = expected_sd(s.unknowns, triangle(s.part(used | (output == name))))
+        # What nothing determines before and after is as it was; what only the further output
+        # determines is infinitely better.
+        ratio = np.where(np.isfinite(after), 0.0, 1.0)
+        both = np.isfinite(before) & np.isfinite(after) & (before > 0)
+        np.divide(after, before, out=ratio, where=both)
+        results.append(MissingOutput(name, sd, ratio, before))
+    return at.layout.of_interest, results
 
 
 def _extended(problem: Problem, at: Solution, lacking: list[str]) -> tuple[Layout, Data, jax.Array]:
     """Layout, data and unknowns with further outputs, of which nothing is measured yet."""
-    flights, parts, z = [], [], [at.z[: at.layout.first_nuisance]]
-    position = at.layout.first_nuisance
-    for i, (flight, numbers) in enumerate(zip(problem.training, at.data.flights, strict=True)):
+    dtype, flights, parts, z = at.z.dtype, [], [], [np.asarray(at.z)[: at.layout.first_nuisance]]
+    ones = {n: jnp.ones((), dtype) for n in lacking}
+    own = own_unknowns(at.layout, at.z)
+    for flight, numbers, (states, constants) in zip(
+        problem.training, at.data.flights, own, strict=True
+    ):
         zeros = np.zeros(flight.n_samples)
-        outputs = {**flight.outputs, **dict.fromkeys(lacking, zeros)}
-        flights.append(replace(flight, outputs=outputs))
-        one = jnp.ones((), at.z.dtype)
-        measured = {**numbers.outputs, **{n: jnp.asarray(zeros, at.z.dtype) for n in lacking}}
-        scales = {**numbers.bias_scale, **dict.fromkeys(lacking, one)}
+        flights.append(replace(flight, outputs={**flight.outputs, **dict.fromkeys(lacking, zeros)}))
+        outputs = {**numbers.outputs, **{n: jnp.asarray(zeros, dtype) for n in lacking}}
+        scales = {**numbers.bias_scale, **ones}
         parts.append(
             numbers._replace(
-                outputs=dict(sorted(measured.items())),
-                bias_scale=dict(sorted(scales.items())),
+                outputs=dict(sorted(outputs.items())), bias_scale=dict(sorted(scales.items()))
             )
         )
-        states = at.layout.windows[i][0] * len(at.layout.states)
-        size = states + at.layout.constants(at.layout.outputs[i])
-        own = at.z[position : position + size]
-        more = jnp.zeros(len(lacking) if at.layout.bias else 0, at.z.dtype)
         # Biases are zero at the start values, so that only their number counts.
-        z += [own[:states], more, own[states:]]
-        position += size
+        z += [states.ravel(), np.zeros(len(lacking) if at.layout.bias else 0), constants]
     layout = layout_of(problem, tuple(flights))
-    return layout, at.data._replace(flights=tuple(parts)), jnp.concatenate(z)
+    data = at.data._replace(flights=tuple(parts))
+    return layout, data, jnp.asarray(np.concatenate(z), dtype)
 
 
 def _noises(
@@ -127,55 +141,12 @@ def _noises(
     sds = {}
     for n in lacking:
         unit = naming.unit(record, n)
-        moves = any(np.std(run[n]) > 0 for run in simulated)
         # A gyro has one noise in all its axes; of a unit that nothing measures yet that of small
         # autopilots' sensors, and of any other it is not known what it would be measured with.
         sd = float(np.median(by_unit[unit])) if unit in by_unit else TYPICAL.get(unit or "")
-        if sd is not None and moves:
+        if sd is not None and any(np.std(run[n]) > 0 for run in simulated):
             sds[n] = sd
     return sds
-
-
-def _weighed(
-    s: Sensitivity, layout: Layout, data: Data, e: Evaluation, sds: dict[str, float]
-) -> Sensitivity:
-    """The rows of further outputs over their noise, their biases in sds of weak priors."""
-    shared, own = s.shared.copy(), s.own.copy()
-    numbers = signal_numbers(layout, data)
-    for k, (_, name) in enumerate(signals(layout)):
-        if name in sds:
-            rows = np.flatnonzero(numbers == k)
-            shared[rows] /= sds[name]
-            own[rows] /= sds[name]
-    column = 0
-    for i, names in enumerate(layout.outputs):
-        column += layout.windows[i][0] * len(layout.states)
-        for j, name in enumerate(names):
-            if layout.bias and name in sds:
-                # Ten times the signal, as of the outputs that are measured.
-                own[:, column + j] *= 10.0 * float(np.sqrt(np.mean(e.simulated[i][name] ** 2)))
-        column += layout.constants(names)
-    return Sensitivity(s.unknowns, shared, own)
-
-
-def _ratios(
-    layout: Layout, data: Data, s: Sensitivity, lacking: list[str], sds: dict[str, float]
-) -> list[MissingOutput]:
-    numbers, named = signal_numbers(layout, data), [n for _, n in signals(layout)]
-    # What follows the samples are the defects between windows, which belong to every choice.
-    output = np.concatenate([np.array(named)[numbers], np.full(len(s.shared) - numbers.size, "")])
-    have = ~np.isin(output, lacking)
-    before = expected_sd(s.unknowns, triangle(s, np.flatnonzero(have)))
-    results = []
-    for name, sd in sds.items():
-        after = expected_sd(s.unknowns, triangle(s, np.flatnonzero(have | (output == name))))
-        # What nothing determines before and after is as it was; what only the further output
-        # determines is infinitely better.
-        ratio = np.where(np.isfinite(after), 0.0, 1.0)
-        both = np.isfinite(before) & np.isfinite(after) & (before > 0)
-        np.divide(after, before, out=ratio, where=both)
-        results.append(MissingOutput(name, sd, ratio, before))
-    return results
 
 
 _STEPS = (0.2, 0.5, 1.0)
@@ -186,8 +157,6 @@ _BAND = (0.1, 5.0)
 """of the chirp [Hz]"""
 _SHORT = 20_000
 """samples of a record up to which its own program serves for the candidates"""
-_FREE = 1e-3
-"""weight of weak priors where they are all that holds a parameter up"""
 
 
 class Candidate(NamedTuple):
@@ -246,27 +215,29 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     candidates = _candidates(flight, m)
     if not candidates:
         return None
-    each = _each_by_itself(problem, at, candidates, m)
-    if each is None:
-        s, layout, data = _sensitivity(problem, at, i, candidates, m)
-        each = _by_flight(s, layout, data)
-    now = sensitivity_at(problem, at.layout, e)
-    verdict = verdict_of(problem, at.layout, e)
-    lacking = {*verdict.undetermined, *verdict.without_effect}
+    now, each = sensitivity_at(problem, at.layout, e), _flown(problem, at, i, candidates, m)
+    flights, _ = row_places(at.layout, at.data, len(now.shared))
+    once_more = now.part(flights == i)
+    lacking = not_determined(problem, at.layout, e)
+    absent = np.array([u.name in lacking for u in now.unknowns])
     if lacking:
         # What only weak priors of biases and offsets hold up is not known: neither now nor then.
-        each, now = [_loosened(s) for s in each], _loosened(now)
-    R = triangle(now)
-    before = expected_sd(now.unknowns, R)
-    absent = np.array([u.name in lacking for u in now.unknowns])
+        now, *each = [s._replace(own=s.own / FREE) for s in (now, *each)]
+    R, unknowns = triangle(now), now.unknowns
+    before = expected_sd(unknowns, R)
     widest = int(np.argmax(np.where(absent, before, 0.0) if lacking else before))
-    times = flight.n_samples / m
-    sds = [_widest_sd(now, widest, together(R, repeated(triangle(s), times)), absent) for s in each]
+    times, sds = flight.n_samples / m, []
+    for s in each:
+        after = expected_sd(unknowns, together(R, np.sqrt(times) * triangle(s)))
+        # Parameters that are not determined now take part in one another.
+        lost = np.any(after[absent] >= DETERMINES)
+        sds.append(np.inf if lost else float(after[widest]))
     best = int(np.argmin(sds))
+    again = expected_sd(unknowns, together(R, triangle(once_more)))
     return Plan(
-        now.unknowns[widest].name,
+        unknowns[widest].name,
         np.inf if lacking else float(before[widest]),
-        np.inf if lacking else _again(now, at, i, widest),
+        np.inf if lacking else float(again[widest]),
         candidates[best],
         sds[best],
         flight.n_samples * flight.dt,
@@ -275,41 +246,46 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     )
 
 
-def _again(now: Sensitivity, at: Solution, i: int, widest: int) -> float:
-    """The widest sd with the i-th flight flown once more."""
-    T = triangle(_by_flight(now, at.layout, at.data)[i])
-    return float(expected_sd(now.unknowns, together(triangle(now), T))[widest])
+def _flown(
+    problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
+) -> list[Sensitivity]:
+    """The rows of each candidate, a flight of m samples that begins as the i-th one does."""
+    flight, numbers, model = problem.training[i], at.data.flights[i], problem.model
+    dtype, (states, constants) = at.z.dtype, own_unknowns(at.layout, at.z)[i]
 
+    def of_length(n: int) -> Layout:
+        inputs, outputs = (dict.fromkeys(s, np.zeros(n)) for s in (flight.inputs, flight.outputs))
+        # Held between samples: steps are, and of a chirp it makes no difference to the comparison.
+        unlogged = {"instruments": {}, "hold": {}, "hold_reason": {}}
+        return layout_of(problem, (replace(flight, inputs=inputs, outputs=outputs, **unlogged),))
 
-def _widest_sd(now: Sensitivity, widest: int, R: np.ndarray, absent: np.ndarray) -> float:
-    """Of the parameter with the widest interval; inf while any of those that are not determined now
-    (q,) is not: they take part in one another."""
-    sds = expected_sd(now.unknowns, R)
-    return np.inf if np.any(sds[absent] >= DETERMINES) else float(sds[widest])
-
-
-def _loosened(s: Sensitivity) -> Sensitivity:
-    """The same with weak priors that hold nothing up."""
-    return s._replace(own=s.own / _FREE)
-
-
-def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[Sensitivity]:
-    """The rows of each flight by itself."""
-    flight = np.repeat(np.arange(len(layout.outputs)), [len(names) for names in layout.outputs])
-    rows = flight[signal_numbers(layout, data)]
-    samples = rows.size
-    # Of a filter the same number of rows follows once more, for its variances.
-    extra = np.full(len(s.shared) - samples, -1)
-    if not layout.estimator.rows_are_samples and extra.size >= samples:
-        extra[extra.size - samples :] = rows
-    elif layout.continuity is not None:
-        extra = np.repeat(
-            np.arange(len(layout.windows)),
-            [(count - 1) * len(layout.states) for count, _ in layout.windows],
+    # The record's program is compiled already. Behind the end of a candidate nothing is measured
+    # there, and rows are zero. Another record is too long for that, or is not flown like this.
+    n, layout = flight.n_samples, at.layout
+    in_one_piece = model.linear and n <= _SHORT and layout.windows == ((1, n),)
+    if not (in_one_piece and layout == of_length(n)):
+        n, layout = m, replace(of_length(m), windows=((1, m),), continuity=None)
+    # A linear model is at rest with neutral sticks alone, and would respond to others as to a step;
+    # another begins in the state and with the sticks that the record begins with.
+    moves = 0.0 if model.linear else 1.0
+    rest = {k: np.full(n, moves * float(u[0])) for k, u in flight.inputs.items()}
+    begin = moves * states[0]
+    shared = np.asarray(at.z)[: at.layout.first_nuisance]
+    z = jnp.asarray(np.concatenate([shared, begin, 0.0 * constants]))
+    measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
+    noise = at.noise._replace(sd=(at.noise.sd[i],))
+    each = []
+    for candidate in candidates:
+        moved = rest[candidate.input] + np.pad(candidate.values, (0, n - m))
+        inputs = {**rest, candidate.input: moved}
+        part = numbers._replace(
+            inputs=model.Inputs(**{k: jnp.asarray(v, dtype) for k, v in inputs.items()}),
+            outputs=dict.fromkeys(numbers.outputs, measured),
         )
-    rows = np.concatenate([rows, extra])
-    each = [np.flatnonzero(rows == i) for i in range(len(layout.outputs))]
-    return [s._replace(shared=s.shared[at], own=s.own[at]) for at in each]
+        data = at.data._replace(flights=(part,))
+        s = sensitivity_at(problem, layout, evaluate(layout, data, noise, z))
+        each.append(s.part(row_places(layout, data, len(s.shared))[0] == 0))
+    return each
 
 
 def _candidates(flight: Flight, m: int) -> list[Candidate]:
@@ -322,7 +298,9 @@ def _candidates(flight: Flight, m: int) -> list[Candidate]:
         for step in _STEPS:
             # At least one whole doublet in the candidate.
             if 3 * step <= m * flight.dt:
-                doublets = amplitude * _doublets(m, flight.dt, step)
+                # One side, the other, and as long of neutral, over and over.
+                phase = np.arange(m) // max(1, round(step / flight.dt)) % 3
+                doublets = amplitude * np.array([1.0, -1.0, 0.0])[phase]
                 candidates.append(Candidate(name, f"doublets, {step:g} s a side", doublets))
             if 8 * step <= m * flight.dt:
                 steps = amplitude * multistep_3211(m, flight.dt, rng, step, step)
@@ -332,99 +310,3 @@ def _candidates(flight: Flight, m: int) -> list[Candidate]:
             words = f"a sine that rises from {low:.2g} to {high:.2g} Hz"
             candidates.append(Candidate(name, words, amplitude * chirp(m, flight.dt, low, high)))
     return candidates
-
-
-def _doublets(m: int, dt: float, step: float) -> Float[np.ndarray, " m"]:
-    """One side, the other, and as long of neutral, over and over."""
-    samples = max(1, round(step / dt))
-    phase = (np.arange(m) // samples) % 3
-    return np.where(phase == 0, 1.0, np.where(phase == 1, -1.0, 0.0))
-
-
-def _of_length(
-    flight: Flight, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]
-) -> Flight:
-    """The flight with other signals; what else was logged is not as long as these."""
-    return replace(flight, inputs=inputs, outputs=outputs, instruments={}, hold={}, hold_reason={})
-
-
-def _each_by_itself(
-    problem: Problem, at: Solution, candidates: list[Candidate], m: int
-) -> list[Sensitivity] | None:
-    """The rows of each candidate in the program of the record, which is compiled already; None
-    where the record has another one, or is so long that a program of their own is done sooner."""
-    flight, numbers = problem.training[0], at.data.flights[0]
-    n, model, dtype = flight.n_samples, problem.model, at.z.dtype
-    if len(problem.training) > 1 or n > _SHORT or not model.linear or numbers.by_instrument:
-        return None
-    rest = {name: np.zeros(n) for name in flight.inputs}
-    # Alike but for what is logged: held inputs, one window.
-    like = _of_length(flight, rest, {name: np.zeros(n) for name in flight.outputs})
-    if layout_of(problem, (like,)) != at.layout or at.layout.windows != ((1, n),):
-        return None
-    # Behind the end of a candidate nothing is measured, and rows of that are zero.
-    measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
-    z = _joined(at, [_begins_as(at, 0, linear=True)])
-    sensitivities = []
-    for candidate in candidates:
-        inputs = {**rest, candidate.input: np.pad(candidate.values, (0, n - m))}
-        part = numbers._replace(
-            inputs=model.Inputs(**{k: jnp.asarray(v, dtype) for k, v in inputs.items()}),
-            outputs=dict.fromkeys(numbers.outputs, measured),
-        )
-        data = at.data._replace(flights=(part,))
-        s = sensitivity_at(problem, at.layout, evaluate(at.layout, data, at.noise, z))
-        sensitivities += _by_flight(s, at.layout, data)
-    return sensitivities
-
-
-def _sensitivity(
-    problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
-) -> tuple[Sensitivity, Layout, Data]:
-    """The rows of all candidates, each a flight of m samples that begins as the i-th one does."""
-    flight, numbers = problem.training[i], at.data.flights[i]
-    linear, dtype = problem.model.linear, at.z.dtype
-    # Held between samples: steps are, and of a chirp it makes no difference to the comparison. A
-    # linear model is at rest with neutral sticks alone, and would answer to others as to a step;
-    # another begins with the sticks that the record begins with.
-    parts, flights = [], []
-    for candidate in candidates:
-        inputs = {}
-        for n, u in flight.inputs.items():
-            rest = np.full(m, 0.0 if linear else float(u[0]))
-            inputs[n] = rest + candidate.values if n == candidate.input else rest
-        outputs = {n: np.zeros(m) for n in flight.outputs}
-        flights.append(_of_length(flight, inputs, outputs))
-        record: Any = problem.model.Inputs
-        parts.append(
-            numbers._replace(
-                inputs=record(**{n: jnp.asarray(inputs[n], dtype) for n in naming.names(record)}),
-                outputs={n: jnp.zeros(m, dtype) for n in numbers.outputs},
-            )
-        )
-    layout = replace(
-        layout_of(problem, tuple(flights)), windows=((1, m),) * len(parts), continuity=None
-    )
-    data = at.data._replace(flights=tuple(parts))
-    noise = Noise((at.noise.sd[i],) * len(parts), at.noise.log_variance_ratio)
-    own = _begins_as(at, i, linear)
-    z = _joined(at, [own] * len(parts))
-    return sensitivity_at(problem, layout, evaluate(layout, data, noise, z)), layout, data
-
-
-def _joined(at: Solution, flights: list[np.ndarray]) -> jax.Array:
-    """The unknowns of the problem, and behind them those of the flights one by one."""
-    # In NumPy, as they are made: each operation by itself would be a program to load.
-    return jnp.asarray(np.concatenate([np.asarray(at.z)[: at.layout.first_nuisance], *flights]))
-
-
-def _begins_as(at: Solution, i: int, linear: bool) -> np.ndarray:
-    """The initial state of the i-th flight's first window, and no bias."""
-    layout, position = at.layout, at.layout.first_nuisance
-    for j in range(i):
-        position += layout.windows[j][0] * len(layout.states)
-        position += layout.constants(layout.outputs[j])
-    states = np.asarray(at.z)[position : position + len(layout.states)]
-    # A linear machine begins at rest, wherever the record begins.
-    states = np.zeros_like(states) if linear else states
-    return np.concatenate([states, np.zeros(layout.constants(layout.outputs[i]), states.dtype)])

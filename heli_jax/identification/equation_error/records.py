@@ -219,6 +219,11 @@ class Structure(NamedTuple):
         """The states that nothing measured shows."""
         return tuple(i for i in range(len(self.states)) if i not in self.shown)
 
+    @property
+    def hidden_names(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(self.states[i] for i in self.hidden)
+
 
 def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[str]) -> Structure:
     """Return what is measured of the states, and which equations there are to regress.

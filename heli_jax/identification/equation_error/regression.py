@@ -215,9 +215,18 @@ def search(
         return (at(tuple(z)) or first).J * np.where(keep_sign, values(z), 1.0)
 
     z = np.where(keep_sign, 0.0, start)
-    options = {"x_scale": "jac", "ftol": _SMALL, "xtol": _SMALL, "max_nfev": _EVALUATIONS}
-    found = least_squares(residuals, z, slopes, method="lm", **options)
-    return values(found.x), at(tuple(found.x)) or first
+    end = least_squares(
+        residuals,
+        z,
+        slopes,  # pyright: ignore[reportArgumentType]
+        # MINPACK's takes no fewer residuals than parameters.
+        method="lm" if first.r.size >= start.size else "trf",
+        x_scale="jac",
+        ftol=_SMALL,
+        xtol=_SMALL,
+        max_nfev=_EVALUATIONS,
+    ).x
+    return values(end), at(tuple(end)) or first
 
 
 # Standard errors and partial F-ratios of a regression whose residuals are autocorrelated.

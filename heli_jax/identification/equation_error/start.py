@@ -15,7 +15,6 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model, require_constants
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error.records import (
-    Structure,
     coefficients,
     generic,
     hidden_constants,
@@ -136,12 +135,48 @@ def equation_error_start(
         ValueError: nothing can be regressed, or a parameter has no start; the sentence says why
             and what to do.
     """
+    flights = [f for f in flights if not f.hold_out]
+    regression, half, reasons = _regression(model, vehicle, flights, free)
+    optimum = _optimum(regression, free)
+    # One parameter at a time is left out, and the rest regressed again: of two that are
+    # exchangeable only one has to go, and the other is determined as soon as the first is held.
+    while (out := _undetermined(regression, optimum.rows)) is not None:
+        name, reasons[name] = out
+        _require_value(regression.base, name, reasons[name])
+        regression = regression._replace(names=tuple(n for n in regression.names if n != name))
+        if not regression.names:
+            raise _nothing("the equations determine none of the free parameters")
+        optimum = _optimum(regression, free)
+    selection = None
+    if stepwise is not None:
+        forced = _forced(regression, free, optimum)
+        selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
+        # Terms that are out are zero from here on, and the others are regressed again: where
+        # regressors are correlated the values of those that stay move.
+        out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
+        regression = regression._replace(names=selection.selected, base={**regression.base, **out})
+        optimum = _optimum(regression, free) if selection.selected else optimum
+    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
+    estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
+    return EquationErrorStart(
+        {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n)) for n in free},
+        _explained(regression, optimum),
+        half * flights[0].dt,
+        tuple(dict.fromkeys(n for one in regression.records for n in one.structure.hidden_names)),
+        selection,
+    )
+
+
+def _regression(
+    model: Model, vehicle: Any, flights: Sequence[Flight], free: Mapping[str, Free]
+) -> tuple[Regression, int, dict[str, str]]:
+    """The flights smoothed, the kernel's half width [samples], and by parameter that no regression
+    finds the reason."""
     if not model.linear:
         raise ValueError(
             f"start: equation-error is for linear models, and {model.name} is none: expected a "
             "start of each free parameter"
         )
-    flights = [f for f in flights if not f.hold_out]
     stated = {n: f.start for n, f in free.items() if math.isfinite(f.start)}
     base = {n: float(np.asarray(v)) for n, v in naming.asdict(vehicle).items()} | stated
     # What is free has generic numbers: NaN is left only where a constant is missing that somebody
@@ -152,71 +187,38 @@ def equation_error_start(
         require_constants(model, model.Params(**{**some, **flight.known}))
         both = coefficients(model, {**some, **flight.known}, list(free), generic(len(free)))
         structures.append(structure(model, both, list(flight.outputs)))
-    lags, constants = dict(model.delays), hidden_constants(model, some, structures)
+    delays, constants = dict(model.delays), hidden_constants(model, some, structures)
     reasons = {
         n: "a delay is found by no regression"
-        if n in lags.values()
+        if n in delays.values()
         else "it is a time constant or frequency of states that are not measured"
         for n in free
         if n in constants
     }
     names = tuple(n for n in free if n not in constants)
-    if not (names and any(s.rows for s in structures)):
-        raise _nothing(flights, structures, names)
+    if not any(s.rows for s in structures):
+        if any(s.shown for s in structures):
+            raise _nothing("no equation of a measured state has a free parameter")
+        measured = ", ".join({n: None for f in flights for n in f.outputs})
+        raise _nothing(f"no output ({measured}) shows a state by itself", ", or other outputs")
+    if not names:
+        raise _nothing("all that is free are delays, or time constants of hidden states")
     for n, why in reasons.items():
         _require_value(base, n, why)
     half, records = kernel_width(flights), []
     for flight, shown in zip(flights, structures, strict=True):
-        late = {u: {**base, **flight.known}[p] for u, p in lags.items()}
+        late = {u: {**base, **flight.known}[p] for u, p in delays.items()}
         records.append(record(model, flight, shown, half, late))
     records = tuple(one for one in records if one.segments and one.structure.rows)
     if not records:
-        raise ValueError(
-            "start: equation-error: no stretch without missing samples is as long as the "
-            f"smoothing needs ({shortest(half)} samples): expected a start of each free parameter"
+        raise _nothing(
+            "no stretch without missing samples is as long as the smoothing needs "
+            f"({shortest(half)} samples)"
         )
-    regression = Regression(model, base, names, records)
-    optimum = _optimum(regression, free)
-    # One parameter at a time is left out, and the rest regressed again: of two that are
-    # exchangeable only one has to go, and the other is determined as soon as the first is held.
-    while (out := _undetermined(regression, optimum.rows)) is not None:
-        name, reasons[name] = out
-        _require_value(base, name, reasons[name])
-        regression = regression._replace(names=tuple(n for n in regression.names if n != name))
-        if not regression.names:
-            raise _nothing(flights, structures, names)
-        optimum = _optimum(regression, free)
-    selection = None
-    if stepwise is not None:
-        forced = _forced(regression, free, optimum)
-        selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
-        # Terms that are out are zero from here on, and the others are regressed again: where
-        # regressors are correlated the values of those that stay move.
-        out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
-        regression = regression._replace(names=selection.selected, base={**base, **out})
-        optimum = _optimum(regression, free) if selection.selected else optimum
-    sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
-    estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
-    return EquationErrorStart(
-        {n: _value(regression, n, free[n], estimates.get(n), reasons.get(n)) for n in free},
-        _explained(regression, optimum),
-        half * flights[0].dt,
-        tuple(dict.fromkeys(s.states[i] for s in structures for i in s.hidden)),
-        selection,
-    )
+    return Regression(model, base, names, records), half, reasons
 
 
-def _nothing(
-    flights: Sequence[Flight], structures: Sequence[Structure], names: Sequence[str]
-) -> ValueError:
-    remedy = ""
-    if not any(s.shown for s in structures):
-        measured = ", ".join({n: None for f in flights for n in f.outputs})
-        why, remedy = f"no output ({measured}) shows a state by itself", ", or other outputs"
-    elif not names:
-        why = "all that is free are delays, or time constants of states that are not measured"
-    else:
-        why = "no equation of a measured state has a free parameter"
+def _nothing(why: str, remedy: str = "") -> ValueError:
     return ValueError(
         f"start: equation-error: nothing can be regressed, since {why}: expected a start of each "
         f"free parameter{remedy}"
