@@ -21,7 +21,7 @@ import scipy.special
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations
+from heli_jax.identification.estimation.evaluation import NULL, deviations
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
@@ -175,7 +175,7 @@ def sandwich(
     r = r / size
     # The singular values of J are those of its triangle, which is (q, q) however long the record.
     _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
-    kept = singular > 1e-10 * max(singular[0], 1e-300)
+    kept = singular > NULL * max(singular[0], 1e-300)
     T = right[kept].T / singular[kept]
     bread = white = T @ T.T
     if curvature is not None:
