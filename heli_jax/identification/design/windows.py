@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding, found
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
@@ -514,7 +514,7 @@ def _simulated(
     z = jnp.concatenate([at.z[: at.layout.first_nuisance], nuisances])
     here = evaluate(layout, data, noise, z)
     if states is None and problem.window is None:
-        notes = (_DIVERGES,)
+        notes = (found("windows.own-beginnings", "note"),)
         # What diverges is left out window by window.
         if problem.model.linear and np.isfinite(here.J).all():
             here = evaluate(layout, data, noise, _best_states(layout, here, z))
@@ -523,13 +523,6 @@ def _simulated(
     weights = prior_weights(layout, cuts, sizes, samples, shooting=problem.window is not None)
     s = s._replace(own=s.own / weights)
     return s, _rows_of_spans(layout, data, cuts, samples, cell), notes
-
-
-_DIVERGES = note(
-    "windows.own-beginnings",
-    "At the start values the simulation of the whole record leaves what was measured, so each "
-    "window begins where its own samples say, and check may expect more or less of the record.",
-)
 
 
 def _cuts(flights: Sequence[Flight], samples: int, cell: int) -> list[tuple[int, int, int]]:
@@ -618,12 +611,16 @@ def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight
     for choice in sorted(ranking.taken, key=lambda c: (c.window.flight, c.window.first)):
         w = choice.window
         whole = problem.training[w.flight]
-        words = (
-            f"window: auto took {w.start:.4g} s to {w.end:.4g} s of it ({choice.reason}; "
-            f"{len(ranking.taken)} windows of {ranking.length:.3g} s say "
-            f"{100 * ranking.taken[-1].efficiency:.0f} % of what all say)"
-        )
         name = f"{whole.name or w.label} {w.start:.4g}-{w.end:.4g} s"
-        taken = note("windows.chosen", words, value=ranking.taken[-1].efficiency)
+        taken = found(
+            "windows.chosen",
+            "note",
+            value=ranking.taken[-1].efficiency,
+            begin=w.start,
+            end=w.end,
+            reason=choice.reason,
+            count=len(ranking.taken),
+            length=ranking.length,
+        )
         flights.setdefault(w.flight, []).append(part(whole, w.first, w.last, name, taken))
     return {i: tuple(f) for i, f in flights.items()}
