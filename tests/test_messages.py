@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import heli_jax
+from heli_jax.identification.restarts import RESTARTS
 from heli_jax.messages import listed, messages, written
 
 ROOT = Path(heli_jax.__file__).parent
@@ -36,7 +37,8 @@ def codes_found():
 
 def test_each_code_has_words_and_all_words_have_a_code():
     assert {c for c in codes_found() if CODE.fullmatch(c)} <= messages().keys()
-    assert messages().keys() <= set(strings())
+    restarts = {f"search.{restart.name}" for restart in RESTARTS}
+    assert restarts <= messages().keys() <= {*strings(), *restarts}
 
 
 @pytest.mark.parametrize("code", sorted(messages()))

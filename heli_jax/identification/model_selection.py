@@ -11,7 +11,7 @@ import scipy.special
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Model, axes_of
-from heli_jax.finding import note
+from heli_jax.finding import found
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import estimator_of
@@ -454,5 +454,6 @@ def with_likelier_hold(
     again = refit(held.problem)
     if again.status == "not-converged" or not again.log_likelihood > fit.log_likelihood:
         return problem, fit
-    taken = note("timing.likelier-hold", held.sentence, *held.inputs)
+    late = 0.5 * max(f.dt for f in problem.training)  # a held input is, by half a sample
+    taken = found("timing.likelier-hold", "note", *held.inputs, value=held.gain, late=1e3 * late)
     return held.problem, dataclasses.replace(again, findings=(taken, *again.findings))

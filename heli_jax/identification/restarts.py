@@ -53,8 +53,6 @@ class Restart(NamedTuple):
     """in `Fit.starts`, and of the code 'search.NAME' of its finding"""
     when: Callable[[SearchState], bool]
     points: Callable[[SearchState], Iterable[StartPoint]]
-    words: str
-    """the finding where it led to the best optimum; none where empty"""
 
 
 # By windows: where a damping begins with the wrong sign, a simulation over the whole record grows
@@ -220,21 +218,8 @@ def _same_responses(at: SearchState) -> list[StartPoint]:
 
 
 RESTARTS: tuple[Restart, ...] = (
-    Restart(
-        "by-windows",
-        _diverges,
-        _by_windows,
-        "The simulation diverges at the start values, so the parameters were first fitted to short "
-        "windows of the record (multiple shooting), and the fit began from there.",
-    ),
-    Restart("further-starts", _needs_further_starts, _further_starts, ""),
-    Restart(
-        "same-responses",
-        _has_one_disturbance,
-        _same_responses,
-        "Other parameter values have the same responses to the inputs: begun from these the filter "
-        "found a better optimum (log-likelihood {after:.1f} for {before:.1f}), and this fit is the "
-        "better one.",
-    ),
+    Restart("by-windows", _diverges, _by_windows),
+    Restart("further-starts", _needs_further_starts, _further_starts),
+    Restart("same-responses", _has_one_disturbance, _same_responses),
 )
 """in the order in which they are asked"""

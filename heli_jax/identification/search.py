@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.finding import note
+from heli_jax.finding import found
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import significant_disturbances
 from heli_jax.identification.estimation.estimator import Evaluation
@@ -136,12 +136,9 @@ def search(
                 state, chosen = state._replace(best=other), runs[-1]
         if state.best is begun:
             continue
-        notes = []
-        if restart.words:
-            before, after = (log_posterior(over, o) for o in (begun, state.best))
-            words = restart.words.format(before=before, after=after)
-            notes = [note(f"search.{restart.name}", words)]
-        state = state._replace(best=state.best.after(begun, *notes))
+        before, after = (log_posterior(over, o) for o in (begun, state.best))
+        note = found(f"search.{restart.name}", "note", before=before, after=after)
+        state = state._replace(best=state.best.after(begun, note))
     return SearchResult(over, state.best, table(layout, data, runs, chosen))
 
 

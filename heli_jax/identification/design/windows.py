@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.finding import Finding, note
+from heli_jax.finding import Finding, found
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.signal_facts import DROP_SHARE
@@ -381,8 +381,13 @@ def _simulated(
         own = start_vector(layout, data, problem)[begin:]
     z = jnp.concatenate([at.z[:begin], own])
     here = evaluate(layout, data, noise, z)
+<<<<<<< HEAD
     if states is None and not shooting:
         notes = (_DIVERGES,)
+=======
+    if states is None and problem.window is None:
+        notes = (found("windows.own-beginnings", "note"),)
+>>>>>>> words
         # What diverges is left out window by window.
         if problem.model.linear and np.isfinite(here.J).all():
             # The states and biases that explain the outputs best at these parameters.
@@ -403,6 +408,7 @@ def _simulated(
     return s, spans, notes
 
 
+<<<<<<< HEAD
 _DIVERGES = note(
     "windows.own-beginnings",
     "At the start values the simulation of the whole record leaves what was measured, so each "
@@ -413,6 +419,11 @@ _DIVERGES = note(
 def _cuts(flights: tuple[Flight, ...], samples: int, cell: int) -> list[_Span]:
     """Parts of whole cells that together hold every window: from the beginning, half a window
     later, and the end."""
+=======
+def _cuts(flights: Sequence[Flight], samples: int, cell: int) -> list[tuple[int, int, int]]:
+    """Parts (flight, first, last) of whole cells that together hold every window: from the
+    beginning, half a window later, and the end."""
+>>>>>>> words
     cuts = []
     for i, flight in enumerate(flights):
         n = flight.n_samples
@@ -515,12 +526,16 @@ def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight
     for choice in sorted(ranking.taken, key=lambda c: (c.window.flight, c.window.first)):
         w = choice.window
         whole = problem.training[w.flight]
-        words = (
-            f"window: auto took {w.start:.4g} s to {w.end:.4g} s of it ({choice.reason}; "
-            f"{len(ranking.taken)} windows of {ranking.length:.3g} s say "
-            f"{100 * ranking.taken[-1].efficiency:.0f} % of what all say)"
-        )
         name = f"{whole.name or w.label} {w.start:.4g}-{w.end:.4g} s"
-        taken = note("windows.chosen", words, value=ranking.taken[-1].efficiency)
+        taken = found(
+            "windows.chosen",
+            "note",
+            value=ranking.taken[-1].efficiency,
+            begin=w.start,
+            end=w.end,
+            reason=choice.reason,
+            count=len(ranking.taken),
+            length=ranking.length,
+        )
         flights.setdefault(w.flight, []).append(part(whole, w.first, w.last, name, taken))
     return {i: tuple(f) for i, f in flights.items()}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -19,7 +19,6 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise
-from heli_jax.numbers import percent
 from heli_jax.numerics.white_noise import noise_guess
 
 _ROUNDS = 8
@@ -121,17 +120,13 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
 
 
 def _not_settled(best: Optimum, rounds: int) -> tuple[Finding, ...]:
-    """In words that a spectrum still moved the optimum in the last of all its rounds."""
+    """Whether a spectrum still moved the optimum in the last of all its rounds."""
     moved = float(best.moved)
     if rounds < _ROUNDS_OF_SPECTRA or not bool(best.converged) or not _SETTLED <= moved < np.inf:
         return ()
-    words = (
-        f"The noise's spectrum had not settled after {rounds} rounds, which are all there are: the "
-        f"last one moved the estimates by {moved**0.5:.2g} joint standard deviations, and further "
-        "ones may move them on, by several times as much together."
+    return (
+        found("search.noise-not-settled", value=moved**0.5, rounds=rounds, limit=_SETTLED**0.5),
     )
-    limit = f"joint standard deviations, {_SETTLED**0.5:.2g}"
-    return (Finding("search.noise-not-settled", "doubt", words, moved**0.5, limit),)
 
 
 def _alternated(
@@ -306,12 +301,6 @@ def unless_stuck(
     share = gain_left(r, J, len(layout.free), at_bound)
     if share is None:
         return optimum
-    words = (
-        "The optimiser is stuck: by their slopes a modest step of the unknowns would take away "
-        f"{percent(share, 0)} of the squares, and it went no further. So it is where a simulation "
-        "grows by orders of magnitude, or parameters have a wrong sign. Remedy: windows (multiple "
-        "shooting), a shorter record, or other starts. What the data determine is not known there."
-    )
     best = optimum.best._replace(converged=np.asarray(False))
-    stuck = Finding("search.stuck", "doubt", words, share, "part of the squares")
+    stuck = found("search.stuck", value=share)
     return optimum._replace(best=best, notes=(stuck, *optimum.notes))

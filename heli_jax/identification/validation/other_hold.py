@@ -80,20 +80,6 @@ class LikelierHold(NamedTuple):
     gain: float
     """of twice the log-likelihood, to first order"""
 
-    @property
-    def sentence(self) -> str:
-        """For the notes of a fit."""
-        names, several = ", ".join(self.inputs), len(self.inputs) > 1
-        late = 0.5e3 * max(f.dt for f in self.problem.training)  # a held input is, by half a sample
-        return (
-            f"{names} {'move' if several else 'moves'} at nearly every sample, as a stick does "
-            "that is sampled on its way, and a command that is computed anew at each; "
-            f"{'they are' if several else 'it is'} taken as held between samples, since that "
-            f"explains the record better (twice the log-likelihood gains {self.gain:.3g}). A servo "
-            f"or a delay of {late:.2g} ms that the model lacks does so too. State hold: "
-            "linear or zero-order where you know which."
-        )
-
 
 def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> LikelierHold | None:
     """The problem with the inputs held that their log let be taken as linear, where the record
