@@ -13,6 +13,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights import Source
 from heli_jax.flights.cut import part
 from heli_jax.identification.design import windows as record_windows
+from heli_jax.identification.design.windows import why_excluded
 from heli_jax.identification.fit import check, windows
 from tests.identification.test_enough import DT, problem, response, steps
 

@@ -381,13 +381,8 @@ def _simulated(
         own = start_vector(layout, data, problem)[begin:]
     z = jnp.concatenate([at.z[:begin], own])
     here = evaluate(layout, data, noise, z)
-<<<<<<< HEAD
     if states is None and not shooting:
-        notes = (_DIVERGES,)
-=======
-    if states is None and problem.window is None:
         notes = (found("windows.own-beginnings", "note"),)
->>>>>>> words
         # What diverges is left out window by window.
         if problem.model.linear and np.isfinite(here.J).all():
             # The states and biases that explain the outputs best at these parameters.
@@ -408,22 +403,9 @@ def _simulated(
     return s, spans, notes
 
 
-<<<<<<< HEAD
-_DIVERGES = note(
-    "windows.own-beginnings",
-    "At the start values the simulation of the whole record leaves what was measured, so each "
-    "window begins where its own samples say, and check may expect more or less of the record.",
-)
-
-
 def _cuts(flights: tuple[Flight, ...], samples: int, cell: int) -> list[_Span]:
     """Parts of whole cells that together hold every window: from the beginning, half a window
     later, and the end."""
-=======
-def _cuts(flights: Sequence[Flight], samples: int, cell: int) -> list[tuple[int, int, int]]:
-    """Parts (flight, first, last) of whole cells that together hold every window: from the
-    beginning, half a window later, and the end."""
->>>>>>> words
     cuts = []
     for i, flight in enumerate(flights):
         n = flight.n_samples
