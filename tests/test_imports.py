@@ -125,7 +125,8 @@ def test_imports_point_one_way(name):
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
     "methods", "free", "defaults", "problem", "unknowns",
-    "estimation", "identifiability", "design", "validation", "equation_error", "result", "uncertainty",
+    "estimation", "identifiability", "design", "validation", "equation_error", "result",
+    "uncertainty",
     "agreement", "fit_notes", "assemble", "further_starts", "fit",
     "frequency_start", "method_comparison", "model_selection",
 )  # fmt: skip
