@@ -1,7 +1,7 @@
 """Findings about a record, a model or a fit, and the one rule that concludes from them.
 
 A finding is data: a stable code, a severity, its number and limit, and what it does to the
-estimates. `messages/` has the words for each code; no code reads them.
+estimates. `messages.yaml` has the words for each code; no code reads them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -84,7 +84,7 @@ def found(
     distrusts: Iterable[str] = (),
     **numbers: Any,
 ) -> Finding:
-    """A finding with the words that `messages/` has for its code.
+    """A finding with the words that `messages.yaml` has for its code.
 
     Args:
         code: of a message.

@@ -36,9 +36,7 @@ class Message(NamedTuple):
 @functools.cache
 def messages() -> Mapping[str, Message]:
     """By code its words."""
-    content: dict[str, Any] = {}
-    for path in sorted((Path(__file__).parent / "messages").glob("*.yaml")):
-        content |= read_mapping(path)
+    content = read_mapping(Path(__file__).with_suffix(".yaml"))
     return {code: Message(**words) for code, words in content.items()}
 
 

@@ -1,7 +1,7 @@
 """All that is asked of a record and of a fit: one tuple of diagnostics, for `check` and for `fit`.
 
 A diagnostic is a function of a `Context` that yields findings. To add one: a function, its entry
-here, and its words in `messages/`.
+here, and its words in `messages.yaml`.
 """
 
 from collections.abc import Callable, Iterable
@@ -58,6 +58,7 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
 
 MOOT: dict[str, tuple[str, ...]] = {
     "units.in-doubt": ("signs.rate-against-angle",),
+    "units.input-in-doubt": ("signs.rate-against-angle",),
     "signs.against-start": ("signs.rate-against-angle",),
     "timing.mode-past-nyquist": ("timing.logging-rate",),
 }
