@@ -103,7 +103,7 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     y = np.sin(np.arange(100.0))
     left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
     signals = SimpleNamespace(measured=dict.fromkeys(shares, y), simulated=left, hold_out=False)
-    of_machine = note("of.machine", "of a machine")
+    of_machine = note("adequacy.of-machine", "of a machine")
     fit = SimpleNamespace(
         estimates={
             n: Estimate(v, 0.5 * w, v - w, v + w, "1", 0.0, 0.9 if n == "b_r" else 0.0, False)
@@ -114,7 +114,6 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
         signals=[signals],
         findings=(note("of.fit", "of the fit"), of_machine),
         adequacy=SimpleNamespace(
-            findings=(of_machine,),
             judged=[OutputAdequacy(n, True, r, 1.0, True, 0.0, 0.4) for n, r in shares.items()],
         ),
         method="filter-error",

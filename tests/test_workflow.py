@@ -166,7 +166,7 @@ def test_a_check_for_other_programs(config, capsys):
     found = json.loads(capsys.readouterr().out)
     check = heli_jax.run_check(config)
     assert (found["identifiable"], found["refused"]) == (True, False)
-    assert [(f["code"], f["value"]) for f in found["record"]] == [
+    assert [(f["code"], f["value"]) for f in found["findings"]] == [
         (f.code, f.value) for f in check.findings
     ]
     sd = found["expected_relative_sd"]

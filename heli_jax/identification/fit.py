@@ -138,7 +138,12 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, at, guess.e, length)
     c = context_of(problem, guess)
     notes = (*ranking.notes, *gusts_guessed(c))
-    record = tuple(f for f in diagnose(c) if f.bad)
+    # Of a record at rest for the most part nothing follows, and a window of it may say much.
+    record = tuple(
+        f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
+        for f in diagnose(c)
+        if f.bad
+    )
     return dataclasses.replace(ranking, record=record, notes=notes)
 
 

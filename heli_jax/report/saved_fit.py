@@ -126,7 +126,9 @@ def load_fit(directory: str | Path) -> SavedFit:
             metrics=_metrics(content["metrics"]),
             validation=_metrics(content["validation"]),
             signals=_signals(directory / "signals.csv", content),
-            notes=tuple(f["sentence"] for f in content.get("findings", ())),
+            notes=tuple(
+                f["sentence"] for f in content.get("findings", ()) if f["severity"] != "ok"
+            ),
             untrusted=tuple(content.get("untrusted", {})),
             content=content,
         )

@@ -132,7 +132,7 @@ def test_they_widen_with_autocorrelated_residuals(bench_run, resting):
 def test_check_warns_of_sampling_and_excitation():
     weak = record(BENCH, seed=3, n=N, amplitude=1e-9)
     found = codes(weak, started(BENCH, 1.0, 1.0))
-    assert {"timing.logging-rate", "excitation.feeble"} <= found
+    assert {"timing.rate-not-judged", "excitation.feeble"} <= found
 
 
 def test_added_inertia_determines_all_three():

@@ -170,7 +170,7 @@ def test_an_input_whose_unit_is_in_doubt_takes_the_intervals_that_it_scales():
     source = Source("log.csv", "", inputs={"d": Signal("stick", "1", "1")})
     read = Flight(dt=DT, inputs=percent, outputs=dict(flight.outputs), source=source)
     found = fit(problem(read, Lp=Free(-1.0), Ld=Free(2.0)))
-    [one] = of(found, "units.in-doubt")
+    [one] = of(found, "units.input-in-doubt")
     assert one.subjects == ("d",)
     # Per cent or not, L is the same; B is a hundredth or not.
     assert found.untrusted == one.distrusts == ("Ld",)

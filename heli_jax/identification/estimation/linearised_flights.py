@@ -182,7 +182,8 @@ def linearisation_notes(at: Solution, e: Evaluation, names: Sequence[str]) -> li
     moved = _moved(layout, data, noise, e, left)
     if moved is None:
         return notes
-    sds = dict(zip(layout.of_interest, deviations(e.J) * np.abs(e.slopes), strict=False))
+    sizes = deviations(e.J)[: len(layout.of_interest)] * np.abs(e.slopes)
+    sds = dict(zip(layout.of_interest, sizes, strict=True))
     notable = {n: v for n, v in moved.items() if abs(v) >= _TOLD}
     words = ", ".join(f"{n} by {v:+.2g}" for n, v in notable.items()) or "no estimate by 0.1"
     share = max(float(np.max(flight.share)) for flight in left)
