@@ -1,9 +1,9 @@
 """What the fit of frequency responses weighs its errors by."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,66 +28,17 @@ from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.frequency_noise import corners_of, powers_of, shapes_of
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.frequency_noise import (
+    corners_of,
+    machine_of,
+    powers_of,
+    shapes_of,
+)
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
-from heli_jax.simulation.blocks import blockwise
-from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import between_samples
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs
-from heli_jax.simulation.stepping import held_columns, start_state
-
-# A flight's linear machine in discrete time: matrices, and simulation.
-#
-# The one place from which the fit of responses takes them: a model that is linearised at a flight's
-# trim need only be put in here.
-
+from heli_jax.identification.unknowns.layout import Data, Layout
 
 _LAGS = 48
 """lags, from a sample to the record's length, at which an impulse response is looked at"""
-
-
-class Machine(NamedTuple):
-    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
-
-    Ad: Float[Array, "n n"]
-    B: Float[Array, "n r"]
-    U: Float[Array, "N r"]
-    """inputs now, late ones, and next ones"""
-    acting: Float[Array, "N m"]
-    C: Float[Array, "p n"]
-    D: Float[Array, "p m"]
-    x0: Float[Array, " n"]
-
-    def simulated(self, block: int) -> Float[Array, "p N"]:
-        """The outputs from the first sample on.
-
-        Args:
-            block: samples in a step of the recurrence.
-        """
-        dt = jnp.ones((), self.Ad.dtype)
-        args = ZeroOrderHoldArgs(None, tuple(self.U.T), dt, None, Discrete(self.Ad, self.B, None))
-        states = jnp.stack(blockwise(args, block, tuple(self.x0)))
-        return self.C @ states + self.D @ self.acting.T
-
-
-def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:
-    """The i-th flight's, with the outputs that it measures.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns.
-        i: the flight's number.
-    """
-    model, drive = layout.model, driven(layout, data, u, i)
-    model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    x0 = start_state(model, drive.params, drive.state, drive.inputs)
-    return Machine(Ad, B, U, acting, C[rows], D[rows], naming.ravel(x0, Ad.dtype))
 
 
 def forgets(
@@ -371,19 +322,9 @@ def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed
         z: the unknowns.
         w: the flights in windows.
     """
-    Ad, C = (np.asarray(v, float) for v in _matrices(layout, data, z))
-    rows = [naming.names(layout.model.Outputs).index(n) for n in w.outputs]
-    return described(Ad, C[rows], w)
-
-
-@eqx.filter_jit
-def _matrices(
-    layout: Layout, data: Data, z: Float[Array, " q"]
-) -> tuple[Float[Array, "n n"], Float[Array, "p n"]]:
-    """Ad from sample to sample, and C of all outputs of the model."""
-    u = unpack(layout, data, z)
-    C = jacobians(layout.model, driven(layout, data, u, 0).params)[2]
-    return machine_of(layout, data, u, 0).Ad, jnp.asarray(C)
+    seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
+    machine = machine_of(seen, data, z)
+    return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
 
 
 class _Cells(NamedTuple):
