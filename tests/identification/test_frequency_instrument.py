@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
-from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,

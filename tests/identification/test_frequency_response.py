@@ -10,7 +10,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
-from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectra import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
 from heli_jax.identification.estimation.frequency_lines import Matrices, Signals
 from heli_jax.identification.estimation.frequency_response import simulated_outputs

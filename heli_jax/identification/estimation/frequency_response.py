@@ -34,8 +34,7 @@ from heli_jax.analysis.response_agreement import (
     expected_interval,
     pair_agreements,
 )
-from heli_jax.analysis.response_errors import noise_density, response_of
-from heli_jax.analysis.windowed import Windowed, window_transforms
+from heli_jax.analysis.spectra import Windowed, window_transforms
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
@@ -54,8 +53,10 @@ from heli_jax.identification.estimation.response_weights import (
     back,
     first_weights,
     gusts_through,
+    noise_density,
     on_device,
     outputs_that_forget,
+    response_of,
     weighed,
 )
 from heli_jax.identification.estimation.simulated_flights import (
