@@ -21,7 +21,7 @@ from coverage_cases.disturbed import matrices, response
 from frequency_error import DT, NAMES, NOISE, SAMPLES, TAU, VEHICLE, steps
 
 from heli_jax import Flight, Free, Problem, fit, models, naming
-from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.result import Fit
 
 jax.config.update("jax_enable_x64", True)

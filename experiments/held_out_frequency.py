@@ -16,7 +16,7 @@ from coverage_cases.disturbed import response
 from frequency_error import DT, NAMES, NOISE, TAU, VEHICLE, steps
 
 from heli_jax import Flight, Free, Problem, fit, models, naming
-from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import ResponseOptions
 
 jax.config.update("jax_enable_x64", True)
 HELD = 3000

@@ -16,9 +16,7 @@ from frequency_error import DT, NAMES, SAMPLES, steps
 from frequency_response import bound, one_fit, record
 
 from heli_jax import Flight
-from heli_jax.analysis import response_errors
-from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.windowed import windowed
+from heli_jax.analysis.spectra import ResponseOptions, windowed
 from heli_jax.identification.estimation import frequency_response, response_weights
 
 jax.config.update("jax_enable_x64", True)
@@ -52,7 +50,7 @@ def main(runs: int, window: float, first: int) -> None:
         "mean alone": [alone],
         "mean alone, over two lines": [
             alone,
-            mock.patch.object(response_errors, "_ENOUGH", np.inf),
+            mock.patch.object(response_weights, "_ENOUGH", np.inf),
         ],
     }
     print("| spectrum | " + " | ".join(NAMES) + " |\n|---|" + "---|" * len(NAMES))

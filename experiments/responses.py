@@ -21,7 +21,8 @@ from r50_record import DT
 
 from heli_jax import Flight, naming
 from heli_jax.analysis.flight_responses import Settings, flight_responses
-from heli_jax.analysis.spectral import cross_spectra, responses
+from heli_jax.analysis.responses import responses
+from heli_jax.analysis.spectra import cross_spectra
 
 jax.config.update("jax_enable_x64", True)
 signal: Any = scipy.signal

@@ -11,7 +11,7 @@ from heli_jax.analysis.attitude_responses import (
     measured_handling,
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
-from heli_jax.analysis.response_curves import COHERENT, octave_mean
+from heli_jax.analysis.spectra import COHERENT, octave_mean
 from heli_jax.config.experiment import Experiment, resolved
 from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig

@@ -25,7 +25,7 @@ import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, flight_responses
-from heli_jax.analysis.spectral import OVERLAP
+from heli_jax.analysis.spectra import OVERLAP
 
 jax.config.update("jax_enable_x64", True)
 signal: Any = scipy.signal

@@ -15,37 +15,37 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.response_curves import octave_mean
-from heli_jax.analysis.spectral import (
+from heli_jax.analysis.responses import (
+    Z95,
+    TooFewAveragesError,
+    averaged,
+    combined,
+    independent_shares,
+    responses,
+    student95,
+    weights_by_output,
+    without_ends,
+)
+from heli_jax.analysis.spectra import (
+    HIGHEST,
+    LONGEST,
     OVERLAP,
     OWN,
     CrossSpectra,
-    TooFewAveragesError,
-    combined,
     cross_spectra,
     leakage,
-    responses,
+    octave_mean,
+    one_rate,
+    require_window,
     segment_transforms,
-    weights_by_output,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
-from heli_jax.analysis.window_errors import (
-    Z95,
-    averaged,
-    independent_shares,
-    student95,
-    without_ends,
-)
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import without_jumps
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.flights.parts import spans
 
-_LONGEST = 30.0
-"""window [s] unless one is stated: what rotorcraft responses are usually taken from"""
-_HIGHEST = 0.4
-"""of the rate: above it an anti-aliasing filter has changed what was logged"""
 _ROUNDS = 2
 """in which a transfer function is fitted again without what the windows add to it"""
 _MOST_SAID = 3
@@ -165,7 +165,7 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     dt = one_rate(flights)
     flights = [without_jumps(f) for f in flights]
     longest = max(f.duration for f in flights)
-    window = settings.window or min(longest / 5.0, _LONGEST)
+    window = settings.window or min(longest / 5.0, LONGEST)
     require_window(window, longest + dt)
     inputs = [n for n in flights[0].inputs if any(_moves(f.inputs[n]) for f in flights)]
     if not inputs:
@@ -208,50 +208,20 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
 
 
-def require_window(window: float, longest: float) -> None:
-    """Refuse windows that no record holds.
-
-    Args:
-        window: length [s]
-        longest: of the flights [s]
-
-    Raises:
-        ValueError: the window is longer.
-    """
-    if window > longest * (1.0 + 1e-9):
-        raise ValueError(
-            f"window: the longest flight is {longest:.4g} s, too short for a window of "
-            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
-        )
-
-
-def one_rate(flights: Sequence[Flight]) -> float:
-    """The sample time [s] of flights that share it.
-
-    Raises:
-        ValueError: they do not.
-    """
-    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
-    if len(rates) > 1:
-        listed = ", ".join(f"{r:g}" for r in rates)
-        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return float(flights[0].dt)
-
-
 def _frequencies(settings: Settings, window: float, dt: float, step: float) -> np.ndarray:
     # Fewer than two periods in a window are not told from its own shape; what moves faster than
     # an input was logged nothing is known of.
-    low, high = settings.band or (2.0 / window, _HIGHEST / step)
+    low, high = settings.band or (2.0 / window, HIGHEST / step)
     if not low < high:
         if settings.window is None and settings.band is None:
-            least = 2.0 * step / _HIGHEST
+            least = 2.0 * step / HIGHEST
             raise ValueError(
                 f"the longest flight is {5.0 * window:.3g} s, too short for responses at "
                 f"{1.0 / step:.4g} Hz; expected more than {5.0 * least:.3g} s, five windows of "
                 "two periods at the highest frequency"
             )
         raise ValueError(
-            f"window: expected one of more than {2.0 * step / _HIGHEST:.3g} s, got {window:g} s"
+            f"window: expected one of more than {2.0 * step / HIGHEST:.3g} s, got {window:g} s"
         )
     if high >= 0.5 / dt:
         raise ValueError(

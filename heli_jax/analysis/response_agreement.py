@@ -6,7 +6,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Complex, Float
 
-from heli_jax.analysis.windowed import Windowed
+from heli_jax.analysis.spectra import COHERENT, Windowed, octave_mean
 
 USUAL_J = 100.0
 """at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
@@ -166,7 +166,6 @@ def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.
     """Over frequencies about equally spaced in the logarithm, as it is usually taken; where the
     response is coherent, since errors of noise in decibels know no bound."""
     # Here: it brings SciPy's optimiser, which takes longer to import than this to run.
-    from heli_jax.analysis.response_curves import COHERENT, octave_mean
     from heli_jax.analysis.transfer_fit import Measured, mismatch
 
     used = used & (octave_mean(2.0 * np.pi * w.hz, of_pair[2]) >= COHERENT)

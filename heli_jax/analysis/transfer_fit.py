@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.window_errors import independent_shares, student95
+from heli_jax.analysis.responses import independent_shares, student95
 
 _ROUNDS = 12
 """of Sanathanan and Koerner's iteration; it settles in a handful"""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from heli_jax import naming, units
-from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectra import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights

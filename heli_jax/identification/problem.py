@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.dynamics.check_model import cannot_start, check_model
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
 from heli_jax.dynamics.model import Model, require_constants, require_linear

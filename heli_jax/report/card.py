@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.response_curves import COHERENT
+from heli_jax.analysis.spectra import COHERENT
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.methods import estimator_of

@@ -27,9 +27,9 @@ from heli_jax.analysis.response_curves import (
     Point,
     linear_responses,
     modelled_curve,
-    octave_mean,
     without_hold,
 )
+from heli_jax.analysis.spectra import octave_mean
 from heli_jax.finding import Finding, note
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem

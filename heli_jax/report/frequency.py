@@ -19,13 +19,12 @@ from heli_jax.analysis.operating_point import (
     OperatingPoint,
     operating_point,
 )
-from heli_jax.analysis.spectral import (
+from heli_jax.analysis.spectra import (
     OWN,
     leakage,
     partial_coherence,
     segment_transforms,
     size_of,
-    spectra,
     without,
 )
 from heli_jax.dynamics.model import Model
@@ -279,7 +278,9 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     segments = segments_of(u.size, dt, memory)
     if isinstance(segments, str):
         return segments
-    omega, Suu, Syy, Suy = spectra(u, y, dt, segments.length)
+    of_both = segment_transforms(np.stack([u, y]), dt, segments.length)
+    omega, S = of_both.omega, of_both.density
+    Suu, Syy, Suy = S[:, 0, 0].real, S[:, 1, 1].real, S[:, 0, 1]
     # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
     # are coherent as well; and of zero frequency the segments' straight lines left nothing.
     own = (Suu > OWN * leakage(Suu)) & (Syy > OWN * leakage(Syy))

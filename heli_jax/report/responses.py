@@ -10,7 +10,7 @@ import numpy as np
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
-from heli_jax.analysis.response_curves import COHERENT
+from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table

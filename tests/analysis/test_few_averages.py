@@ -6,8 +6,8 @@ import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.responses import averaged, student95
 from heli_jax.analysis.transfer_fit import TransferFit
-from heli_jax.analysis.window_errors import averaged, student95
 
 DT, TRUTH = 0.05, (80.0, 5.0, 40.0)  # 80 / (s^2 + 5 s + 40)
 

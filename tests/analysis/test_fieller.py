@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from heli_jax.analysis.spectral import CrossSpectra, responses
+from heli_jax.analysis.responses import responses
+from heli_jax.analysis.spectra import CrossSpectra
 
 RESPONSE, WINDOWS, DRAWS = 2.0 - 1.0j, 20, 4000
 

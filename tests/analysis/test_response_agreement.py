@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from heli_jax.analysis.response_agreement import _J, ResponseAgreement
-from heli_jax.analysis.windowed import Windowed
+from heli_jax.analysis.spectra import Windowed
 
 
 def test_what_lies_above_a_sweep_has_no_part_in_J():

@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.analysis.spectral import (
-    TooFewAveragesError,
-    combined,
-    cross_spectra,
-    responses,
-    weights_by_output,
-)
+from heli_jax.analysis.responses import TooFewAveragesError, combined, responses, weights_by_output
+from heli_jax.analysis.spectra import cross_spectra
 
 DT = 0.02
 BAND = 2.0 * np.pi * np.arange(4, 60) / 20.0

@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, flight_responses
-from heli_jax.analysis.spectral import OVERLAP, cross_spectra
+from heli_jax.analysis.spectra import OVERLAP, cross_spectra
 from heli_jax.report.responses import useful_band
 
 DT, N = 0.02, 6000

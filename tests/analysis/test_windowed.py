@@ -5,7 +5,8 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight
-from heli_jax.analysis.response_errors import (
+from heli_jax.analysis.spectra import PairOptions, ResponseOptions, windowed
+from heli_jax.identification.estimation.response_weights import (
     averages,
     covariance,
     noise_density,
@@ -14,8 +15,6 @@ from heli_jax.analysis.response_errors import (
     response_of,
     whitening,
 )
-from heli_jax.analysis.response_options import PairOptions, ResponseOptions
-from heli_jax.analysis.windowed import windowed
 
 DT, N, L = 0.05, 600, 100
 

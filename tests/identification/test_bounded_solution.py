@@ -3,16 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from heli_jax import Flight
 from heli_jax.flights.instruments import own_instruments
-from heli_jax.identification.estimation.response_weights import Machine
-from heli_jax.identification.estimation.window_errors import (
+from heli_jax.identification.estimation.frequency_lines import Matrices, Signals
+from heli_jax.identification.estimation.frequency_response import (
     bounded_outputs,
-    driven_by,
-    ends_outputs,
-    output_slopes,
     resolved,
     span,
 )
@@ -25,16 +21,17 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
     A = np.array([[1.08, 0.0, 0.1], [0.3, 1.0, 0.0], [0.0, 0.0, 0.7]])
     B, C, D = (rng.standard_normal(s) for s in ((3, 2), (2, 3), (2, 2)))
     U, x = rng.standard_normal((samples, 2)), rng.standard_normal(3)
-    machine = Machine(*(jnp.asarray(v) for v in (A, B, U, U, C, D, x)))
+    machine = Matrices(*(jnp.asarray(v) for v in (A, B, C, D)))
+    signals = Signals(jnp.asarray(U), jnp.asarray(U))
     y = np.zeros((2, samples))
     for k in range(samples):
         y[:, k] = C @ x + D @ U[k]
         x = A @ x + B @ U[k]
-    at = resolved(machine.Ad, machine.C, samples)
-    left = (y - np.asarray(bounded_outputs(machine, driven_by(machine, at, None)))).ravel()
-    basis = np.moveaxis(np.asarray(ends_outputs(at, samples)), 1, 0).reshape(3, -1).T
+    at = resolved(machine, samples)
+    left = (y - np.asarray(bounded_outputs(machine, signals, at, None))).ravel()
+    basis = np.moveaxis(np.asarray(at.ends(samples)), 1, 0).reshape(3, -1).T
     ends = np.linalg.lstsq(basis, left, rcond=None)[0]
-    whole = np.asarray(bounded_outputs(machine, driven_by(machine, at, jnp.asarray(ends))))
+    whole = np.asarray(bounded_outputs(machine, signals, at, jnp.asarray(ends)))
     np.testing.assert_allclose(whole, y, atol=1e-8 * np.max(np.abs(y)))
     Q, solution = (np.asarray(v) for v in span(jnp.asarray(basis)))
     np.testing.assert_allclose(solution @ (Q.T @ left), ends, rtol=1e-6)
@@ -51,31 +48,31 @@ def test_a_state_that_no_output_shows_adds_nothing():
     assert not solution[1].any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("moving", [("U", "D"), Machine._fields[:-1]])
-def test_slopes_of_the_bounded_solution_are_those_of_forward_differentiation(moving):
+def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
+    """Though the inverse for each line has no derivative of its own."""
     rng = np.random.default_rng(7)
-    shapes = ((3, 3), (3, 2), (60, 2), (60, 2), (2, 3), (2, 2), (3,))
-    machine = Machine(*(jnp.asarray(rng.standard_normal(s)) for s in shapes))
-    ends = jnp.asarray(rng.standard_normal(3))
-    slopes = Machine(
-        *(
-            jnp.asarray(rng.standard_normal((*s, 4))) if n in moving else None
-            for n, s in zip(Machine._fields, shapes, strict=True)
-        )
-    )
+    shapes = ((3, 3), (3, 2), (2, 3), (2, 2), (60, 2), (60, 2))
+    here, along = ([jnp.asarray(rng.standard_normal(s)) for s in shapes] for _ in range(2))
+    ends, turns = jnp.asarray(rng.standard_normal(3)), np.exp(1j * np.pi * np.arange(60) / 60)
+    z = np.exp(1j * np.pi * (2 * np.arange(60) + 1) / 60)
 
-    def outputs(m: Machine):
-        return bounded_outputs(m, driven_by(m, resolved(m.Ad, m.C, 60), ends))
+    def outputs(*v):
+        m, signals = Matrices(*v[:4]), Signals(*v[4:])
+        return bounded_outputs(m, signals, resolved(m, 60), ends)
 
-    still = Machine(*(jnp.zeros((*s, 4)) for s in shapes))
-    along = slopes._replace(**{n: v for n, v in still._asdict().items() if n not in moving})
-    expected = jax.vmap(
-        lambda d: jax.jvp(outputs, (machine,), (d,))[1], in_axes=-1, out_axes=1
-    )(along)  # fmt: skip
-    at = resolved(machine.Ad, machine.C, 60)
-    made = output_slopes(machine, slopes, at, driven_by(machine, at, ends))
-    np.testing.assert_allclose(made, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
+    def plain(A, B, C, D, U, acting):
+        lines = jnp.fft.fft(U * turns.conj()[:, None], axis=0)
+        driving = lines @ B.T + z[:, None] * ends[None]
+        X = jnp.linalg.solve(z[:, None, None] * np.eye(3)[None] - A[None], driving[:, :, None])[
+            :, :, 0
+        ]
+        return jnp.real(jnp.fft.ifft(C @ X.T, axis=1) * turns[None]) + D @ acting.T
+
+    made = jax.jvp(outputs, here, along)
+    with jax.numpy_dtype_promotion("standard"):
+        whole = jax.jvp(plain, here, along)
+    for made, expected in zip(made, whole, strict=True):
+        np.testing.assert_allclose(made, expected, atol=1e-9 * np.max(np.abs(expected)))
 
 
 def test_a_stick_is_no_instrument_of_itself():

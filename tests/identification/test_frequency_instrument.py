@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
-from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
 from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of

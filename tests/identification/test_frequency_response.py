@@ -1,6 +1,7 @@
 """Fit of frequency responses: estimates, an unstable machine in a loop, and what is refused."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
-from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectra import PairOptions, ResponseOptions
 from heli_jax.dynamics.jacobians import StateSpace
+from heli_jax.identification.estimation.frequency_lines import Matrices, Signals
+from heli_jax.identification.estimation.frequency_response import simulated_outputs
 from heli_jax.identification.estimation.residual import differentiate, rows_of
-from heli_jax.identification.estimation.response_weights import Machine, forgets
+from heli_jax.identification.estimation.response_weights import forgets
 from heli_jax.identification.search import first_guess
 from tests.identification.bench import BENCH, record, vehicle
 from tests.test_log_responses import CONFIG
@@ -57,9 +60,10 @@ def test_the_simulation_of_a_machine_is_that_of_scipy():
     A = np.array([[0.95, 0.1], [-0.2, 0.9]])
     B, C, D = (rng.standard_normal(s) for s in ((2, 2), (3, 2), (3, 2)))
     U, x0 = rng.standard_normal((90, 2)), rng.standard_normal(2)
-    machine = Machine(*(jnp.asarray(v) for v in (A, B, U, U, C, D, x0)))
+    machine = Matrices(*(jnp.asarray(v) for v in (A, B, C, D)))
+    signals = Signals(jnp.asarray(U), jnp.asarray(U))
     _, y, _ = scipy.signal.dlsim((A, B, C, D, 1.0), U, x0=x0)
-    simulated = eqx.filter_jit(Machine.simulated)(machine, 32)
+    simulated = jax.jit(simulated_outputs, static_argnums=3)(machine, signals, jnp.asarray(x0), 32)
     np.testing.assert_allclose(simulated, y.T, rtol=1e-10, atol=1e-12)
 
 

@@ -4,10 +4,13 @@ import numpy as np
 import scipy.linalg
 
 from heli_jax import Flight
-from heli_jax.analysis.response_errors import averages, noise_density
-from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.windowed import hann, windowed
-from heli_jax.identification.estimation.response_weights import described, ways_of
+from heli_jax.analysis.spectra import ResponseOptions, hann, windowed
+from heli_jax.identification.estimation.response_weights import (
+    averages,
+    described,
+    noise_density,
+    ways_of,
+)
 
 DT, L, N = 0.05, 200, 2400
 C = np.array([[1.0, 0.0], [0.3, 1.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Nuisance, Prior, Problem, models
-from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectra import PairOptions, ResponseOptions
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.model_selection import choose
 from tests.identification.bench import BENCH, record, vehicle

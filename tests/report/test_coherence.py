@@ -8,7 +8,7 @@ import scipy.signal
 
 from heli_jax import Flight, models, naming
 from heli_jax.analysis.operating_point import EVERYWHERE
-from heli_jax.analysis.spectral import partial_coherence
+from heli_jax.analysis.spectra import partial_coherence
 from heli_jax.identification.result import Signals
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report import card

@@ -23,15 +23,11 @@ from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import between_samples
-from heli_jax.simulation.stepping import held_columns
+from heli_jax.simulation.stepping import held_columns, start_state
 
 # Machines that take signals to outputs, sample by sample, and the flights that share one.
 #
 # Source: Pintelon and Schoukens (2012), chapter 6.
-
-
-_TOGETHER = 4
-"""flights of one machine side by side at most"""
 
 
 class Matrices(NamedTuple):
@@ -66,6 +62,8 @@ class Machines(NamedTuple):
     """of all of them, or with a leading axis where parameters are known of each flight"""
     signals: Signals
     """with a leading axis"""
+    x0: Float[Array, "f n"]
+    """initial states"""
     by: Signals | None
     """likewise with the inputs by instrument; None without"""
 
@@ -80,7 +78,8 @@ def alike(layout: Layout, data: Data) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
-        key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
+        facts = layout.of_flights[i : i + 1]
+        key = (n, layout.outputs[i], layout.holds[i], facts, tuple(flight.known))
         # An offset of its own moves the point about which a flight is linearised.
         key = key if layout.model.linear else (i, *key)
         groups.setdefault(key, []).append(i)
@@ -97,20 +96,27 @@ def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> 
         members: the flights' numbers.
     """
     first = members[0]
-    stacked = jax.tree.map(lambda *v: jnp.stack(v), *(data.flights[i] for i in members))
+    own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
 
-    def of_one(flight: Any) -> Machines:
+    def of_one(flight: Any, state: Any, offset: Any) -> Machines:
         # With one sample time all that does not hang on the signals is computed once.
         flight = flight._replace(dt=data.flights[first].dt)
-        matrices, signals = _machine(layout, data, u, (first, flight))
+        here = u._replace(
+            states=_with(u.states, first, state), offsets=_with(u.offsets, first, offset)
+        )
+        matrices, signals, x0 = _machine(layout, data, here, (first, flight))
         if flight.by_instrument is None:
-            return Machines(matrices, signals, None)
+            return Machines(matrices, signals, x0, None)
         # A point to linearise about knows means alone, which inputs by instrument have as well.
         by = flight._replace(inputs=flight.by_instrument)
-        return Machines(matrices, signals, _machine(layout, data, u, (first, by))[1])
+        return Machines(matrices, signals, x0, _machine(layout, data, here, (first, by))[1])
 
-    axes = Machines(None if _one_machine(data, members) else 0, 0, 0)  # pyright: ignore
-    return jax.vmap(of_one, out_axes=axes)(stacked)
+    axes = Machines(None if _one_machine(data, members) else 0, 0, 0, 0)  # pyright: ignore
+    return jax.vmap(of_one, out_axes=axes)(*jax.tree.map(lambda *v: jnp.stack(v), *own))
+
+
+def _with(values: tuple[Any, ...], i: int, value: Any) -> tuple[Any, ...]:
+    return (*values[:i], value, *values[i + 1 :])
 
 
 def _one_machine(data: Data, members: list[int]) -> bool:
@@ -119,16 +125,17 @@ def _one_machine(data: Data, members: list[int]) -> bool:
 
 def _machine(
     layout: Layout, data: Data, u: Unknowns, of: tuple[int, Any]
-) -> tuple[Matrices, Signals]:
+) -> tuple[Matrices, Signals, Float[Array, " n"]]:
     i, flight = of
-    data = data._replace(flights=(*data.flights[:i], flight, *data.flights[i + 1 :]))
-    condition = layout.of_flights[i].condition
+    data = data._replace(flights=_with(data.flights, i, flight))
+    condition = layout.of_flights[i].condition if layout.of_flights else None
     model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
     model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
     Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)
+    x0 = naming.ravel(start_state(model, drive.params, drive.state, drive.inputs), Ad.dtype)
+    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting), x0
 
 
 def by_flight(
@@ -138,6 +145,7 @@ def by_flight(
     body: Callable[[Any, Any], Any],
     common: Any,
     each: Any,
+    together: int = 4,
 ) -> Any:
     """`body(prepared(common), some of each)` over the flights of a group, with a leading axis.
 
@@ -148,12 +156,13 @@ def by_flight(
         body: of a few flights, which have a leading axis in what it is given and what it returns.
         common: of the machine; with a leading axis where each flight has its own.
         each: of the flights, with a leading axis.
+        together: flights of one machine side by side at most.
     """
     count = len(members)
     one_machine = _one_machine(data, members)
     # A few at a time: what is read for every line of a machine is then read once for all of them,
     # and what is on the way to a few sums of a flight still fits into memory.
-    size = max(n for n in range(1, _TOGETHER + 1) if count % n == 0) if one_machine else 1
+    size = max(n for n in range(1, together + 1) if count % n == 0) if one_machine else 1
     some = jax.tree.map(lambda v: v.reshape(count // size, size, *v.shape[1:]), each)
     if one_machine:
         ready = prepared(common)

@@ -17,9 +17,11 @@ Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmi
 by coherence are not used: they lose a factor of 2 to 10 in precision.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,10 +34,18 @@ from heli_jax.analysis.response_agreement import (
     expected_interval,
     pair_agreements,
 )
-from heli_jax.analysis.response_errors import noise_density, response_of
+from heli_jax.analysis.spectra import Windowed, window_transforms
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
+from heli_jax.identification.estimation.frequency_lines import (
+    Matrices,
+    Signals,
+    alike,
+    by_flight,
+    machines_of,
+)
+from heli_jax.identification.estimation.frequency_slopes import shared_of, with_shared
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
@@ -43,8 +53,10 @@ from heli_jax.identification.estimation.response_weights import (
     back,
     first_weights,
     gusts_through,
+    noise_density,
     on_device,
     outputs_that_forget,
+    response_of,
     weighed,
 )
 from heli_jax.identification.estimation.simulated_flights import (
@@ -53,10 +65,6 @@ from heli_jax.identification.estimation.simulated_flights import (
     signals,
     simulated_at,
     with_biases,
-)
-from heli_jax.identification.estimation.window_errors import (
-    errors_in_windows,
-    rows_of_responses,
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
@@ -67,6 +75,366 @@ from heli_jax.identification.unknowns.layout import (
     Unknowns,
     unpack,
 )
+from heli_jax.simulation.blocks import blockwise
+from heli_jax.simulation.discretize import Discrete
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs
+
+_NO_END = 1e-10
+"""part of the largest effect of an end below which a state has none"""
+
+
+# The model through the windows of the record.
+#
+# With $z = e^{i \pi (2 k + 1) / N}$ the sums $X = (zI - A_d)^{-1} B U$ are those of the solution
+# with $x_N = -x_0$. It is bounded where a simulation diverges, and the response over the record is
+# this and $n$ numbers times the effects of the ends: those of stable modes decay from the beginning
+# on, those of unstable ones towards the end. Lines half a line away from those of Fourier have no
+# pole of an integrator among them.
+#
+# Sources: Devasia, Chen and Paden (1996) for bounded solutions of unstable plants; Golub and
+# Pereyra (1973) and Kaufman (1975) for the projection.
+
+
+class Resolved(NamedTuple):
+    """A model at K lines of a record, without a derivative."""
+
+    R: Complex[Array, "K n n"]
+    """(zI - Ad)^-1"""
+    H: Complex[Array, "K p n"]
+    """C (zI - Ad)^-1"""
+
+    def ends(self, samples: int) -> Float[Array, "p n N"]:
+        """What the ends of a record add to the outputs, for each state.
+
+        Args:
+            samples: of the record.
+        """
+        z, turns = _lines(samples)
+        return _in_time(jnp.moveaxis(self.H * z[:, None, None], 0, -1), turns)
+
+
+def resolved(m: Matrices, samples: int) -> Resolved:
+    """A model at the lines of a record.
+
+    Args:
+        m: the model.
+        samples: of the record.
+    """
+    z, _ = _lines(samples)
+    Ad, C = (jax.lax.stop_gradient(v).astype(z.dtype) for v in (m.Ad, m.C))
+    R = jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
+    return Resolved(R, C[None] @ R)
+
+
+def bounded_outputs(
+    m: Matrices, signals: Signals, at: Resolved, ends: Float[Array, " n"] | None
+) -> Float[Array, "p N"]:
+    """The outputs over a record by the bounded solution.
+
+    Args:
+        m: the model.
+        signals: what drives it, over the record.
+        at: the model at the record's lines.
+        ends: of the states, factors of `Resolved.ends`; zero unless given.
+    """
+    z, turns = _lines(len(signals.U))
+    driving = _at_lines(signals.U, turns) @ m.B.T.astype(z.dtype)
+    if ends is not None:
+        driving = driving + z[:, None] * ends.astype(z.dtype)[None]
+    # Products in place of the derivative of an inverse: dY = H (dAd X + d driving) + dC X. What is
+    # subtracted here is zero but for its derivative.
+    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", at.R, driving))
+    dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
+    lines = jnp.einsum("kpn,kn->pk", at.H, driving + X @ dA.T) + dC @ X.T
+    return _in_time(lines, turns) + m.D @ signals.acting.T
+
+
+def simulated_outputs(
+    m: Matrices, signals: Signals, x0: Float[Array, " n"], block: int
+) -> Float[Array, "p N"]:
+    """The outputs from the first sample on.
+
+    Args:
+        m: the model.
+        signals: what drives it, over the record.
+        x0: state at the first sample.
+        block: samples in a step of the recurrence.
+    """
+    dt = jnp.ones((), m.Ad.dtype)
+    args = ZeroOrderHoldArgs(None, tuple(signals.U.T), dt, None, Discrete(m.Ad, m.B, None))
+    states = jnp.stack(blockwise(args, block, tuple(x0)))
+    return m.C @ states + m.D @ signals.acting.T
+
+
+def span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
+    """Orthonormal directions of a space, zero where a column is none of its own, and what makes the
+    columns' factors of components along them.
+
+    Args:
+        basis: what spans it.
+    """
+    sizes = jnp.linalg.norm(basis, axis=0)
+    # A state that no output shows has a column of rounding, which would take some direction off.
+    seen = sizes > max(_NO_END, 10.0 * float(jnp.finfo(basis.dtype).eps)) * jnp.max(sizes)
+    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
+    Q, R = jnp.linalg.qr(basis * over[None, :])
+    U, values, Vt = jnp.linalg.svd(R)
+    kept = values > _NO_END * values[0]
+    root = jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)
+
+    return jnp.where(kept[None, :], Q @ U, 0.0), over[:, None] * (Vt.T * root[None, :])
+
+
+def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
+    # The odd record's line at Nyquist's frequency is its own conjugate.
+    k = np.arange((N + 1) // 2)
+    return np.exp(1j * np.pi * (2 * k + 1) / N), np.exp(1j * np.pi * np.arange(N) / N)
+
+
+def _at_lines(v: Float[Array, "N *c"], turns: Complex[np.ndarray, " N"]) -> Complex[Array, "K *c"]:
+    back = np.conj(turns).reshape(-1, *(1 for _ in v.shape[1:]))
+    return jnp.fft.fft(v.astype(turns.dtype) * back, axis=0)[: (turns.size + 1) // 2]
+
+
+def _in_time(
+    lines: Complex[Array, "*c K"], turns: Complex[np.ndarray, " N"]
+) -> Float[Array, "*c N"]:
+    N, K = turns.size, lines.shape[-1]
+    weights = np.full(K, 2.0, turns.dtype)
+    if N % 2:
+        weights[-1] = 1.0
+    of_lines, in_time = (v.reshape(*(1 for _ in lines.shape[1:]), -1) for v in (weights, turns))
+    return jnp.real(jnp.fft.ifft(lines * of_lines, N, axis=-1) * in_time)
+
+
+class _Group(NamedTuple):
+    """Flights that differ in numbers alone."""
+
+    members: list[int]
+    """their numbers"""
+    starts: tuple[int, ...]
+    """first samples of the windows"""
+    simulated: np.ndarray
+    """which of the outputs in windows are simulated"""
+    bounded: np.ndarray
+    """which do not forget; the flights do not have the others"""
+
+
+def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[_Group]:
+    """Those that have windows."""
+    w, sent, made = weights.windows, np.asarray(weights.simulated), []
+    for members in alike(layout, data):
+        seen = np.array([n in layout.outputs[members[0]] for n in w.outputs])
+        if starts := w.starts[members[0]]:
+            which = (np.flatnonzero(seen & sent), np.flatnonzero(seen & ~sent))
+            made.append(_Group(members, starts, *which))
+    return made
+
+
+class _Measured(NamedTuple):
+    """Of a flight."""
+
+    y: Float[Array, "p N"]
+    """the outputs in windows; zero where nothing is measured"""
+    Z: Array | np.ndarray
+    """(W, k, m), see `Windowed`"""
+    seen: Array | np.ndarray
+    """(W, p)"""
+
+
+def _measured(data: Data, w: Windowed, members: list[int]) -> _Measured:
+    """Of each of some flights, with a leading axis."""
+    first, made = np.cumsum([0, *(len(s) for s in w.starts)]), []
+    for i in members:
+        outputs, own = data.flights[i].outputs, slice(first[i], first[i + 1])
+        absent = jnp.zeros_like(next(iter(outputs.values())))
+        y = jnp.stack([jnp.nan_to_num(outputs.get(n, absent)) for n in w.outputs])
+        made.append(_Measured(y, w.Z[own], w.seen[own]))
+    return jax.tree.map(lambda *v: jnp.stack(v), *made)
+
+
+def _by_flight(
+    layout: Layout,
+    data: Data,
+    weights: ResponseWeights,
+    u: Unknowns,
+    group: _Group,
+    ends: Float[Array, "f n"] | None,
+    body: Callable[[Array, Array | None, _Measured], Any],
+) -> Any:
+    """`body(E, effects, measured)` of each flight of a group, with a leading axis: E (p, W, k) what
+    the model misses of the outputs in windows, effects (p, n, W, k) what the ends of the record add
+    there, None where all outputs forget.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        weights: with the windows.
+        u: the unknowns.
+        group: of flights.
+        ends: of each flight; zero unless given.
+        body: of one flight.
+    """
+    w, (states, offsets) = weights.windows, weights.begun
+    N = next(iter(data.flights[group.members[0]].outputs.values())).shape[0]
+    # Numbers, not unknowns: they are found in time, since responses hardly tell them.
+    u = u._replace(states=states, offsets=offsets)
+    of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
+    machines = machines_of(of_windows, data, u, group.members)
+
+    def windows(rows: np.ndarray, y: Array) -> Complex[Array, "p *c W k"]:
+        """Of some outputs (., *c, N), zero for the others."""
+        y = jnp.zeros((len(w.outputs), *y.shape[1:]), y.dtype).at[rows].set(y)
+        E = window_transforms(y.reshape(-1, N), group.starts, w.length, w.numbers, w.dt)
+        return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
+
+    def ready(m: Matrices) -> tuple[Matrices, Resolved | None, Array | None]:
+        if not group.bounded.size:
+            return m, None, None
+        at = resolved(_of(m, group.bounded), N)
+        return m, at, windows(group.bounded, at.ends(N))
+
+    def of_some(of: tuple[Matrices, Resolved | None, Array | None], some: Any) -> Any:
+        m, at, effects = of
+
+        def of_one(signals: Signals, x0: Array, measured: _Measured, ends: Any) -> Any:
+            y = measured.y
+            if group.simulated.size:
+                own = simulated_outputs(_of(m, group.simulated), signals, x0, layout.block)
+                y = y.at[group.simulated].add(-own)
+            if at is not None:
+                own = bounded_outputs(_of(m, group.bounded), signals, at, ends)
+                y = y.at[group.bounded].add(-own)
+            return body(windows(np.arange(len(y)), y), effects, measured)
+
+        return jax.vmap(of_one)(*some)
+
+    each = (machines.signals, machines.x0, _measured(data, w, group.members), ends)
+    # One at a time: what is made of a flight's windows for each unknown fills the caches.
+    return by_flight(data, group.members, ready, of_some, machines.matrices, each, together=1)
+
+
+def _of(m: Matrices, outputs: np.ndarray) -> Matrices:
+    return m._replace(C=m.C[outputs], D=m.D[outputs])
+
+
+def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
+    """Products with the instruments in windows, summed over a flight."""
+    E = E * measured.seen.T[:, None, :, None].astype(E.dtype)
+    return jnp.einsum("wkz,pcwk->kpzc", jnp.conj(measured.Z), E)
+
+
+def _summed(each: Iterable[Array]) -> Array:
+    return jnp.sum(jnp.concatenate(list(each)), axis=0)
+
+
+def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[Array, "r c"]:
+    """What such sums over all flights make of the responses, in rows of variance 1."""
+    w, (k, c) = weights.windows, (S.shape[0], S.shape[3])
+    S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None, None]
+    dH = jnp.einsum("pkmz,kpzc->kpmc", weights.averages.P, S)
+    rows = weights.whitening @ dH.reshape(k, -1, c)
+    # Of a complex normal error each part has half of the variance.
+    return 2.0**0.5 * jnp.concatenate([jnp.real(rows), jnp.imag(rows)]).reshape(-1, c)
+
+
+def rows_of_responses(
+    layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
+) -> Float[Array, " r"]:
+    """Whitened errors of all responses, without what the ends of the records may add.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        weights: with the windows.
+        u: the unknowns, in the units of the model.
+    """
+    rest, groups = jax.lax.stop_gradient(u), _groups(layout, data, weights)
+
+    def sums(v: Array, ends: list[Array | None], body: Callable[..., Any]) -> list[Any]:
+        here = with_shared(layout, rest, v)
+        each = zip(groups, ends, strict=True)
+        return [_by_flight(layout, data, weights, here, g, end, body) for g, end in each]
+
+    def projected(v: Array) -> tuple[Array, Array | None, list[Array | None]]:
+        """The rows, directions of what the ends add, and by group the ends that suit the errors
+        best."""
+
+        def body(E: Array, effects: Array | None, own: _Measured) -> Any:
+            return _cross(own, E[:, None]), None if effects is None else _cross(own, effects)
+
+        made = sums(v, [None] * len(groups), body)
+        rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
+        effects = [of_ends for _, of_ends in made]
+        # The states of each flight in turn, as columns.
+        columns = [
+            jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for e in effects if e is not None
+        ]
+        if not columns:
+            return rows, None, [None] * len(groups)
+        Q, solution = span(_whitened(weights, jnp.concatenate(columns, axis=3)))
+        along = Q.T @ rows
+        each = iter(jnp.split(solution @ along, np.cumsum([c.shape[3] for c in columns])[:-1]))
+        ends = [None if e is None else next(each).reshape(len(e), -1) for e in effects]
+        return rows - Q @ along, Q, ends
+
+    @jax.custom_jvp
+    def rows(v: Array) -> Array:
+        return projected(v)[0]
+
+    # Once for the unknowns that all flights share, and not for each nuisance.
+    @rows.defjvp
+    def _(at: tuple[Array], along: tuple[Array]) -> tuple[Array, Array]:
+        made, Q, ends = projected(at[0])
+
+        def errors(v: Array) -> Array:
+            each = sums(v, ends, lambda E, _, own: _cross(own, E[:, None]))
+            return _whitened(weights, _summed(each))[:, 0]
+
+        J = jax.jacfwd(errors)(at[0])
+        # Variable projection: about the ends that suit these unknowns best, whose own effect moves
+        # with the unknowns.
+        J = J if Q is None else J - Q @ (Q.T @ J)
+        return made, J @ along[0]
+
+    return rows(shared_of(layout, u))
+
+
+@eqx.filter_jit
+def errors_in_windows(
+    layout: Layout, data: Data, weights: ResponseWeights, z: Array
+) -> Complex[Array, "W k p"]:
+    """Transforms of measured less modelled outputs; zero where an output is not seen.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        weights: with the windows.
+        z: the unknowns.
+    """
+    u, of_flight = unpack(layout, data, z), dict[int, Array]()
+    # Of all that is seen in the windows, each output by its noise, and not of the responses alone.
+    power = jnp.real(jnp.einsum("kii->ki", weights.density))
+
+    def left(E: Array, effects: Array | None, own: _Measured) -> Array:
+        seen = own.seen.T[:, :, None].astype(E.dtype)
+        if effects is None:
+            return E * seen
+        scale = seen / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
+
+        def rows(v: Array) -> Array:
+            v = jnp.moveaxis(v * scale[:, None], 1, -1).reshape(-1, v.shape[1])
+            return jnp.concatenate([jnp.real(v), jnp.imag(v)])
+
+        Q, solution = span(rows(effects))
+        ends = solution @ (Q.T @ rows(E[:, None])[:, 0])
+        return (E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)) * seen
+
+    for group in _groups(layout, data, weights):
+        made = _by_flight(layout, data, weights, u, group, None, left)
+        of_flight |= {i: jnp.moveaxis(made[j], 0, -1) for j, i in enumerate(group.members)}
+    return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 
 class FrequencyResponse(Estimator):

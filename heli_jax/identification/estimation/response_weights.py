@@ -1,9 +1,22 @@
-"""What the fit of frequency responses weighs its errors by."""
+"""Weights of the fit of frequency responses: covariance and whitening of the responses' errors.
 
+With Z, U, E the transforms of instruments, inputs and errors in each window, the response that is
+left in the errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
+
+    P_i V_ij P_j^H S_ij,    P = S_zu^-1,
+
+with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
+have, overlapping ones by their correlation: exact for a chirp too, whose power at one frequency is
+in one window.
+
+Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
+2, for the estimate by instrument.
+"""
+
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,83 +24,318 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Complex, Float
 
 from heli_jax import naming
-from heli_jax.analysis.response_errors import (
-    Averages,
-    averages,
-    covariance,
-    noise_density,
-    pairs_used,
-    partial_coherence,
-    response_of,
-    whitening,
+from heli_jax.analysis.responses import inverse
+from heli_jax.analysis.spectra import (
+    PER_AVERAGE,
+    STEPS,
+    PairOptions,
+    ResponseOptions,
+    Windowed,
+    hann,
+    octave_mean,
+    windowed,
 )
-from heli_jax.analysis.response_options import ResponseOptions
-from heli_jax.analysis.windowed import Windowed, hann, windowed
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.frequency_noise import corners_of, powers_of, shapes_of
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.frequency_noise import (
+    corners_of,
+    machine_of,
+    powers_of,
+    shapes_of,
+)
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
-from heli_jax.simulation.blocks import blockwise
-from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import between_samples
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs
-from heli_jax.simulation.stepping import held_columns, start_state
+from heli_jax.identification.unknowns.layout import Data, Layout
 
-# A flight's linear machine in discrete time: matrices, and simulation.
-#
-# The one place from which the fit of responses takes them: a model that is linearised at a flight's
-# trim need only be put in here.
+_WIDEST = 2.0
+"""sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window: half
+of it where averages are many enough"""
+_PART = 0.04
+"""the same as a part of the frequency, of each line"""
+_ENOUGH = 30.0
+"""independent averages for each output that a spectral matrix is taken from. A wider mean takes a
+mode of gusts for a wide one: with twice the width errors were by 20 % larger"""
+_LINES = 2.0 * np.pi**0.5 / (STEPS / PER_AVERAGE)
+"""independent lines in a Gaussian of one line, of Hann windows"""
+_NEIGHBOURS = 3
+"""lines to either side with which a line is correlated in Hann windows"""
+_ROUNDING = 1e-14
+"""of a signal's density, below which noise is not taken to fall"""
+_SMALLEST = 1e-9
+"""eigenvalue of the noise's matrix of coherences: outputs that were computed from one another have
+none of their own"""
+
+
+class Averages(NamedTuple):
+    """What the inputs alone say of the responses' errors; p outputs, m inputs, k lines."""
+
+    P: np.ndarray
+    """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
+    each output has; NaN where inputs move as one"""
+    V: np.ndarray
+    """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
+    share: np.ndarray
+    """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
+    are correlated, and responses are smooth"""
+    power: np.ndarray
+    """(k,) of white noise in a window over its density: less than 1 at the first line, of which the
+    mean takes a part"""
+
+
+def averages(w: Windowed) -> Averages:
+    """Of flights in windows."""
+    p, m, k = len(w.outputs), len(w.inputs), len(w.numbers)
+    P, share, V = [], [], np.zeros((p, p, k, m, m), complex)
+    turns = np.outer(w.lines, np.arange(w.length)) / w.length
+    g = hann(w.length) * np.exp(-2j * np.pi * turns)
+    g = g - np.mean(g, axis=1, keepdims=True)
+    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, k))]
+    # Most outputs miss samples in the same windows, or nowhere: each case once.
+    inverses: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
+    keys = [w.seen[:, j].tobytes() for j in range(p)]
+    for i, first in enumerate(keys):
+        seen = w.seen[:, i]
+        for j, second in enumerate(keys):
+            if (first, second) not in spreads:
+                spreads[first, second] = _spread(w, seen, w.seen[:, j], near[0])
+            V[i, j] = spreads[first, second]
+        if first not in inverses:
+            S = _cross(seen, w.Z, w.U)
+            z, u = (_cross(seen, v, v) for v in (w.Z, w.U))
+            of_case = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
+            inverses[first] = of_case, _share(w, seen, np.nan_to_num(of_case), near)
+        P.append(inverses[first][0])
+        share.append(inverses[first][1])
+    return Averages(np.stack(P), V, np.stack(share), np.real(near[0][0]))
+
+
+def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, m, m) mean over the windows seen of conj(a) b."""
+    return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
+
+
+def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
+    """Of the transform of white noise at each line in a window with that at the d-th line after it
+    in another window, (k - d,), by how many steps that one begins later.
+
+    Args:
+        g: windows times the turning of each line (k, samples), less their means.
+        step: from a window to the next, in samples.
+    """
+    a, b = g[: len(g) - d], np.conj(g[d:])
+    size, found = np.sum(hann(g.shape[1]) ** 2), {}
+    for j in range(1 - STEPS, STEPS):
+        first, second = max(j, 0) * step, max(-j, 0) * step
+        shared = g.shape[1] - abs(j) * step
+        products = a[:, first : first + shared] * b[:, second : second + shared]
+        found[j] = np.sum(products, axis=1) / size
+    return found
+
+
+def _spread(
+    w: Windowed, first: np.ndarray, second: np.ndarray, c: dict[int, np.ndarray]
+) -> np.ndarray:
+    """(k - d, m, m) covariance of two means of conj(Z) E of white noise E of density 1, the second
+    at the d-th line after the first."""
+    k = len(c[0])
+    a = first[:, None, None] * w.Z[:, :k]
+    b = second[:, None, None] * w.Z[:, len(w.numbers) - k :]
+    total = np.zeros((k, *a.shape[2:], b.shape[2]), complex)
+    for j, correlation in c.items():
+        later = w.later(abs(j))
+        here, there = slice(max(-j, 0), len(a) - max(j, 0)), slice(max(j, 0), len(a) - max(-j, 0))
+        x, y = a[here][later], b[there][later]
+        products = np.einsum("wkx,wky->kxy", np.conj(x), y, optimize=True)
+        total += correlation[:, None, None] * products
+    return total / (np.sum(first) * np.sum(second))
+
+
+def _share(
+    w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[dict[int, np.ndarray]]
+) -> np.ndarray:
+    """(k, m) one over the sum of an error's correlations with those at the lines around it."""
+    size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
+    for d, c in enumerate(near):
+        k = len(c[0])
+        V = _spread(w, seen, seen, c)
+        C = np.real(np.einsum("kxa,kab,kxb->kx", P[:k], V, np.conj(P[d:]), optimize=True))
+        if d == 0:
+            size = np.sqrt(np.maximum(C, 1e-300))
+            continue
+        # Where they alternate nothing is gained: no response moves that fast.
+        rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
+        total[:k] += rho
+        total[d:] += rho
+    return 1.0 / total
+
+
+def response_of(
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+) -> Complex[np.ndarray, "k p m"]:
+    """The response dH from the inputs that errors have; NaN where inputs move as one.
+
+    Args:
+        E: errors, or the outputs themselves; zero in windows that an output does not have.
+    """
+    S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
+    S = S / np.sum(w.seen, axis=0)[None, :, None]
+    return np.einsum("pkmz,kpz->kpm", at.P, S)
+
+
+def noise_density(
+    w: Windowed,
+    at: Averages,
+    E: Complex[np.ndarray, "W k p"],
+    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None = None,
+) -> Complex[np.ndarray, "k p p"]:
+    """The spectral matrix of what no response explains of the errors, smoothed over frequency.
+
+    Args:
+        E: errors (W, k, p); zero in windows that an output does not have.
+        described: of raw spectral matrices (k, q, q) of some outputs, by their place, what is known
+            of their shape: the mean over lines is taken of what is left by that (`None`: nothing).
+    """
+    own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
+    p, power = own.shape[1], np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    floor = np.maximum(_ROUNDING * power, 1e-300)
+    kernel = _kernel(w)
+    if not w.together:
+        each = [_smoothed(kernel, own[:, i, None, None], [i], described) for i in range(p)]
+        S = np.concatenate(each, axis=1) * np.eye(p)
+        return _definite(S, floor) / at.power[:, None, None]
+    # Coherences from windows that all outputs have: those of pairs would contradict one another,
+    # and the noise that seems to be left of several outputs with a common one would be anything.
+    S = _left(w, E, np.repeat(w.common[:, None], p, axis=1))
+    common = np.real(np.einsum("kii->ki", S))
+    S = _smoothed(kernel, S, list(range(p)), described)
+    shape = np.real(np.einsum("kii->ki", S))
+    own, common = (kernel @ (v / np.maximum(shape, floor)) for v in (own, common))
+    size = np.sqrt(np.maximum(own, _ROUNDING) / np.maximum(common, _ROUNDING))
+    return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
+
+
+def _kernel(w: Windowed) -> Float[np.ndarray, "k k"]:
+    """Weights of the mean over lines."""
+    freedom = np.maximum(np.sum(w.seen, axis=0) / PER_AVERAGE - len(w.inputs), 0.5)
+    least = _ENOUGH * len(w.outputs) / (_LINES * float(np.min(freedom)))
+    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
+    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
+    return kernel / np.sum(kernel, axis=1, keepdims=True)
+
+
+def _smoothed(
+    kernel: Float[np.ndarray, "k k"],
+    S: Complex[np.ndarray, "k q q"],
+    outputs: list[int],
+    described: Callable[[np.ndarray, list[int]], np.ndarray | None] | None,
+) -> Complex[np.ndarray, "k q q"]:
+    """The mean over lines of spectral matrices, divided by what is known of their shape."""
+    known = None if described is None else described(S, outputs)
+    if known is None:
+        return np.einsum("kl,lij->kij", kernel, S)
+    L = np.linalg.cholesky(known)
+    white = np.linalg.inv(L)
+    flat = np.einsum("kl,lij->kij", kernel, white @ S @ np.conj(np.swapaxes(white, 1, 2)))
+    return L @ flat @ np.conj(np.swapaxes(L, 1, 2))
+
+
+def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(k, p, p) spectral matrix of what inputs (their instruments) leave of errors in the windows
+    seen (W, p); of outputs with different windows only the diagonal is sound."""
+    P = []
+    for mask in seen.T:
+        # By what follows the instruments in the errors themselves, not by a response by instrument:
+        # that one is anything where the excitation has no power, and what it left would be as well.
+        S_zz = _cross(mask, w.Z, w.Z)
+        power = np.real(np.einsum("kaa->ka", S_zz))
+        P.append(np.nan_to_num(inverse(S_zz, power, power)))
+    S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
+    part = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
+    D = (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
+    # Each input takes one of the independent averages for its own response.
+    freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
+    S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
+    return S / np.sqrt(freedom[:, None] * freedom[None, :])
+
+
+def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """A spectral matrix (k, p, p) that has an inverse; `floor` (p,) of its diagonal."""
+    power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
+    scale = np.sqrt(power)
+    rho = S / (scale[:, :, None] * scale[:, None, :])
+    # Of more outputs than averages, or of some that were computed from others, none is left.
+    values, vectors = np.linalg.eigh(0.5 * (rho + np.conj(np.swapaxes(rho, 1, 2))))
+    rho = np.einsum("kia,ka,kja->kij", vectors, np.maximum(values, _SMALLEST), np.conj(vectors))
+    return rho * scale[:, :, None] * scale[:, None, :]
+
+
+def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
+    """Of the errors of all responses at one frequency."""
+    P = np.nan_to_num(at.P)
+    return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
+
+
+def whitening(
+    at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
+) -> Complex[np.ndarray, "k r r"]:
+    """What makes rows of variance 1 of the errors of the responses that are used, independent of
+    one another at a line; the rows of the others are zero. r = p m.
+    """
+    k, p, m = used.shape
+    taken = used.reshape(k, -1)
+    C = covariance(at, S).reshape(k, p * m, p * m)
+    size = np.sqrt(np.real(np.einsum("krr->kr", C)))
+    # A response that is not used is one of variance 1 that goes with no other.
+    scale = np.where(taken & (size > 0), size, 1.0)
+    both = taken[:, :, None] & taken[:, None, :]
+    C = np.where(both, C / (scale[:, :, None] * scale[:, None, :]), 0.0)
+    C = C + np.eye(p * m) * ~taken[:, None, :]
+    return np.linalg.inv(np.linalg.cholesky(C)) / scale[:, None, :] * taken[:, :, None]
+
+
+def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
+    """Of each output with each input, what the others explain taken out; 0 where inputs move as
+    one."""
+    H = response_of(w, at, w.Y)
+    left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
+    density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
+    spread = [
+        np.einsum("kxa,kab,kxb->kx", P, _cross(w.seen[:, j], w.Z, w.Z), np.conj(P), optimize=True)
+        for j, P in enumerate(at.P)
+    ]
+    error = density[:, :, None] * np.real(np.stack(spread, axis=1))
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(np.abs(H) ** 2 / (np.abs(H) ** 2 + error))
+
+
+def pairs_used(
+    w: Windowed,
+    options: ResponseOptions,
+    coherence: Float[np.ndarray, "k p m"],
+    sound: Bool[np.ndarray, "k p m"],
+) -> Bool[np.ndarray, "k p m"]:
+    """Which responses take part at which frequencies."""
+    used = np.zeros(sound.shape, bool)
+    omega = 2.0 * np.pi * w.hz
+    everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
+    for pair in options.pairs or everything:
+        if pair.input not in w.inputs or pair.output not in w.outputs:
+            continue
+        at = (slice(None), w.outputs.index(pair.output), w.inputs.index(pair.input))
+        low, high = pair.band or (0.0, np.inf)
+        least = options.coherence if pair.coherence is None else pair.coherence
+        # The mean over an octave: a single frequency that reaches a limit by chance has too large
+        # a gain by the same chance.
+        enough = octave_mean(omega, coherence[at]) >= least
+        used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
+    return used
 
 
 _LAGS = 48
 """lags, from a sample to the record's length, at which an impulse response is looked at"""
-
-
-class Machine(NamedTuple):
-    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
-
-    Ad: Float[Array, "n n"]
-    B: Float[Array, "n r"]
-    U: Float[Array, "N r"]
-    """inputs now, late ones, and next ones"""
-    acting: Float[Array, "N m"]
-    C: Float[Array, "p n"]
-    D: Float[Array, "p m"]
-    x0: Float[Array, " n"]
-
-    def simulated(self, block: int) -> Float[Array, "p N"]:
-        """The outputs from the first sample on.
-
-        Args:
-            block: samples in a step of the recurrence.
-        """
-        dt = jnp.ones((), self.Ad.dtype)
-        args = ZeroOrderHoldArgs(None, tuple(self.U.T), dt, None, Discrete(self.Ad, self.B, None))
-        states = jnp.stack(blockwise(args, block, tuple(self.x0)))
-        return self.C @ states + self.D @ self.acting.T
-
-
-def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:
-    """The i-th flight's, with the outputs that it measures.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns.
-        i: the flight's number.
-    """
-    model, drive = layout.model, driven(layout, data, u, i)
-    model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    x0 = start_state(model, drive.params, drive.state, drive.inputs)
-    return Machine(Ad, B, U, acting, C[rows], D[rows], naming.ravel(x0, Ad.dtype))
 
 
 def forgets(
@@ -371,19 +619,9 @@ def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed
         z: the unknowns.
         w: the flights in windows.
     """
-    Ad, C = (np.asarray(v, float) for v in _matrices(layout, data, z))
-    rows = [naming.names(layout.model.Outputs).index(n) for n in w.outputs]
-    return described(Ad, C[rows], w)
-
-
-@eqx.filter_jit
-def _matrices(
-    layout: Layout, data: Data, z: Float[Array, " q"]
-) -> tuple[Float[Array, "n n"], Float[Array, "p n"]]:
-    """Ad from sample to sample, and C of all outputs of the model."""
-    u = unpack(layout, data, z)
-    C = jacobians(layout.model, driven(layout, data, u, 0).params)[2]
-    return machine_of(layout, data, u, 0).Ad, jnp.asarray(C)
+    seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
+    machine = machine_of(seen, data, z)
+    return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
 
 
 class _Cells(NamedTuple):

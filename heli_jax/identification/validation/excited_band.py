@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Complex, Float
 
-from heli_jax.analysis.spectral import partial_coherence, segment_transforms, without
+from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import spans
 

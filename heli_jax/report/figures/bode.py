@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.analysis.operating_point import OperatingPoint
-from heli_jax.analysis.response_curves import COHERENT, octave_mean
+from heli_jax.analysis.response_curves import unnoticeable
+from heli_jax.analysis.spectra import COHERENT, octave_mean
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import Z95

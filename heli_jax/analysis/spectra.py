@@ -1,0 +1,638 @@
+"""Spectra of signals in Hann windows, and flights in such windows.
+
+Segments of a record in Hann windows are transformed to the frequencies asked for (any band, any
+resolution), and their cross-spectra averaged over segments and flights.
+
+Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Welch (1967), IEEE Trans. Audio
+and Electroacoustics 15(2); Harris (1978), Proceedings of the IEEE 66(1).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax.flights.flight import Flight
+
+_NO_POWER = 1e-20
+"""of a signal's power: less is what rounding leaves where others explain all of it"""
+OWN = 10.0
+"""times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
+OVERLAP = 2.0 / 3.0
+"""of a Hann window with the next, for responses. The squares of such windows add up to the same at
+all times: no sample counts for more than another but at the ends of a record, and what they cut off
+of answers that end outside of them, in proportion to the square's slope, cancels; of windows that
+overlap by half it does not"""
+_FINE = 64
+"""samples whose turns are sines, each times those of every so many"""
+LONGEST = 30.0
+"""window [s] unless one is stated: what rotorcraft responses are usually taken from"""
+HIGHEST = 0.4
+"""of the rate: above it an anti-aliasing filter has changed what was logged"""
+COHERENT = 0.6
+"""mean coherence over an octave from which on a response is taken for the input's: Tischler and
+Remple, Aircraft and Rotorcraft System Identification (2012)"""
+_SMOOTHED = 3.4
+"""independent lines at least over which the noise's spectrum is smoothed"""
+_SHARED = (
+    1.0 / 3.0 + 3.0**0.5 / (4.0 * np.pi),
+    1.0 / 6.0 - 3.0**0.5 / (4.0 * np.pi),
+)
+"""correlation of white noise in a Hann window with that in the next one and in the one after it"""
+_FOR_MATRIX = 4.0
+"""averages for each output from which a spectral matrix has an inverse of about the right size"""
+STEPS = round(1.0 / (1.0 - OVERLAP))
+"""from a window to the next, in the length of one. With an overlap of a half kappa of the disturbed
+bench is 4 % less precise"""
+PER_AVERAGE = 1.0 + 2.0 * sum(r**2 for r in _SHARED)
+"""windows that make one independent average: the sum of the squared correlations of transforms of
+white noise in one window with those in all others"""
+
+
+class Spectra(NamedTuple):
+    """Signals in windows at k frequencies; squares are one-sided densities per Hz."""
+
+    omega: np.ndarray
+    """(k,) [rad/s]"""
+    X: np.ndarray
+    """(k, W, c) Fourier transforms of c signals in W windows"""
+
+    @property
+    def density(self) -> Complex[np.ndarray, "k c c"]:
+        """Means of conj(X_a) X_b: the response from a to b is [a, b] / [a, a]."""
+        return np.conj(np.swapaxes(self.X, 1, 2)) @ self.X / self.X.shape[1]
+
+
+def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int) -> Spectra:
+    """Half-overlapping segments, each less its straight line, in a Hann window (Welch 1967), at
+    k = length // 2 + 1 frequencies from zero on.
+
+    Args:
+        signals: sampled together.
+        dt: time between samples [s].
+        length: samples of a segment, at most N.
+    """
+    segments = np.lib.stride_tricks.sliding_window_view(signals, length, axis=1)
+    # The next segment begins where the second half of this one does.
+    segments = segments[:, :: length - length // 2]
+    # Less the straight line that fits each best: a drift would leak into the lowest frequencies.
+    # Symmetric about zero, so that slope and mean are found apart from each other.
+    t, window = np.linspace(-1.0, 1.0, length), np.hanning(length)
+    slopes = (segments @ t / (t @ t))[..., None]
+    segments = (segments - segments.mean(axis=-1, keepdims=True) - slopes * t) * window
+    X = np.moveaxis(np.fft.rfft(segments, axis=-1), -1, 0).swapaxes(1, 2)
+    # Zero frequency and Nyquist's, which an odd length has not, have no twin of negative frequency.
+    twins = np.full(len(X), 2.0)
+    twins[[0] if length % 2 else [0, -1]] = 1.0
+    omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)
+    return Spectra(omega, X * np.sqrt(twins * dt / np.sum(window**2))[:, None, None])
+
+
+def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
+
+    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
+
+    Args:
+        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
+        u: (k, segments)
+        y: (k, segments)
+
+    Source: Bendat and Piersol, Random Data (2010), chapter 7.
+    """
+    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
+    # the pilot moves two sticks together.
+    # A coherence has no size, and the squares of a simulation that diverged have none in numbers.
+    u, y = u / size_of(u), y / size_of(y)
+    left_u, left_y = without(others, u), without(others, y)
+    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
+    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
+    enough = uu > _NO_POWER * np.sum(np.abs(u) ** 2, axis=1)
+    enough &= yy > _NO_POWER * np.sum(np.abs(y) ** 2, axis=1)
+    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
+
+
+def size_of(x: np.ndarray) -> float:
+    """The largest number, by which what hangs on no unit may be divided; 1 where there is none."""
+    size = float(np.max(np.abs(x), initial=0.0))
+    return size if size > 0 and np.isfinite(size) else 1.0
+
+
+def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """x (k, segments) less its projection on the others (k, segments, inputs)."""
+    if not others.shape[2]:
+        return x
+    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
+    gains = np.linalg.pinv(others) @ x[:, :, None]
+    return x - (others @ gains)[:, :, 0]
+
+
+def octave_mean(
+    omega: Float[np.ndarray, " k"], coherence: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Mean coherence (k,) over an octave; zero where there is none.
+
+    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
+    """
+    octaves = np.log2(omega)
+    near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
+    seen = np.isfinite(coherence)
+    count = near @ seen.astype(float)
+    mean = near @ np.where(seen, coherence, 0.0) / np.maximum(count, 1.0)
+    return np.where(seen, mean, 0.0)
+
+
+def leakage(S: np.ndarray) -> np.ndarray:
+    """What the Hann window's sidelobes bring to each frequency from all others, (k,).
+
+    Args:
+        S: spectral density (k,) of segments in a Hann window.
+
+    Source: Harris (1978), Proceedings of the IEEE 66(1): the window's transform m lines away is at
+    most 1/(pi m (m^2 - 1)) of its height.
+    """
+    m = np.arange(S.size, dtype=float)
+    sidelobes = np.zeros(S.size)
+    # Up to two lines away is the main lobe: there a signal is itself.
+    far = m > 2
+    # Its square, and of that the mean of a squared sine: where between two lines a frequency lies
+    # is as good as random.
+    sidelobes[far] = 0.5 / (np.pi * m[far] * (m[far] ** 2 - 1.0)) ** 2
+    both = np.concatenate([sidelobes[:0:-1], sidelobes])
+    return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
+
+
+class CrossSpectra(NamedTuple):
+    """Spectral densities of several signals with one another."""
+
+    omega: np.ndarray
+    """(k,) [rad/s]"""
+    S: np.ndarray
+    """(k, c, c) one-sided densities per Hz: S[:, a, b] is the mean of conj(X_a) X_b"""
+    averages: float | np.ndarray
+    """independent averages that each is made of, a number or (k,): overlapping segments count for
+    less than one"""
+    seconds: float
+    """length of a segment"""
+    slopes: np.ndarray | None = None
+    """(k, c, m) those of the signals with the first m of them in the window's slope [1/s]"""
+
+
+def cross_spectra(
+    records: Sequence[Float[np.ndarray, "c N"]],
+    dt: float,
+    omega: Float[np.ndarray, " k"],
+    seconds: float,
+    overlap: float = 0.5,
+    sloped: int = 0,
+) -> CrossSpectra:
+    """Averages over Hann windows of all records, each segment less its mean.
+
+    Args:
+        records: the same c signals in each, (c, N) with any N; no sample missing.
+        dt: between two samples [s].
+        omega: (k,) [rad/s], above zero and below the Nyquist frequency.
+        seconds: length of a segment; records that are shorter are left out.
+        overlap: of one segment with the next, from 0 to below 1.
+        sloped: how many of the first signals are taken in the window's slope, too.
+
+    Raises:
+        ValueError: no record has a segment, a sample is missing, or a frequency is out of range.
+    """
+    length = round(seconds / dt)
+    step = max(round(length * (1.0 - overlap)), 1)
+    _require(records, dt, omega, length)
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    counts = [max(1 + (r.shape[1] - length) // step, 0) for r in records]
+    total, averages = np.zeros(1), 0.0
+    for record, count in zip(records, counts, strict=True):
+        if count:
+            mean = _products(np.asarray(record, np.float64), window, dt, omega, step, sloped)
+            total, averages = (
+                total + count * mean,
+                averages + _independent(window, step, count),
+            )
+    # One-sided: each frequency stands for its negative twin as well.
+    density = 2.0 * dt / np.sum(window**2)
+    S = density / sum(counts) * total
+    c = records[0].shape[0]
+    slopes = S[:, :, c:] if sloped else None
+    return CrossSpectra(np.asarray(omega), S[:, :, :c], averages, length * dt, slopes)
+
+
+def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
+    longest = max((r.shape[1] for r in records), default=0)
+    if length < 8 or longest < length:
+        raise ValueError(
+            f"seconds: expected a segment of 8 samples at least and no longer than the longest "
+            f"record, {longest * dt:.6g} s; got {length * dt:.6g} s"
+        )
+    if not all(np.isfinite(r).all() for r in records):
+        raise ValueError("records: expected no missing sample; cut them where one is missing")
+    if not (np.all(omega > 0) and np.all(omega < np.pi / dt)):
+        raise ValueError(
+            f"omega: expected frequencies between 0 and the Nyquist frequency, "
+            f"{np.pi / dt:.6g} rad/s; got {np.min(omega):.6g} to {np.max(omega):.6g} rad/s"
+        )
+
+
+# In NumPy: there is a program to compile for each length of the windows, and it is called once.
+def _products(
+    record: Float[np.ndarray, "c N"],
+    window: Float[np.ndarray, " n"],
+    dt: float,
+    omega: Float[np.ndarray, " k"],
+    step: int,
+    sloped: int,
+) -> Complex[np.ndarray, "k c both"]:
+    """Mean over the segments of conj(X_a) X_b, then of the first signals in the window's slope."""
+    c, n = record.shape[0], window.shape[0]
+    count = 1 + (record.shape[1] - n) // step
+    # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
+    record = record - record.mean(axis=1, keepdims=True)
+    segments = np.lib.stride_tricks.sliding_window_view(record, n, axis=1)[:, ::step]
+    even, odd, means = (part.reshape(c * count, -1) for part in _folded(segments))
+    # Products of matrices: for the few hundred frequencies of a band faster than fast Fourier
+    # transforms of twice the length, and they may lie anywhere.
+    late = np.arange((n + 1) // 2, n)
+    cosines, sines = _turns(late.size, omega * dt, (n + 1) // 2 - 0.5 * n)
+    ones = _folded(np.ones(n))[0]
+    w = window[late, None]
+    C = w * cosines
+    X = (even @ C - means * (ones @ C) - 1j * (odd @ (w * sines))).reshape(c, count, -1)
+    both, rows = [X], sloped * count
+    if sloped:
+        # Of the window itself, a cosine, per second.
+        v = (np.pi / (n * dt) * np.sin(2.0 * np.pi * late / n))[:, None]
+        S = v * sines
+        steep = odd[:rows] @ (v * cosines) - 1j * (even[:rows] @ S - means[:rows] * (ones @ S))
+        both.append(steep.reshape(sloped, count, -1))
+    Y = np.concatenate(both, axis=0)
+    return np.conj(X).transpose(2, 0, 1) @ Y.transpose(2, 1, 0) / count
+
+
+def _folded(
+    segments: Float[np.ndarray, "... n"],
+) -> tuple[
+    Float[np.ndarray, "... half"], Float[np.ndarray, "... half"], Float[np.ndarray, "... 1"]
+]:
+    """Even and odd part of segments about their middle, twice each, and their means.
+
+    A window is even about its middle and its slope odd, so that cosines go with one part and sines
+    with the other: half of the products. Of the first sample neither makes anything.
+    """
+    n = segments.shape[-1]
+    late, early = segments[..., (n + 1) // 2 :], segments[..., n // 2 : 0 : -1]
+    even, odd = late + early, late - early
+    if n % 2 == 0:
+        # The middle itself, once.
+        even[..., 0] *= 0.5
+    return even, odd, ((even.sum(axis=-1) + segments[..., 0]) / n)[..., None]
+
+
+def _turns(
+    count: int, angle: Float[np.ndarray, " k"], first: float
+) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
+    """Cosines and sines of m angle, m from the first on in steps of one, by products of few: so
+    many would take as long as the transform."""
+    coarse = np.outer(first + _FINE * np.arange(-(-count // _FINE)), angle)[:, None]
+    fine = np.outer(np.arange(_FINE), angle)[None]
+    (c, s), (C, S) = ((np.cos(v), np.sin(v)) for v in (fine, coarse))
+    k = angle.shape[0]
+    turns = C * c - S * s, S * c + C * s
+    return turns[0].reshape(-1, k)[:count], turns[1].reshape(-1, k)[:count]
+
+
+def _independent(window: np.ndarray, step: int, count: int) -> float:
+    """Independent averages of overlapping segments (Welch 1967, for a flat spectrum)."""
+    # Of white noise the transforms of two segments correlate as the windows overlap, and their
+    # squares, which spectra are made of, as the square of that.
+    n, power, total = window.size, float(np.sum(window**2)), 1.0
+    for j in range(1, min(count, -(-n // step))):
+        shared = float(np.sum(window[: n - j * step] * window[j * step :])) / power
+        total += 2.0 * (1.0 - j / count) * shared**2
+    return count / total
+
+
+# Flights in windows that overlap by two thirds, each less its mean, at its lines.
+
+
+class PairOptions(NamedTuple):
+    """One response that takes part, where not all do."""
+
+    input: str
+    output: str
+    band: tuple[float, float] | None = None
+    """[Hz]; None: that of all"""
+    coherence: float | None = None
+    """least partial coherence; None: that of all"""
+
+
+class ResponseOptions(NamedTuple):
+    """Frequencies, windows, and the responses that take part."""
+
+    band: tuple[float, float] | None = None
+    """first and last frequency [Hz]; None: a period in a window to 0.4 of the rate"""
+    window: float | None = None
+    """length [s]; None: a fifth of the longest flight, 30 s at most"""
+    points: int | None = None
+    """frequencies about equally spaced in the logarithm; None: all lines of the window"""
+    coherence: float = 0.0
+    """least partial coherence in the mean over an octave; 0 leaves all to their weights"""
+    pairs: tuple[PairOptions, ...] = ()
+    """those that take part; all where none is named"""
+
+
+def require_window(window: float, longest: float) -> None:
+    """Refuse windows that no record holds.
+
+    Args:
+        window: length [s]
+        longest: of the flights [s]
+
+    Raises:
+        ValueError: the window is longer.
+    """
+    if window > longest * (1.0 + 1e-9):
+        raise ValueError(
+            f"window: the longest flight is {longest:.4g} s, too short for a window of "
+            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
+        )
+
+
+def one_rate(flights: Sequence[Flight]) -> float:
+    """The sample time [s] of flights that share it.
+
+    Raises:
+        ValueError: they do not.
+    """
+    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
+    if len(rates) > 1:
+        listed = ", ".join(f"{r:g}" for r in rates)
+        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
+    return float(flights[0].dt)
+
+
+class Windowed(NamedTuple):
+    """Flights of one rate, W windows of them at k lines; transforms scaled to densities per Hz."""
+
+    inputs: tuple[str, ...]
+    """the m that move"""
+    instruments: tuple[str, ...]
+    """those of them that are taken by an excitation that was logged"""
+    outputs: tuple[str, ...]
+    """the p of which windows are complete"""
+    dt: float
+    """[s]"""
+    length: int
+    """samples of a window"""
+    numbers: tuple[int, ...]
+    """of the k lines, in periods of a window"""
+    starts: tuple[tuple[int, ...], ...]
+    """by flight the first sample of each window"""
+    Z: np.ndarray
+    """(W, k, m) of the instruments, or of the inputs themselves"""
+    U: np.ndarray
+    """(W, k, m) of the inputs"""
+    Y: np.ndarray
+    """(W, k, p) of the outputs; zero where a sample is missing"""
+    seen: np.ndarray
+    """(W, p) 1 where all samples of an output are there, else 0"""
+    own: np.ndarray
+    """(k, p, m) where an input and an output have more power than the window's sidelobes bring"""
+    left_out: dict[str, str]
+    """by output that is left out, why"""
+
+    @property
+    def lines(self) -> np.ndarray:
+        """(k,) numbers of the lines"""
+        return np.asarray(self.numbers)
+
+    @property
+    def hz(self) -> np.ndarray:
+        """(k,) frequencies [Hz]"""
+        return self.lines / (self.length * self.dt)
+
+    @property
+    def seconds(self) -> float:
+        """length of a window"""
+        return self.length * self.dt
+
+    @property
+    def step(self) -> int:
+        """samples from the beginning of a window to that of the next"""
+        return _step(self.length)
+
+    def later(self, steps: int) -> np.ndarray:
+        """(W - steps,) whether the window so many after each is of the same flight."""
+        flight = np.repeat(np.arange(len(self.starts)), [len(s) for s in self.starts])
+        return flight[steps:] == flight[: len(flight) - steps]
+
+    @property
+    def common(self) -> np.ndarray:
+        """(W,) 1 where a window has every sample of all outputs, else 0"""
+        return np.min(np.asarray(self.seen), axis=1)
+
+    @property
+    def together(self) -> bool:
+        """Whether there are windows enough to say how the errors of outputs go together: the
+        inverse of a spectral matrix from few averages is too large."""
+        left = np.sum(self.common) / PER_AVERAGE - len(self.inputs)
+        return len(self.outputs) == 1 or bool(left * _SMOOTHED >= _FOR_MATRIX * len(self.outputs))
+
+    @property
+    def averages(self) -> np.ndarray:
+        """(p,) independent averages of each output"""
+        return np.sum(self.seen, axis=0) / PER_AVERAGE
+
+    def by_flight(self, v: np.ndarray) -> list[np.ndarray]:
+        """An array (W, ...) of all windows in parts, flight by flight."""
+        return np.split(v, np.cumsum([len(s) for s in self.starts])[:-1])
+
+
+def window_transforms(
+    x: Float[np.ndarray | Array, "c N"],
+    starts: Sequence[int],
+    length: int,
+    lines: Sequence[int] | np.ndarray,
+    dt: float,
+) -> Complex[np.ndarray | Array, "c W k"]:
+    """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
+
+    Args:
+        starts: first samples of the W windows.
+        length: samples of each.
+        lines: the k lines of the window that are kept.
+        dt: between two samples [s].
+    """
+    xp = jnp if isinstance(x, jax.Array) else np
+    window = hann(length)
+    parts = x[:, np.asarray(starts, int)[:, None] + np.arange(length)]
+    # A constant is in the first line alone, and that is kept.
+    parts = parts - xp.mean(parts, axis=-1, keepdims=True)
+    transforms = xp.fft.rfft(parts * window[None, None], axis=-1)[..., np.asarray(lines, int)]
+    return transforms * float((2.0 * dt / np.sum(window**2)) ** 0.5)
+
+
+def hann(length: int) -> Float[np.ndarray, " n"]:
+    """The window."""
+    return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+
+
+def windowed(
+    flights: Sequence[Flight],
+    options: ResponseOptions = ResponseOptions(),
+    by: Sequence[str] | None = None,
+) -> Windowed:
+    """Flights in windows.
+
+    Args:
+        flights: of one rate, with the same inputs; samples of outputs may be missing.
+        by: inputs that are taken by their instrument (`Flight.instruments`); all that have one in
+            every flight unless given.
+
+    Raises:
+        ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
+            no output has windows enough.
+    """
+    dt = one_rate(flights)
+    longest = max(f.duration for f in flights) + dt
+    seconds = options.window or min(longest / 5.0, LONGEST)
+    require_window(seconds, longest)
+    # Even, so that half of it is a number of samples.
+    length = 2 * round(0.5 * seconds / dt)
+    lines = _lines(options, length, dt)
+    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
+    if not inputs:
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
+    instruments = tuple(
+        n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
+    )
+    starts = tuple(_starts(f, length) for f in flights)
+    outputs, seen, left_out = _complete(flights, starts, length, (length * dt, len(inputs)))
+    cut = _Cut(starts, length, lines, dt)
+    U, of_inputs = cut.transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
+    Z = U
+    if instruments:
+        kinds = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
+        signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in kinds]
+        Z = cut.transforms([np.stack(s) for s in signals])[0]
+    Y, of_outputs = cut.transforms([_filled(f, outputs) for f in flights])
+    own = of_inputs[:, None, :] & of_outputs[:, :, None]
+    Y = Y * seen[:, None, :]
+    names, numbers = (inputs, instruments, outputs), tuple(lines.tolist())
+    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, own, left_out)
+
+
+class _Cut(NamedTuple):
+    """How flights are cut into windows."""
+
+    starts: tuple[tuple[int, ...], ...]
+    length: int
+    lines: np.ndarray
+    dt: float
+
+    def transforms(self, signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """(W, k, c) of signals (c, N) by flight, and (k, c) where they have more power than the
+        window's sidelobes bring from other lines."""
+        # Of all lines first: what leaks into those that are kept comes from any.
+        parts = [
+            window_transforms(x, s, self.length, range(self.length // 2), self.dt)
+            for x, s in zip(signals, self.starts, strict=True)
+        ]
+        whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
+        power = np.mean(np.abs(whole) ** 2, axis=0).T
+        own = [(OWN * leakage(S) < S)[self.lines] for S in power]
+        return whole[:, self.lines], np.stack(own, axis=1)
+
+
+def _complete(
+    flights: Sequence[Flight],
+    starts: tuple[tuple[int, ...], ...],
+    length: int,
+    asked: tuple[float, int],
+) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:
+    """The outputs that have windows enough, which windows (W, p), and why others have not.
+
+    Args:
+        length: samples of a window.
+        asked: the same in seconds, and how many inputs move.
+    """
+    outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
+    seen = np.concatenate(
+        [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
+    )
+    seconds, inputs = asked
+    averages = np.sum(seen, axis=0) / PER_AVERAGE
+    kept = averages >= inputs + 1
+    many = "1 input" if inputs == 1 else f"{inputs} inputs"
+    need = f"expected at least {inputs + 1} independent averages for {many}, got"
+    windows = f"from windows of {seconds:g} s without a missing sample"
+    if not kept.any():
+        raise ValueError(
+            f"{need} {np.max(averages, initial=0.0):.2g} {windows}; a shorter window, or longer "
+            "flights"
+        )
+    each = list(zip(outputs, averages, kept, strict=True))
+    left_out = {n: f"{need} {count:.2g} {windows}" for n, count, fine in each if not fine}
+    return tuple(n for n, _, fine in each if fine), seen[:, kept], left_out
+
+
+def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
+    """The lines of the band, or of these the ones nearest to points of a logarithm."""
+    if length < 16:
+        raise ValueError(f"window: expected at least 16 samples, {16 * dt:.3g} s; got {length}")
+    low, high = options.band or (1.0 / (length * dt), HIGHEST / dt)
+    if high >= 0.5 / dt:
+        raise ValueError(
+            f"band: expected frequencies below half the rate of {1.0 / dt:.4g} Hz, got {high:g} Hz"
+        )
+    if low < 1.0 / (length * dt) * (1.0 - 1e-9):
+        raise ValueError(
+            f"band: expected at least one period in a window of {length * dt:g} s, from "
+            f"{1.0 / (length * dt):.3g} Hz on; got {low:g} Hz"
+        )
+    first, last = (f * length * dt for f in (low, high))
+    lines = np.arange(int(np.ceil(first - 1e-6)), int(last + 1e-6) + 1)
+    if not lines.size:
+        raise ValueError(
+            f"band: expected one that holds a line of the window, every {1 / (length * dt):.3g} "
+            f"Hz; got {low:g} to {high:g} Hz"
+        )
+    if options.points is None or options.points >= lines.size:
+        return lines
+    spaced = np.geomspace(lines[0], lines[-1], options.points)
+    return lines[np.unique(np.argmin(np.abs(lines[:, None] - spaced), axis=0))]
+
+
+def _starts(flight: Flight, length: int) -> tuple[int, ...]:
+    return tuple(range(0, flight.n_samples - length + 1, _step(length)))
+
+
+def _step(length: int) -> int:
+    # Rounded up: windows so many steps apart share no sample.
+    return -(-length // STEPS)
+
+
+def _seen(
+    flight: Flight, starts: tuple[int, ...], length: int, outputs: tuple[str, ...]
+) -> np.ndarray:
+    """(windows, p) 1 where a window has every sample of an output."""
+    seen = np.zeros((len(starts), len(outputs)))
+    for j, name in enumerate(outputs):
+        if name in flight.outputs:
+            missing = np.concatenate([[0], np.cumsum(~np.isfinite(flight.outputs[name]))])
+            seen[:, j] = [missing[s + length] == missing[s] for s in starts]
+    return seen
+
+
+def _filled(flight: Flight, outputs: tuple[str, ...]) -> np.ndarray:
+    """(p, N), zero where nothing is measured."""
+    absent = np.zeros(flight.n_samples)
+    return np.stack([np.nan_to_num(flight.outputs.get(n, absent), nan=0.0) for n in outputs])
