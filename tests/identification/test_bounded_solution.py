@@ -63,16 +63,15 @@ def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
     def plain(A, B, C, D, U, acting):
         lines = jnp.fft.fft(U * turns.conj()[:, None], axis=0)
         driving = lines @ B.T + z[:, None] * ends[None]
-        X = jnp.linalg.solve(z[:, None, None] * np.eye(3)[None] - A[None], driving[:, :, None])[
-            :, :, 0
-        ]
+        resolvent = z[:, None, None] * np.eye(3)[None] - A[None]
+        X = jnp.linalg.solve(resolvent, driving[:, :, None])[:, :, 0]
         return jnp.real(jnp.fft.ifft(C @ X.T, axis=1) * turns[None]) + D @ acting.T
 
     made = jax.jvp(outputs, here, along)
     with jax.numpy_dtype_promotion("standard"):
         whole = jax.jvp(plain, here, along)
-    for made, expected in zip(made, whole, strict=True):
-        np.testing.assert_allclose(made, expected, atol=1e-9 * np.max(np.abs(expected)))
+    for one, expected in zip(made, whole, strict=True):
+        np.testing.assert_allclose(one, expected, atol=1e-9 * np.max(np.abs(expected)))
 
 
 def test_a_stick_is_no_instrument_of_itself():
