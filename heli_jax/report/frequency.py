@@ -280,7 +280,7 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         return segments
     of_both = segment_transforms(np.stack([u, y]), dt, segments.length)
     omega, S = of_both.omega, of_both.density
-    Suu, Syy, Suy = S[:, 0, 0].real, S[:, 1, 1].real, S[:, 0, 1]
+    Suu, Syy, Suy = np.real(S[:, 0, 0]), np.real(S[:, 1, 1]), S[:, 0, 1]
     # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
     # are coherent as well; and of zero frequency the segments' straight lines left nothing.
     own = (Suu > OWN * leakage(Suu)) & (Syy > OWN * leakage(Syy))
