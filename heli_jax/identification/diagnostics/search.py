@@ -73,7 +73,7 @@ def profile_intervals(c: Context) -> Iterator[Finding]:
 def log_cautions(c: Context) -> Iterator[Finding]:
     """What the logs say of their signals that biases a fit to them; once where flights agree."""
     said: dict[str, Finding] = {}
-    flights = c.problem.flights
+    flights = tuple(c.problem.flights)
     for label, flight in zip(labels(flights), flights, strict=True):
         for caution in flight.source.cautions if flight.source else ():
             said.setdefault(caution.sentence, caution.of(label))

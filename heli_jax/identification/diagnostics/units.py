@@ -6,6 +6,7 @@ as well as a right one, with estimates that are off by 57 or of the other sign.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def rate_against_angle(c: Context) -> Iterator[Finding]:
             size = abs(ratio.factor)
             low, high = ratio.scale
             most = LIMITS.scale_of_roll if angle in _ROLL else LIMITS.scale
-            numbers = {"flight": label, "rate": rate, "angle": angle}
+            numbers: dict[str, Any] = {"flight": label, "rate": rate, "angle": angle}
             if backward or off:
                 far = max(size, 1.0 / size) / _DEGREE
                 # No model follows an angle that runs against its rate, or is in other units.

@@ -299,9 +299,9 @@ def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
         if signal.unit == "rad" and name in headings:
             limit = impossible = _HEADING_TURNS * 2 * np.pi
         if size > limit:
-            flown = _flown(model, flight, name, size) and not said
+            flown = _flown(model, flight, str(name), size) and not said
             certain = said or (size > impossible and not flown)
-            yield Oversized(name, signal, size, limit, flown, certain)
+            yield Oversized(str(name), signal, size, limit, flown, certain)
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
