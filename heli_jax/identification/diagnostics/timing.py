@@ -33,6 +33,8 @@ _LARGE = 0.1
 """of a parameter, by which half a sample of an input has to move it for a doubt before any fit"""
 _NAMED = 3
 """parameters that a sentence names at most"""
+_SEEN = 1e-3
+"""of a parameter, below which a move is not named: of one held by a prior alone it is rounding"""
 
 
 def angles_late(c: Context) -> Iterator[Finding]:
@@ -127,8 +129,9 @@ def _parts(c: Context, moved: Mapping[str, float]) -> dict[str, float]:
 
 def _largest(parts: Mapping[str, float]) -> list[str]:
     """The parameters that are moved most, each with how far."""
-    order = sorted(parts, key=lambda n: -abs(parts[n]))
-    return [f"{n} by {100 * parts[n]:+.2g} %" for n in order[:_NAMED]]
+    first, *others = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
+    shown = [first, *(n for n in others if abs(parts[n]) >= _SEEN)]
+    return [f"{n} by {100 * parts[n]:+.2g} %" for n in shown]
 
 
 def loop_between_samples(c: Context) -> Iterator[Finding]:
