@@ -127,9 +127,9 @@ def rows(runs: list[dict[str, Any]], params: Any, bound: dict[str, float]) -> li
             # The intervals as reported; for white noise log-normal ones, as `fit` gives them then.
             inside = np.abs(np.log(np.maximum(values / true, 1e-300))) < 1.96 * sds / values
             if all(d.get("interval") for d in done):
-                inside = np.array(
-                    [d["interval"][name][0] < true < d["interval"][name][1] for d in done]
-                )
+                # Of those that were not withdrawn: a fit that says so claims nothing.
+                ends = [d["interval"][name] for d in done]
+                inside = np.array([low < true < high for low, high in ends if low is not None])
             spread = values.std(ddof=1)
             table.append(
                 {
@@ -140,7 +140,7 @@ def rows(runs: list[dict[str, Any]], params: Any, bound: dict[str, float]) -> li
                     "rmse": np.sqrt(np.mean((values / true - 1.0) ** 2)),
                     "rmse_over_fisher": np.sqrt(np.mean((values / true - 1.0) ** 2)) / bound[name],
                     "claimed_over_empirical": np.sqrt(np.mean(sds**2)) / spread,
-                    "coverage": inside.mean() if np.isfinite(sds).all() else np.nan,
+                    "coverage": inside.mean() if inside.size and np.isfinite(sds).all() else np.nan,
                     "failures": len(runs) - len(done),
                     "steps_99": np.percentile([d["steps"] for d in done], 99),
                     "seconds": np.median([d["seconds"] for d in done]),
