@@ -8,14 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from heli_jax.messages import Message, messages, written
+from heli_jax.messages import messages, sentence, written
 
 Severity = Literal["ok", "note", "doubt", "refuse"]
 """ok: tested, nothing found; note: for information; doubt: something may be wrong; refuse: a fit of
 this record says nothing of what is asked"""
 
-UNIT_IN_DOUBT = "units.in-doubt"
-"""code of a signal that may be in another unit than it is read in"""
 LEFT_OUT = "channels.left-out"
 """code of what of a log is not read"""
 _FARTHEST = 10.0
@@ -96,14 +94,13 @@ def found(
         distrusts: parameters whose intervals it makes unusable.
         numbers: what the sentence shows, by the names of its fields; `flight` stands before it.
     """
-    message: Message = messages()[code]
+    message = messages()[code]
     shown = {"value": value, "subjects": subjects, **numbers}
     whose = f"{numbers['flight']}: " if "flight" in numbers else ""
-    text = " ".join(filter(None, (message.text, message.remedy)))
     return Finding(
         code,
         severity,
-        whose + written(text, shown),
+        whose + sentence(code, **shown),
         value,
         written(message.measure, shown),
         subjects,

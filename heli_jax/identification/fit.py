@@ -13,8 +13,13 @@ from heli_jax.identification.design.accuracy import starting_at_zero, unstated_g
 from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.diagnostics import diagnose
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.diagnostics.excitation import gusts_guessed
-from heli_jax.identification.diagnostics.timing import of_rates
+from heli_jax.identification.diagnostics.excitation import (
+    excited_bands,
+    gusts_guessed,
+    inputs_together,
+    nothing_follows,
+)
+from heli_jax.identification.diagnostics.timing import of_rates, rates_enough
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.disturbance_search import likely_gusts
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -136,12 +141,14 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
-    c = context_of(problem, guess)
+    c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = (*ranking.notes, *gusts_guessed(c))
     # Of a record at rest for the most part nothing follows, and a window of it may say much.
+    asked = (rates_enough, nothing_follows, excited_bands, inputs_together)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
-        for f in diagnose(c)
+        for diagnostic in asked
+        for f in diagnostic(c)
         if f.bad
     )
     return dataclasses.replace(ranking, record=record, notes=notes)
@@ -154,7 +161,6 @@ def fit(
     seed: int = 0,
     max_steps: int = 200,
     progress: starting.Progress | None = None,
-    guess: FirstGuess | None = None,
 ) -> Fit:
     """Estimate the free parameters by the problem's method: one of `methods.METHODS`.
 
@@ -167,7 +173,6 @@ def fit(
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
-        guess: of `first_guess`, where it is at hand already.
 
     Returns:
         A Fit whose `status` says whether it converged and whether the data determine what was
@@ -181,7 +186,7 @@ def fit(
     _require_problem(problem)
     report = progress or (lambda _: None)
     with stage("first guess"):
-        guess = guess or first_guess(problem)
+        guess = first_guess(problem)
     # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"

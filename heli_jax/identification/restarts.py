@@ -47,7 +47,7 @@ class StartPoint(NamedTuple):
 
 
 class Restart(NamedTuple):
-    """One reason to run the optimiser again; the best of all runs is taken (`search.better`)."""
+    """One reason to run the optimiser again; the best of all runs is taken (`search.is_better`)."""
 
     name: str
     """in `Fit.starts`, and of the code 'search.NAME' of its finding"""

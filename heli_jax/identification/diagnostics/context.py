@@ -40,7 +40,6 @@ from heli_jax.identification.validation.adequacy import (
     Adequacy,
     Evidence,
     assess,
-    explains_nothing,
     inputs_explain_nothing,
     joined_metrics,
     misses,
@@ -72,6 +71,7 @@ from heli_jax.identification.validation.held_out_agreement import HeldOutFrequen
 from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
+from heli_jax.messages import sentence
 
 
 def no_disturbance(optimum: RelaxedOptimum) -> bool:
@@ -401,16 +401,16 @@ class Context:
         if not self.arrived:
             return errors
         verdict = inputs_explain_nothing(self.at, self.e, errors.verdict)
-        verdict, before = explains_nothing(verdict, self.adequacy), verdict
-        return errors._replace(verdict=verdict, limits=errors.limits if verdict is before else {})
+        if self.explains:
+            return errors._replace(verdict=verdict)
+        outputs = [o.output for o in self.adequacy.judged]
+        words = sentence("verdict.model-explains-nothing", names=verdict.names, outputs=outputs)
+        return errors._replace(verdict=verdict.nothing(words), limits={})
 
     @property
     def explains(self) -> bool:
         """Whether the model explains anything of the record."""
-        return (
-            explains_nothing(self._by_likelihood.verdict, self.adequacy)
-            is self._by_likelihood.verdict
-        )
+        return not self.adequacy.explains_nothing
 
     @property
     def verdict(self) -> Verdict:
@@ -480,7 +480,7 @@ class Context:
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
         return HeldOut(signals_of(checked.e, flights), free_run, checked.notes, in_frequency)
 
-    @property
+    @cached_property
     def rounding(self) -> bool:
         """Whether the numbers are rounding: a filter of too little noise."""
         return self.at.layout.estimator.ill_conditioned(self.problem, self.e, self.noise)

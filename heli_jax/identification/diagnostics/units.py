@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.dynamics.model import Model
-from heli_jax.finding import UNIT_IN_DOUBT, Finding, found
+from heli_jax.finding import Finding, found
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.table import shown
@@ -49,6 +49,7 @@ class Limits:
 
 
 LIMITS = Limits()
+UNIT_IN_DOUBT = "units.in-doubt"
 _DEGREE = 180.0 / np.pi
 _ROLL = frozenset({"phi", "roll"})
 

@@ -11,6 +11,7 @@ from heli_jax.identification.identifiability.verdict import (
     Weakest,
     connected,
 )
+from heli_jax.messages import listed
 
 # Index is the number; from nine on all are called nine.
 _NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
@@ -19,11 +20,6 @@ _STATED = 8.0 / 9.0
 would be three times as large without them"""
 _BY_PRIOR = 0.9
 """share of its prior above which a parameter is what the prior says"""
-
-
-def listed(words: Sequence[str], last: str = "and") -> str:
-    """`a, b and c`"""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def sentences(verdict: Verdict) -> tuple[str, ...]:

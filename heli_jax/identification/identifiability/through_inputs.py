@@ -21,9 +21,9 @@ from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.identifiability.directions import projected
-from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.unknowns.layout import FlightData, Layout, Solution
+from heli_jax.messages import listed
 
 _LEFT = 10.0
 """of a signal's variance, from which on the error of its simulation says that it left the record"""

@@ -99,6 +99,16 @@ class Adequacy(NamedTuple):
         """Whether an output is not explained."""
         return self.by_chance or any(not output.adequate for output in self.judged)
 
+    @property
+    def explains_nothing(self) -> bool:
+        """Whether the model follows every output worse than its mean, so that the record determines
+        none of its parameters."""
+        # A disturbance, or predictions ahead, let a good model's simulation be as poor.
+        if not self.denied or self.ahead is not None:
+            return False
+        simulated = any(o.against_disturbance is None for o in self.judged)
+        return simulated and all(o.vaf < 0 for o in self.judged)
+
 
 class Evidence(NamedTuple):
     """What adequacy is assessed by: the fitted flights, and what is known of their residuals."""
@@ -259,27 +269,6 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
     other = max(residual - noise, 0.0)
     rest = max(total - min(noise, residual), 1e-300)
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
-
-
-# A fit whose model explains nothing of what was measured determines nothing of it either.
-
-
-def explains_nothing(verdict: Verdict, adequacy: Adequacy) -> Verdict:
-    """The verdict; where every output is followed worse than by its mean no parameter is
-    determined.
-
-    Args:
-        verdict: what the data determine by the slopes at the optimum, and about it.
-        adequacy: how the model explains what was measured.
-    """
-    # A disturbance, or predictions ahead, let a good model's simulation be as poor.
-    judged = [o for o in adequacy.judged if o.against_disturbance is None]
-    worse = bool(judged) and all(o.vaf < 0 for o in adequacy.judged)
-    if not adequacy.denied or adequacy.ahead is not None or not worse:
-        return verdict
-    outputs = [o.output for o in adequacy.judged]
-    words = sentence("verdict.model-explains-nothing", names=verdict.names, outputs=outputs)
-    return verdict.nothing(words)
 
 
 # Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
