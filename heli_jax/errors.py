@@ -80,12 +80,6 @@ def require_known(names: Iterable[Any], known: Iterable[str], where: str, what: 
     """Refuse names of a file that are none of those known: `fit.yaml: fit.free: model roll has no
     parameter 'Ixy'; did you mean 'Ixx'?`.
 
-    Args:
-        names: as the file has them.
-        known: those that there are.
-        where: the file and the place.
-        what: the words before the name.
-
     Raises:
         InputError: one of them is.
     """

@@ -85,13 +85,9 @@ def found(
     """A finding with the words that `messages.yaml` has for its code.
 
     Args:
-        code: of a message.
-        severity: as of a Finding.
         subjects: signals, parameters or flights that it is about.
-        value: its number.
         shifts: by parameter how far the misfit moves its estimate [SI].
         denies: whether it shows that the model does not explain the record.
-        distrusts: parameters whose intervals it makes unusable.
         numbers: what the sentence shows, by the names of its fields; `flight` stands before it.
     """
     message = messages()[code]

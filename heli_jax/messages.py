@@ -45,18 +45,12 @@ def written(template: str, numbers: Mapping[str, Any]) -> str:
 
     Args:
         template: of `Message`.
-        numbers: by the names of its fields.
     """
     return _FORMATTER.vformat(template, (), numbers).strip()
 
 
 def sentence(code: str, **numbers: Any) -> str:
-    """The text and the remedy of a message.
-
-    Args:
-        code: of the message.
-        numbers: by the names of its fields.
-    """
+    """The text and the remedy of a message."""
     message = messages()[code]
     return written(" ".join(filter(None, (message.text, message.remedy))), numbers)
 

@@ -158,7 +158,6 @@ def extended(record: type, title: str, more: Mapping[str, tuple[Any, Any]]) -> t
     """A record class with the fields of `record` and `more`.
 
     Args:
-        record: the class to extend, not changed.
         more: by name, (annotation, default); None for no default.
     """
     # A named tuple, whatever `record` is: it needs no base class, and JAX knows it. Fields without

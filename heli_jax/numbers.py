@@ -171,7 +171,6 @@ def aligned(values: Sequence[float], step: float) -> tuple[str, ...]:
     """Numbers that a step tells apart, as of an axis: all with one power of ten and as many places.
 
     Args:
-        values: finite.
         step: the least difference between two of them, above zero.
     """
     power = _power(max(abs(v) for v in values))

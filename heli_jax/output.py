@@ -38,12 +38,7 @@ from heli_jax.workflow import FitRun
 
 
 def print_fit(run: FitRun, *, verbose: bool = False) -> None:
-    """Verdict, estimates, agreement and baseline on standard output.
-
-    Args:
-        run: the fit.
-        verbose: whether all findings are shown in full.
-    """
+    """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
     # Did the optimiser arrive; what do the data determine; is the model adequate; doubts.
     tell(": ".join(fit.outcome))
@@ -195,12 +190,7 @@ def _print_baseline(b: Baseline) -> None:
 
 
 def print_check(check: Check, *, verbose: bool = False) -> None:
-    """The identifiability at the initial guess, on standard output.
-
-    Args:
-        check: what is known before a fit.
-        verbose: whether all findings are shown in full.
-    """
+    """The identifiability at the initial guess, on standard output."""
     verdict = check.verdict
     # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
     tell("At the start values (the fit judges at its estimates, which may differ):")
@@ -235,12 +225,7 @@ _IN_FULL = 3
 
 
 def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
-    """The most severe findings in full, and the others by their titles.
-
-    Args:
-        findings: the most severe first.
-        verbose: whether all are shown in full.
-    """
+    """The most severe findings in full, and the others by their titles."""
     shown = findings if verbose else [f for f in findings if f.severity != "ok"][:_IN_FULL]
     for f in shown:
         tell(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")

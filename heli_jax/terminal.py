@@ -65,11 +65,6 @@ def _folded(line: str, width: int) -> str:
 def print_table(head: _Row, rows: Sequence[_Row], *, keys: int = 1) -> None:
     """Print a table on standard output, its columns as wide as they need; as a list where that is
     wider than the terminal. A pipe has lines of any length.
-
-    Args:
-        head: names of the columns.
-        rows: as many cells each.
-        keys: columns that name a row together, the first ones.
     """
     # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
     from rich.box import SIMPLE_HEAD

@@ -214,7 +214,6 @@ def vehicle_from_mapping(
     """Build the parameters from a mapping of names to numbers or {value, unit, source}.
 
     Args:
-        where: what errors name, such as the file.
         may_lack: constants that may be missing, and are NaN then.
 
     Raises:
@@ -245,7 +244,6 @@ def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
 
     Args:
         si: its SI unit; None where it has none, and the file's is taken as it is.
-        where: what errors name, such as the file.
 
     Raises:
         InputError: no finite number, an unknown key, or a unit of another kind.

@@ -442,7 +442,6 @@ def groups(
     them.
 
     Args:
-        window: samples of one, the least of a part.
         without: why an output has no part is added to them.
     """
     by_parts: dict[Parts, list[str]] = {}
@@ -457,11 +456,7 @@ def groups(
 
 
 def parts_of(flights: Sequence[Flight], output: str, window: int) -> Parts | str:
-    """The parts without a missing sample, or in words why there is none.
-
-    Args:
-        window: samples of one, the least of a part.
-    """
+    """The parts without a missing sample, or in words why there is none."""
     parts, longest = [], 0
     for i, f in enumerate(flights):
         if output not in f.outputs:
@@ -508,7 +503,6 @@ def coherence_where_moving(
 
     Args:
         moving: the inputs, or their instruments, by their place among the signals.
-        window: samples of one.
     """
     windows = np.array([max(r.shape[1] - window + 1, 0) for r in records], float)
     sizes = np.array([np.std(r[list(moving)], axis=1) for r in records])

@@ -61,7 +61,6 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
     """Eigenvalues of A [1/s], (n,) complex, slowest first.
 
     Args:
-        params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
 
@@ -108,7 +107,6 @@ def eigenmodes(
     move (an eigenvalue of zero, a position or a heading) it is the right eigenvector's alone.
 
     Args:
-        params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
 
@@ -191,9 +189,6 @@ def transfer_function(
 
     The denominator has n + 1 numbers and begins with 1; leading zeros of the numerator are cut.
     A delay of the input (`Model.delays`) is no ratio of polynomials and is left out.
-
-    Args:
-        params: its constants, concrete.
 
     Raises:
         ValueError: the model has no such output or input.

@@ -131,12 +131,7 @@ def pair_agreements(
     coherence: Float[np.ndarray, "k p m"],
     simulated: tuple[bool, ...],
 ) -> tuple[PairAgreement, ...]:
-    """Response by response.
-
-    Args:
-        H: measured.
-        E: measured less the model's.
-    """
+    """Response by response."""
     out = []
     for j, output in enumerate(w.outputs):
         for i, input in enumerate(w.inputs):

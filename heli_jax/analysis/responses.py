@@ -67,7 +67,6 @@ def responses(
     where an instrument is too weak beside what else moves its input (`fieller`).
 
     Args:
-        inputs: the m inputs, by their place among the signals.
         instruments: as many excitations, outside of every feedback; without them the inputs are
             taken for ones that do not follow the outputs.
 
@@ -204,8 +203,6 @@ def sd_of_ratio(
     Args:
         omega: frequencies [rad/s].
         signals: places of the inputs, of the outputs and of the instruments.
-        left: density of what they leave.
-        spread: density of w_j over the averages.
         half95: half of a 95 % interval in standard deviations.
     """
     u, y, z = signals

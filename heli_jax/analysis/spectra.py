@@ -71,7 +71,6 @@ def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int
     k = length // 2 + 1 frequencies from zero on.
 
     Args:
-        signals: sampled together.
         dt: time between samples [s].
         length: samples of a segment, at most N.
     """
@@ -463,9 +462,6 @@ def window_transforms(
     """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
 
     Args:
-        starts: first samples of the W windows.
-        length: samples of each.
-        lines: the k lines of the window that are kept.
         dt: between two samples [s].
     """
     xp = jnp if isinstance(x, jax.Array) else np
@@ -561,7 +557,6 @@ def _complete(
     """The outputs that have windows enough, which windows (W, p), and why others have not.
 
     Args:
-        length: samples of a window.
         asked: the same in seconds, and how many inputs move.
     """
     outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))

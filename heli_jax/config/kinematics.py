@@ -66,9 +66,6 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
     """A configuration's content with what `model: kinematics` leaves out filled in: the model that
     its signals allow, all errors free, no bias beside them.
 
-    Args:
-        content: as read, not validated.
-
     Raises:
         InputError: accelerometers without a velocity to compare them with, or the reverse.
     """
@@ -143,8 +140,6 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
 
     Args:
         model: any; the flight of another than a kinematic one stays as it is.
-        flight: as read.
-        where: what an error begins with.
 
     Raises:
         InputError: the machine points so steeply up or down that its angles mean nothing, turns
@@ -232,8 +227,6 @@ def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[
 
     Args:
         model: any; none of another than a kinematic one.
-        params: its Params.
-        flights: read.
     """
     if not is_kinematic(model):
         return {}
@@ -253,7 +246,6 @@ def sharpened(model: Model, flight: Flight) -> Flight:
 
     Args:
         model: any; the flight of another than a kinematic one stays as it is.
-        flight: its inputs are changed that are linear between samples.
     """
     if not is_kinematic(model):
         return flight

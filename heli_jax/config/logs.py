@@ -73,7 +73,6 @@ def read_flights(experiment: Experiment, *, gain: bool = False) -> tuple[Flight,
     """The flights that a configuration names, in SI.
 
     Args:
-        experiment: the configuration, with its model at hand.
         gain: whether a plain number is allowed for an input with a unit: an estimated gain then
             carries the unit.
 
@@ -377,10 +376,7 @@ def signals(
     """Which column is which of the model's inputs or outputs, with units checked.
 
     Args:
-        model: what the names are of.
         role: whether they are its inputs or its outputs.
-        stated: a configuration's signals by the model's name.
-        where: what a sentence about a wrong one begins with.
         gain: whether a plain number is allowed for an input with a unit.
 
     Raises:

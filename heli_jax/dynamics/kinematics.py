@@ -177,7 +177,6 @@ def to_ground(s: Record, body: Vector) -> Vector:
 
     Args:
         s: with phi, theta, psi [rad].
-        body: forward, right, down.
     """
     x, y, z = body
     y, z = jnp.cos(s.phi) * y - jnp.sin(s.phi) * z, jnp.sin(s.phi) * y + jnp.cos(s.phi) * z
@@ -194,7 +193,6 @@ def to_body(s: Record, ground: Vector) -> Vector:
 
     Args:
         s: with phi, theta, psi [rad].
-        ground: north, east, down.
     """
     x, y, z = ground
     x, y = jnp.cos(s.psi) * x + jnp.sin(s.psi) * y, jnp.cos(s.psi) * y - jnp.sin(s.psi) * x

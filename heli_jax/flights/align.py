@@ -52,7 +52,6 @@ def lag_between(a: Timed, b: Timed) -> Lag:
 
     Args:
         a: a signal on its clock; the unit may be another than that of `b`.
-        b: the same motion, on a clock of any origin.
 
     Raises:
         NotAligned: too short, too weakly correlated, against one another, or ambiguous.
@@ -202,9 +201,6 @@ def _refined(
     Args:
         t: times (n,) of `x` (n,), by the first clock.
         x: the first signal, NaN where missing.
-        y: the second.
-        lag: to begin with.
-        step: between the times.
     """
     begun = lag
     for _ in range(_STEPS):

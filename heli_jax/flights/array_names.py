@@ -70,7 +70,6 @@ def named_columns(
     """The names and the units of a matrix's columns, each empty where nothing says so.
 
     Args:
-        path: of the matrix.
         array: the matrix, or a vector.
         texts: lists of texts by path, as many as columns in the one that names them.
     """

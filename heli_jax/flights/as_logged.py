@@ -69,7 +69,6 @@ def as_logged(
     """The signals without marks and turns, and what they were.
 
     Args:
-        request: names them.
         signals: by key, in SI, each on its own clock.
         of_sources: of derived ones by key, the marks that their sources had, by channel.
 
@@ -140,12 +139,7 @@ def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray,
 
 
 def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
-    """Notes on the marks in the channels that a derived one is computed from.
-
-    Args:
-        name: of the derived one, as it is shown.
-        marks: by channel.
-    """
+    """Notes on the marks in the channels that a derived one is computed from."""
     # The four parts of a quaternion are lost together: one note says it of all.
     alike: dict[Counts, list[str]] = {}
     for source, counts in marks.items():
@@ -205,8 +199,6 @@ def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, F
 
     Args:
         values: NaN where one is missing.
-        turn: in their unit.
-        name: as it is shown.
     """
     seen = np.isfinite(values)
     before = values[seen]

@@ -52,9 +52,7 @@ def find_frames(data: bytes, start: int, layouts: dict[str, FrameLayout]) -> Fra
     """All frames of a flight.
 
     Args:
-        data: the flight's bytes, its header included.
         start: where its frames begin.
-        layouts: the fields of each kind of frame, by letter.
     """
     return _Walk(data, start, layouts).run()
 

@@ -179,11 +179,8 @@ def add_predictions(
     Args:
         values: (N,) int32 of all frames in the file's order; changed in place. Those of frames in
             no run come out as anything.
-        i: the field's place.
-        runs: of these frames.
         is_first: which (N,) are I frames.
         motor: what the first motor was told (N,) int32, where a predictor of this field is that.
-        head: the flight's header.
     """
     # Nothing stands before an I frame, so of the predictors only constants and the first motor can
     # be meant in it.

@@ -108,9 +108,7 @@ def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
     """What a channel measures, `an angular rate`, where that is no input of a kind; else empty.
 
     Args:
-        name: of the channel.
         unit: that the log or the name states, empty without one.
-        si: the unit that the model's input has.
         sure: whether to take only what can hardly be a stick, instead of what is likely none.
     """
     words = words_in(name)

@@ -64,8 +64,6 @@ def guess_clock(
     """The clock, and whether its unit is a guess.
 
     Args:
-        table: of rows.
-        surveys: of its columns.
         by_name: whether only one that is called so is taken.
     """
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
@@ -185,10 +183,7 @@ def table_clock(
     its rate.
 
     Args:
-        table: of rows.
-        surveys: of its columns.
         time: the column of time stamps, where it is stated.
-        unit: of the time stamps.
         rate: samples a second [Hz], of rows or of what `time` counts.
 
     Raises:

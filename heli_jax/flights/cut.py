@@ -13,8 +13,6 @@ def part(
 
     Args:
         flight: the whole.
-        first: number of the first sample.
-        last: number after that of the last.
         name: of the part; that of the whole unless given.
         note: what its source says of it, beside what the reader noted.
 

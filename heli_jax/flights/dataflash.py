@@ -219,10 +219,7 @@ def make_log(
     """The log that messages make.
 
     Args:
-        path: of the file.
-        data: its bytes.
         parts: the messages by description, those of one number in the file's order.
-        damaged: how many places were no message.
         scaled: whether fields hold numbers that were multiplied already, as text does.
 
     Raises:

@@ -55,8 +55,6 @@ def derivation(
     """How a channel of this name is computed; None where the name is that of a plain channel.
 
     Args:
-        name: as a configuration has it.
-        known: the log's own channels.
         swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
 
     Raises:
@@ -147,7 +145,6 @@ def body_velocity(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
     Args:
         q: attitude (4, N), w first, from the earth's axes to the body's.
-        velocity: north, east, down.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         q = q / np.linalg.norm(q, axis=0)

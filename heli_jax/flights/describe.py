@@ -175,7 +175,6 @@ def describe_flights(
         time: the column of time stamps, in seconds where only its name is given; by default a
             column with a usual name (its unit from an ending such as `_ms`, or guessed from the
             steps), or the first that increases from row to row.
-        unit: of the time stamps, whichever column they are in.
         number: of the one flight to describe, from 1.
         rate: samples a second [Hz] of a table without times: of its rows, or of a column that
             counts them.
@@ -236,9 +235,6 @@ def describe_table(
     """As `describe_flights`, of a table that is open.
 
     Args:
-        table: of rows.
-        time: the column of time stamps.
-        unit: of the time stamps.
         rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
             clock, or a column that counts them, unless `time` names one.
 

@@ -129,7 +129,6 @@ def topics_of(
         seconds: of the rows (N,) [s].
         columns: (N,), NaN where a cell is empty.
         units: by column, where they are stated.
-        clock: the column of time stamps.
     """
     topics = []
     for group in row_groups(columns):

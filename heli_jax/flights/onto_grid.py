@@ -261,7 +261,6 @@ def _resampled_with(
     by least squares.
 
     Args:
-        signal: the output, on its own clock.
         inputs: held ones that it follows at the very sample, each with what `held_low_passed`
             makes of it.
         times: (M,) [s].
@@ -287,11 +286,9 @@ def flight_of(
     """The flight of samples (N,) on one grid.
 
     Args:
-        request: what was asked for.
         samples: by key, SI.
         dt: step of the grid [s].
         t0: time in the log of the first sample [s].
-        holds: by input.
         source: where the samples came from.
     """
     options = request.options

@@ -47,7 +47,6 @@ def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
     """Open a log of any format; columns of tables are read when they are asked for.
 
     Args:
-        path: the file.
         flight: which flight of a file that holds several, from 1.
 
     Returns:

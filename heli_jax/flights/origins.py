@@ -42,8 +42,6 @@ def with_origins(
     Args:
         flight: as it was read, without the constants.
         inputs: all, in the order in which the flight shall have them.
-        outputs: all.
-        constants: those of the inputs that are constant.
 
     Raises:
         ValueError: a constant is no finite number.

@@ -85,11 +85,6 @@ def read_parts(
 
     Args:
         path: as of `read_flight`, and so are the others.
-        time: the column of time stamps.
-        inputs: the log's signals by the model's names.
-        outputs: the same for what was measured.
-        options: which part of the log, at which rate.
-        **keywords: fields of ReadOptions.
 
     Returns:
         The run as it is where it has no such gap, else its parts, named `NAME, part 1` and so on.

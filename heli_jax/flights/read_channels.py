@@ -130,8 +130,6 @@ def topic_clock(
     """The times of a topic inside the window, finite and increasing.
 
     Args:
-        log: of the topic.
-        topic: its name.
         times: its stamps (N,) [s], in the log's own count.
         window: first and last [s] from the log's beginning.
 
@@ -174,9 +172,7 @@ def in_si(
     """The numbers (N,) of a log in SI.
 
     Args:
-        signal: what they are.
         kind: `input` or `output`, which may be missing here and there.
-        numbers: as the log has them.
         refuse: makes the error of a row of them, of what is to be said behind it.
 
     Raises:
@@ -245,7 +241,6 @@ def flight_of_signals(
 
     Args:
         signals: by key, in SI inside the window.
-        request: what was asked for.
         source: where they came from, with notes on it so far.
 
     Raises:
@@ -392,7 +387,6 @@ def common_times(
     """Times (M,) [s] at the rate [Hz] at which all topics have samples before and behind.
 
     Args:
-        path: for the message.
         clocks: of the topics, at least one; their times count from the log's beginning.
         rate: of the times [Hz].
         on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid

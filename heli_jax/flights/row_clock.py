@@ -196,8 +196,6 @@ def with_runs(
     """A table whose runs follow one another; as it is where it holds one.
 
     Args:
-        table: of rows.
-        clock: the column of times.
         numbers: that column (N,), and the one that numbers runs.
         scale: [s] of a unit of the stamps.
         column: that numbers runs; without one they begin where the time does.

@@ -184,7 +184,6 @@ def facts_of_all[K: Hashable](
 
     Args:
         signals: stamps (N,) [s] and samples (N,) by key.
-        outputs: keys of those that a machine cannot hold still.
     """
     # Differences of huge values overflow, and no more is known of such signals then.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -339,8 +338,6 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
 
     Args:
         x: samples (N,), NaN where one is missing.
-        finite: those that are not.
-        counts: by distinct value, the largest first.
     """
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.

@@ -69,7 +69,6 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     speak of where it is many times as fast.
 
     Args:
-        signal: slower than the times.
         times: (M,) [s], evenly spaced, M >= 2.
     """
     seen = ~np.isnan(signal.values)
@@ -104,7 +103,6 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
     disturbance.
 
     Args:
-        signal: of about the grid's rate.
         times: (M,) [s], evenly spaced, M >= 2.
 
     Returns:
@@ -134,9 +132,7 @@ def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
     """What was done to a slow output, in a sentence.
 
     Args:
-        name: of the signal, as it is shown.
         placed: what `at_nearest` made of it.
-        signal: as logged.
         rate: of the grid [Hz].
     """
     there = int(np.count_nonzero(~np.isnan(placed.samples)))

@@ -65,7 +65,6 @@ def one_topic(
     Args:
         table: of rows, or of arrays, of which those of other lengths are left out.
         time: the clock, where it is named; else guessed.
-        unit: of the clock.
         rate: samples a second [Hz] of a table without times.
         notes: to which what was assumed and left out is added.
 

@@ -24,11 +24,9 @@ class TableView:
     ) -> None:
         """
         Args:
-            table: of all rows.
             rows: those that are seen (n,), as numbers of the table's.
             columns: that stand in place of the table's, or beside them (N,); None for the numbers
                 of the rows.
-            note: of what is seen otherwise.
         """
         self.table, self._rows, self._columns = table, rows, columns
         self.path, self.format, self.size = table.path, table.format, table.size

@@ -70,11 +70,7 @@ def require_likely(
     that one or nobody stated seconds; a caution where somebody did.
 
     Args:
-        path: for the message.
-        name: of the column.
-        unit: in which the stamps are taken.
         stamps: (N,)
-        assumed: whether nobody stated it.
 
     Raises:
         InputError: with what to state.

@@ -46,7 +46,6 @@ def lines(
     Args:
         x: samples (N,); NaN where one is missing, which are put on straight lines.
         dt: time between them [s].
-        rotor_hz: turns per second of the rotor.
         logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
     """
     n = min(x.size, max(64, round(SEGMENT / dt)))
@@ -79,7 +78,6 @@ def line_words(line: Line, rotor_hz: float | None) -> str:
     """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`.
 
     Args:
-        line: of a signal.
         rotor_hz: turns per second of the rotor, where they are known.
     """
     share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
@@ -145,7 +143,6 @@ def settling(frequencies: Sequence[float], q: float) -> float:
 
     Args:
         frequencies: centres of the notches [Hz].
-        q: centre over width.
     """
     # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
     return 3.0 * q / (np.pi * min(frequencies))
@@ -166,7 +163,6 @@ def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: floa
         x: samples (N,), NaN between those that were taken.
         dt: of the grid [s].
         frequencies: centres of the notches [Hz].
-        q: centre over width.
     """
     step = slow_step(x)
     own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
@@ -190,7 +186,6 @@ def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) ->
         x: samples (N,), NaN where one is missing.
         dt: time between them [s].
         frequencies: centres of the notches [Hz], below half the rate.
-        q: centre over width.
     """
     from scipy.signal import iirnotch, lfilter, lfilter_zi
 

@@ -29,7 +29,6 @@ def filtered_noise(low_passes: Sequence[LowPass], flights: Sequence[Flight]) -> 
 
     Args:
         low_passes: `Model.low_passes`.
-        flights: as they are fitted.
     """
     return tuple(p for p in low_passes if any(_shows(p, f) for f in flights))
 
@@ -65,11 +64,9 @@ def push_scales(
     is what would move the most sensitive output as far as it was measured to move.
 
     Args:
-        model: the disturbed one, n states.
         params: its parameters at the first guess, SI.
         inputs: at the first sample, SI.
         outputs: standard deviation of what was measured, by name, SI.
-        disturbances: those to scale.
     """
     at = model.Inputs(**{n: jnp.asarray(v) for n, v in inputs.items()})
     A, _, C, _ = (np.asarray(M) for M in jacobians(model, params, model.initial_state(params), at))
@@ -90,7 +87,6 @@ def _scale(A: np.ndarray, C: np.ndarray, sds: np.ndarray, state: int) -> float:
         A: (n, n).
         C: (p, n), of the measured outputs.
         sds: (p,), of what was measured.
-        state: the number of the state that is pushed.
     """
     reach, least = C, np.inf
     for _ in range(_DEEPEST):
@@ -127,10 +123,7 @@ def offset_inputs(
     equations that parameter stands for the offsets already.
 
     Args:
-        model: whose inputs they are.
         params: its parameters, SI; what is known of the flight replaces them.
-        flight: how long, and how far the inputs go.
-        free: names of the free parameters.
     """
     centreless = ("x_throttle", "x_collective", "Omega")
     sticks = [n for n in naming.names(model.Inputs) if n not in centreless]

@@ -102,7 +102,6 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     """The problem at its start values, for diagnostics.
 
     Args:
-        problem: model, vehicle, flights and what is free.
         guess: of `first_guess`, where it is at hand already.
     """
     guess = guess or first_guess(problem)
@@ -116,11 +115,7 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
 
 
 def rates(problem: Problem) -> tuple[Finding, ...]:
-    """Of the findings those on logging rates alone, which need no simulation.
-
-    Args:
-        problem: model, vehicle, flights and what is free.
-    """
+    """Of the findings those on logging rates alone, which need no simulation."""
     return tuple(of_rates(problem, first_noise(problem, problem.training).sd))
 
 
@@ -128,7 +123,6 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     """What each window of the flights says of the free parameters, at the start values.
 
     Args:
-        problem: model, vehicle, flights and what is free.
         length: of a window [s]; unless given a twelfth of the longest flight, between 2 and 20 s.
 
     Raises:

@@ -46,9 +46,7 @@ def check_free(name: str, free: Free, model: Model) -> None:
     """Refuse a free parameter that the model does not have, or whose numbers contradict.
 
     Args:
-        name: of the parameter.
         free: its start, bounds, prior and sign; the sign is filled in.
-        model: whose Params it belongs to.
 
     Raises:
         ValueError: naming the key, what was expected and what was got.
@@ -131,12 +129,6 @@ _FASTEST, _OVER = 15.0, 0.1
 
 def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
     """Refuse what is of another kind than it has to be.
-
-    Args:
-        params: the model's class of parameters.
-        vehicle: should be one of these.
-        flights: should be a sequence of Flights.
-        free: should be Free by name.
 
     Raises:
         TypeError: naming the argument, what was expected and what was found.

@@ -67,7 +67,6 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
     Args:
         problem: with starts of its own; its method and its windows do not matter. Without a
             disturbance, whose states a spectrum of the noise stands for.
-        max_steps: of the optimiser.
 
     Raises:
         ValueError: frequency error cannot solve it; the sentence says why.
@@ -96,12 +95,7 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
 
 
 def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
-    """The problem with the guess for its starts.
-
-    Args:
-        problem: to be fitted in time.
-        guess: of the same free parameters.
-    """
+    """The problem with the guess for its starts."""
     free = {
         n: f._replace(start=guess.values[n].value) if n in guess.values else f
         for n, f in problem.free.items()

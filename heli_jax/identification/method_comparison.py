@@ -64,7 +64,6 @@ class MethodComparison(NamedTuple):
         """A method's estimate; None where it has none.
 
         Args:
-            result: one of the results.
             name: of a parameter, delay or gain.
         """
         if result.fit is None or result.reason:
@@ -76,10 +75,6 @@ class MethodComparison(NamedTuple):
 
         The two are taken as independent. Both come from the same records, so that they differ by
         less than this where both are right: a difference that it shows is one.
-
-        Args:
-            other: one of the results.
-            name: of the parameter.
         """
         a, b = self.estimate(self.results[0], name), self.estimate(other, name)
         if a is None or b is None:
@@ -124,11 +119,8 @@ def compare_methods(
     """Fit a problem by further methods.
 
     Args:
-        main: the fit that the others are laid beside.
         others: by method the problem, or why the method refuses it.
         starts: as `fit` takes it.
-        seed: likewise.
-        max_steps: likewise.
         progress: called with a line of text before each longer part of the work.
     """
     report = progress or (lambda _: None)

@@ -73,9 +73,7 @@ def alternatives(
     """No disturbance, one pole and two poles on `axis`, all by filter error.
 
     Args:
-        problem: gives vehicle, flights, free parameters and nuisances.
         model: the model without disturbance.
-        axis: whose angular acceleration is disturbed, such as 'roll'.
         without_stand: the same machine without its stand, where that is in question too; it is
             fitted without the stand's kappa and zeta.
     """
@@ -108,7 +106,6 @@ def _by_filter_error(problem: Problem, model: Model, *, silent: bool = False) ->
 
     Args:
         problem: gives the vehicle's values, and the starts of the disturbances that it has too.
-        model: the disturbed one.
         silent: fix its one disturbance at all but nothing: the measurement noise is then laid out
             as in the others, and the likelihoods can be compared.
     """
@@ -163,7 +160,6 @@ def choose(
     A model that ends below one nested in it is fitted again from there, and a sentence says so.
 
     Args:
-        problems: by name, all with the same flights.
         nested: names (small, large) of those to compare by a likelihood ratio.
         progress: called with a line of text before each fit.
         fit_options: go to `fit`.
@@ -286,7 +282,6 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
     """The problem with its starts where the fit of another one ended, the disturbance's too.
 
     Args:
-        problem: to be fitted again.
         nested: the other one; a parameter that is fixed there begins at its value there, one that
             its model does not have begins all but at zero.
         optimum: the fit of `nested`.
@@ -438,11 +433,6 @@ def with_likelier_hold(
 
     An input that moves at every sample may be a stick that was sampled on its way or a command that
     is computed at each sample and held. The log looks the same; the answer is half a sample later.
-
-    Args:
-        problem: what was fitted.
-        fit: the fit.
-        refit: fits a problem as that one was.
     """
     if fit.status == "not-converged":
         return problem, fit

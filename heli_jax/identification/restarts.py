@@ -141,13 +141,7 @@ def _needs_further_starts(at: SearchState) -> bool:
 
 
 def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) -> bool:
-    """True if the start values were stable and an optimum is not.
-
-    Args:
-        problem: what is fitted.
-        search: over it.
-        optimum: of a linear model.
-    """
+    """True if the start values were stable and an optimum is not."""
     values = named_values(search.layout, search.data, optimum.best.z)
     return is_unstable(problem, problem.params_with(values)) and not is_unstable(
         problem, problem.start_params()

@@ -38,11 +38,7 @@ _FIRST_STEPS = 40
 
 
 def first_guess(problem: Problem) -> FirstGuess:
-    """The problem at its start values, with a first guess of the noise.
-
-    Args:
-        problem: model, vehicle, flights and what is free.
-    """
+    """The problem at its start values, with a first guess of the noise."""
     # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
     # with both can a coarse search compare starts.
     layout = layout_of(problem, problem.training)
@@ -96,11 +92,8 @@ def search(
     """Search for the optimum of a problem from its first guess, then by each restart that applies.
 
     Args:
-        problem: what is fitted.
         guess: of `first_guess`.
         starts: how many points to start from, as `fit` takes it.
-        seed: of their draw.
-        max_steps: of the optimiser, in each of its runs.
         report: called with a line of text before each longer part of the work.
     """
     layout, data = guess.layout, guess.data
@@ -155,9 +148,6 @@ def is_better(
     was; or it has the higher log-posterior.
 
     Args:
-        problem: what is fitted.
-        over: the search.
-        optimum: the one.
         other: the other, which stays where there is no difference.
     """
 
@@ -175,7 +165,6 @@ def log_posterior(over: Search, optimum: RelaxedOptimum) -> float:
     -inf where it is not finite.
 
     Args:
-        over: the search.
         optimum: where it ended.
     """
     values = named_values(over.layout, over.data, optimum.best.z)

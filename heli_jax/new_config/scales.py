@@ -34,9 +34,6 @@ def scaled(
     """A channel with the unit and the scale that its name, the log or its numbers tell.
 
     Args:
-        channel: its name.
-        series: its samples.
-        si: the unit that the model has.
         full: what the log's sticks count to at their stops, where that is known.
         is_input: whether it is a stick's or a servo's.
     """

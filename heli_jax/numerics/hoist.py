@@ -25,7 +25,6 @@ def hoisted(
     what `function(params, *others)` does, operation for operation.
 
     Args:
-        function: of params and others, anything that JAX can trace.
         params: what stays the same at every step; its leaves may be tracers.
         *others: examples of what changes; their shapes and types count.
     """

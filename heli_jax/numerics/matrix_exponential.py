@@ -137,7 +137,6 @@ def van_loan(
 
     Args:
         A: 1/s, of scaled states.
-        f: the drift that stays, states per second.
         g: the noise intensity, states per second times sqrt(s).
         h: the step [s], a number.
 

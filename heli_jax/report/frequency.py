@@ -156,9 +156,6 @@ def held(
     """Hd(e^{i omega dt}) (k,) from input j, held over each sample, to output i.
 
     Args:
-        matrices: A, B, C and D of a linear model.
-        i: of the output.
-        j: of the input.
         dt: sample time [s].
         omega: (k,) [rad/s]
     """
@@ -237,10 +234,8 @@ def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -
     the slow mode within one is smooth, and is all but gone at that frequency.
 
     Args:
-        samples: of the record.
         dt: between two of them [s].
         memory: how long the machine remembers its input [s].
-        least: segments that make an average.
     """
     most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
     length, lowest = max(_needed(dt, memory), most), 0.0

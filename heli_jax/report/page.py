@@ -99,14 +99,9 @@ def picture(
     """Draw a figure for a page; None where there is nothing to draw.
 
     Args:
-        name: of its files.
-        draw: draws it.
-        numbers: the page's, to which it is added.
         folder: for NAME.svg, and NAME.png where that is asked for; no files unless given.
-        logged: by signal how its log has it.
         kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
             `panels` words are made alone; of an `image` the title is all.
-        png: whether the folder gets NAME.png too.
     """
     with style.in_style():
         drawn = style.figure_of(draw())

@@ -113,10 +113,7 @@ def panels(
 
     Args:
         height: of the figure [inch].
-        ratios: heights of the panels, relative to each other.
-        sharex: whether the panels have one x axis.
         right: margin [inch].
-        top: likewise, above the first panel.
     """
     from matplotlib.transforms import ScaledTranslation
 

@@ -433,8 +433,6 @@ def product(
 
     Args:
         powers: by estimate or constant.
-        estimates: those of a fit.
-        constants: the numbers that it took as known.
         names: the order of `correlation`.
         correlation: between the estimates, (q, q).
 

@@ -139,7 +139,6 @@ def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
 
     Args:
         shape: points [m].
-        turn: of the body.
         at: (3,) position of the body's origin in the figure [m].
     """
     # Forward, left and up are right-handed, as a viewer takes axes to be; forward, right and up

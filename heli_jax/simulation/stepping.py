@@ -95,9 +95,6 @@ def start_state(
 def check_countable(samples: int, dtype: Any) -> None:
     """Refuse a run of so many samples that their numbers are not told apart in its precision.
 
-    Args:
-        dtype: of its states, in which diffrax counts the samples.
-
     Raises:
         ValueError: float32 and more than 4 million samples.
     """

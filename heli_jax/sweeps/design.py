@@ -363,7 +363,6 @@ def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
 
     Args:
         axes: by name, from where to where, SI.
-        n: elements.
         seed: of the points; the same one gives the same.
 
     Raises:

@@ -88,8 +88,6 @@ def spread(
 
     Args:
         function: of the numbers of a flight and of what an element has of its own.
-        devices: among which the elements are cut.
-        lanes: elements side by side on each.
 
     Returns:
         The function of the numbers and of a tuple of arrays with an element a row, and how those

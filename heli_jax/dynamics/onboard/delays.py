@@ -242,18 +242,13 @@ def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
     """What comes out of a delay line: the signal one delay ago, or as it is now for none.
 
     Args:
-        past: the states of the line, in the signal's unit.
         delay: [s].
     """
     return jnp.where(delay == 0, value, line_end(past))
 
 
 def line_end(past: Sequence[Any]) -> Any:
-    """The signal at the far end of a delay line of one state at least, one delay ago.
-
-    Args:
-        past: the states of the line, in the signal's unit.
-    """
+    """The signal at the far end of a delay line of one state at least, one delay ago."""
     # Shifted Legendre polynomials are all one there: the sum of the coefficients is the value.
     return sum(past)
 
@@ -272,9 +267,6 @@ def _possible(delay: Any) -> Any:
 
 def require_past(model: Model, params: Record) -> None:
     """Refuse a delay line that would look ahead.
-
-    Args:
-        params: its Params, concrete.
 
     Raises:
         ValueError: naming the signal and its delay.
@@ -296,7 +288,6 @@ def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
     NaN where tau is negative.
 
     Args:
-        past: the states m, in the signal's unit.
         delay: tau [s].
     """
     rates, delay = [], _possible(delay)

@@ -52,7 +52,6 @@ def with_sensors(
         angular_acceleration: whether `pdot`, `qdot`, `rdot` [rad/s^2] are outputs.
         airspeed: whether `airspeed` and `u_air`, `v_air`, `w_air` [m/s] are outputs, at (`x_air`,
             `y_air`, `z_air`) [m] from the centre of gravity.
-        order: states of each delay's line.
 
     Raises:
         ValueError: no such output, velocities that the model does not know, or a name that is
@@ -294,11 +293,7 @@ def _body_rates(model: Model) -> tuple[str, ...]:
 def specific_force(
     model: Model, motion: MotionKind, p: Record, s: Record, u: Record, rates: Record
 ) -> dict[str, Any]:
-    """The specific force at the IMU [m/s^2], by output.
-
-    Args:
-        p: the model's Params with x_imu, y_imu, z_imu.
-    """
+    """The specific force at the IMU [m/s^2], by output."""
     # From the model's own derivatives, so that thrust, drag and gusts are in it without being
     # named: an accelerometer shows all forces but weight.
     of_kind = {"linear": _linear, "body": _body, "ground": _ground}[motion.kind]
@@ -313,7 +308,6 @@ def airspeed(
     forward, right, down, and airspeed, their norm [m/s].
 
     Args:
-        p: the model's Params with x_air, y_air, z_air.
         u: the model's Inputs; the wind is wind_x, wind_y, wind_z where it is among them.
     """
     at = (p.x_air, p.y_air, p.z_air)

@@ -53,9 +53,7 @@ def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivi
     """Return the rows of the data of an evaluation.
 
     Args:
-        problem: bounds, priors and starts.
         layout: what stands where in the Jacobian's columns.
-        e: the whitened residuals' Jacobian and the values there.
     """
     unknowns, rows = relative_rows(problem, layout, e)
     # Of the unknowns that are no parameter of interest the first are shared by all flights.
@@ -68,8 +66,6 @@ def row_places(layout: Layout, data: Data, count: int) -> tuple[np.ndarray, np.n
     """Return the flight and the sample of each row of a `Sensitivity`, (n,) each; -1 for none.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
         count: of the rows. Behind those of the samples stand a filter's variances, one a sample, or
             the defects between windows, which belong to a flight alone.
     """
@@ -124,10 +120,6 @@ def expected_sd(
 ) -> Float[np.ndarray, " q"]:
     """Return expected standard deviations of the parameters of interest, in relative coordinates
     (of log |value| where they have a sign); infinite where the data and the priors say nothing.
-
-    Args:
-        unknowns: the parameters, with their priors.
-        R: triangle of the data.
     """
     q = len(unknowns)
     # A parameter's prior is a measurement of itself.
@@ -142,9 +134,7 @@ def not_determined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str
     """Return the parameters that the whole record does not determine: then none of its parts does.
 
     Args:
-        problem: what is free.
         layout: what stands where.
-        e: the evaluation there.
     """
     verdict = verdict_of(problem, layout, e)
     return (*verdict.undetermined, *verdict.without_effect)
@@ -161,13 +151,7 @@ _WORTH_DOUBT = 0.1
 def too_good(
     sds: Sequence[float] | np.ndarray, guessed: bool, *, nothing_follows: bool = False
 ) -> str:
-    """Return a sentence where expected sds are too small to be true; empty where they are not.
-
-    Args:
-        sds: relative.
-        guessed: whether noise was guessed.
-        nothing_follows: whether no output was found to follow any input.
-    """
+    """Return a sentence where expected sds are too small to be true; empty where they are not."""
     if nothing_follows and len(sds) and float(np.min(sds)) < _WORTH_DOUBT:
         return (
             f"An expected sd of {100 * float(np.min(sds)):.2g} % is no promise: it takes for "
@@ -186,9 +170,6 @@ def too_good(
 def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
     """Return, by free parameter that starts at zero, the size [SI] that its expected sd is relative
     to, and its unit.
-
-    Args:
-        problem: what is to be fitted.
     """
     return {
         n: (scale(f), naming.unit(problem.model.Params, n) or "1")

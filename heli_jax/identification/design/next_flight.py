@@ -57,10 +57,6 @@ def look_at_missing(
 ) -> tuple[tuple[str, ...], list[MissingOutput]] | None:
     """Return the parameters of interest, and for each output that no flight has what it would do;
     None where the method's rows are not samples of one output each.
-
-    Args:
-        problem: what is free.
-        at: layout, data, noise and unknowns at the start values.
     """
     # The rows of a filter's predictions belong to all outputs together, which say each other's.
     if not at.layout.estimator.rows_are_samples:
@@ -189,13 +185,7 @@ class Plan(NamedTuple):
 
 
 def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
-    """Compare manoeuvres; None where nothing can be compared.
-
-    Args:
-        problem: what is free.
-        at: layout, data, noise and unknowns at the start values.
-        e: the evaluation there.
-    """
+    """Compare manoeuvres; None where nothing can be compared."""
     # A filter of a nonlinear model would be compiled for every candidate by itself.
     if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
         return None

@@ -77,8 +77,6 @@ def why_excluded(flight: Flight, first: int, last: int) -> str:
 
     Args:
         flight: the whole of it.
-        first: sample.
-        last: sample after the window's last one.
     """
     for name, y in flight.outputs.items():
         if missing := _missing(y, slice(first, last), flight.dt):
@@ -157,8 +155,6 @@ def _chosen(
     and the sds expected of all that could be taken.
 
     Args:
-        unknowns: the parameters.
-        usable: windows, and the triangle of what each says.
         unknown: True where the whole record does not determine a parameter.
     """
 
@@ -282,9 +278,6 @@ def rank_windows(
     """Rank the windows of the flights that are fitted, and take those that together say enough.
 
     Args:
-        problem: what is free.
-        at: layout, data, noise and unknowns at the start values.
-        e: the evaluation there.
         length: of a window [s].
 
     Raises:
@@ -464,10 +457,7 @@ def _prior_weights(
     """By own unknown of all windows, the part of its weak prior (as 1 / sd) that a window has.
 
     Args:
-        layout: of the windows.
-        cuts: the layout's flights.
         flights: the whole ones.
-        samples: of a window.
         shooting: True if the whole record has initial states at every window too.
     """
     weights: list[float] = []

@@ -187,7 +187,6 @@ def of_rates(
     """Findings on logging rates, which need no simulation; where all are enough the lowest alone.
 
     Args:
-        problem: model, flights and start values.
         sd: by flight and output the noise that is assumed, SI.
         params: the model's Params with the estimates in place, SI; the start values unless given.
     """

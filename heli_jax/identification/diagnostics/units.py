@@ -125,13 +125,7 @@ def size_of_angles(c: Context) -> Iterator[Finding]:
 
 
 def in_degrees(model: Model, label: str, flight: Flight) -> Iterator[Finding]:
-    """Angles and rates of a flight that look like degrees read as radians.
-
-    Args:
-        model: whose axes say which outputs are attitudes and rates.
-        label: of the flight.
-        flight: as read from a log.
-    """
+    """Angles and rates of a flight that look like degrees read as radians."""
     for one in oversized(model, flight):
         yield found(
             # What was flown upside down is in its own unit as likely as not.

@@ -182,9 +182,7 @@ def coefficients(
     """Return [A B; C D] of a linear model, and beside it its derivatives by the parameters.
 
     Args:
-        model: linear, with n states, m inputs and p outputs.
         base: all parameters by name, SI.
-        names: those to differentiate by.
         values: theirs (q,), in place of those in `base`.
 
     Returns:
@@ -232,9 +230,7 @@ def structure(model: Model, both: Float[np.ndarray, "r c q"], outputs: Sequence[
     with known coefficients; or where it is the derivative of one, as a rate is of an angle.
 
     Args:
-        model: linear.
         both: of `coefficients`, by the free parameters, at `generic` values of these.
-        outputs: measured, by name.
     """
     value, depends = both[..., 0], (both[..., 1:] != 0).any(axis=-1)
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
@@ -294,10 +290,8 @@ def hidden_constants(
     squares fit the rest to a wrong signal.
 
     Args:
-        model: linear.
         base: all parameters by name; one that is not given (NaN) stays so, other values do not
             matter.
-        structures: of the flights.
     """
     names = tuple(n for n in naming.names(model.Params) if not np.isnan(base[n]))
     both = coefficients(model, base, names, generic(len(names)))
@@ -338,9 +332,7 @@ def record(
     """Return a flight smoothed.
 
     Args:
-        model: linear.
         flight: with outputs as `structure` has them.
-        structure: of the flight.
         half: half width of the kernel [samples].
         late: by input, how late it acts [s].
     """

@@ -67,7 +67,6 @@ class Regression(NamedTuple):
 
         Args:
             values: of the parameters `names` (q,), SI.
-            weights: one over the residuals' size, by equation.
         """
         with np.errstate(all="ignore"):
             try:
@@ -164,12 +163,7 @@ def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndar
 def recurrence(
     phi: Float[np.ndarray, "h h"], f: Float[np.ndarray, "N h c"]
 ) -> Float[np.ndarray, "N h c"]:
-    """Return x(0) = f(0), x(k) = phi x(k-1) + f(k), by doubling.
-
-    Args:
-        phi: transition matrix.
-        f: what is added at each sample, for many columns.
-    """
+    """Return x(0) = f(0), x(k) = phi x(k-1) + f(k), by doubling."""
     x, done = f.copy(), 1
     # After each round x(k) holds what the last `done` samples add: log2(N) steps in place of N.
     while done < len(x):
@@ -187,10 +181,8 @@ def search(
     """Levenberg-Marquardt on the equation error; None where that is not finite at the start.
 
     Args:
-        regression: what is regressed.
         start: values to begin with (q,), SI.
         keep_sign: True where a parameter keeps its start's sign (q,): searched in its logarithm.
-        weights: by equation.
     """
     from scipy.optimize import least_squares
 
@@ -330,9 +322,7 @@ def select(
     Products of parameters are taken as they are linear about the point where all terms are in.
 
     Args:
-        rows: there, weighted.
         values: of the parameters there (q,).
-        names: theirs.
         forced: those that stay in: of a known sign, they cannot be zero.
         limits: F to enter and F to remove; the second is at most the first.
     """

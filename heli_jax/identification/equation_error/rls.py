@@ -82,9 +82,7 @@ def rls_step(
     Args:
         state: Theta (q,) and the square root of P (q, q).
         phi: regressor (q,).
-        y: what it should give.
         forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
-        bound: largest variance that a parameter may have.
     """
     theta, S = state
     f = jnp.sum(S * phi[:, None], axis=0)
@@ -122,11 +120,6 @@ def _bounded(
 def regressors(u: Float[Array, " N"], y: Float[Array, " N"], order: int) -> Float[Array, "N q"]:
     """Return Phi(k) = [y(k-1) ... y(k-n), u(k) ... u(k-n)], eq. 25, (N, 2n + 1), with zeros before
     the first sample.
-
-    Args:
-        u: input.
-        y: output.
-        order: n.
     """
 
     def delayed(s: Array, j: int) -> Array:
@@ -189,10 +182,7 @@ def rls_regression(
     """Run RLS with any regressors: y(k) = phi(k)^T theta.
 
     Args:
-        phi: regressors.
-        y: what they should give.
         forgetting: in (0, 1].
-        p0: initial variance of every parameter.
         bound: largest variance that P may reach, against wind-up; 100 p0 unless given.
     """
     dtype = phi.dtype
@@ -261,7 +251,6 @@ def baseline(
     Args:
         model: names the signals, and shows whether physical parameters can be read off.
         params: the model's Params, for the vehicle's geometry and rotor speed.
-        flight: the record.
         order: n of Hd(z); the paper's is 4.
         forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
 
@@ -430,13 +419,7 @@ def _combinations(
 def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
 ) -> list[str]:
-    """What shows that noise biases least squares on past measured outputs.
-
-    Args:
-        errors: of one step ahead, in the unit of y.
-        y: as measured.
-        agreement: of the simulation with y.
-    """
+    """What shows that noise biases least squares on past measured outputs."""
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))

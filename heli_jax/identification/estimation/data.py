@@ -32,8 +32,6 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     """The numbers of a problem over the given flights.
 
     Args:
-        problem: model, vehicle and what is free.
-        flights: those of the layout, in its order.
         layout: of the problem over these flights, where it is at hand already.
     """
     dtype = np.dtype(jnp.result_type(float))

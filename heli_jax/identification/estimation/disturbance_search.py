@@ -24,10 +24,6 @@ def likely_gusts(at: Solution, e: Evaluation) -> tuple[Float[Array, " q"], Evalu
     """z with the disturbances of the greatest likelihood, all else as it is, and what that tells.
 
     A search may begin a decade off; what a fit may be expected to determine goes with the size.
-
-    Args:
-        at: the start values.
-        e: there.
     """
     layout, data, noise, z = at
     k, places = layout.first_nuisance, [layout.disturbance_at(n) for n in layout.disturbance]
@@ -57,7 +53,6 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
     same residuals with sigma_w all but zero are those of output error.
 
     Args:
-        search: the optimiser over the problem.
         optimum: with all disturbances; the search for it may have been cut short.
     """
     layout = search.layout
@@ -87,13 +82,7 @@ def significant_disturbances(search: Search, optimum: RelaxedOptimum) -> Relaxed
 
 
 def with_noise_guess(search: Search, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
-    """z with the disturbances from a coarse search about their start values.
-
-    Args:
-        search: the optimiser over the problem.
-        noise: of the measurements.
-        z: the unknowns.
-    """
+    """z with the disturbances from a coarse search about their start values."""
     layout = search.layout
     for name in layout.disturbance:
         start = np.log(search.problem.noise[name].start)

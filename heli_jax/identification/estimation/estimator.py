@@ -114,9 +114,6 @@ class Estimator(abc.ABC):
         """The rows of the measurements at the unknowns; traced, and differentiated forwards.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: of the measurements, by which the rows are divided.
             u: the unknowns, in the units of the model.
         """
 
@@ -136,48 +133,25 @@ class Estimator(abc.ABC):
         return (), False
 
     def refusal(self, problem: Problem) -> str | None:
-        """Why the method cannot solve a problem and what can, in words; None where it can.
-
-        Args:
-            problem: its model and flights have been checked by themselves.
-        """
+        """Why the method cannot solve a problem and what can, in words; None where it can."""
         return None
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
-        """By flight what the method has to know of it before anything is traced; hashable.
-
-        Args:
-            problem: what is fitted.
-            flights: those of a layout, in its order.
-        """
+        """By flight what the method has to know of it before anything is traced; hashable."""
         return ()
 
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """By flight and input what of it follows the instruments (N,), SI; None without any.
-
-        Args:
-            problem: says which instruments are used.
-            flights: those of a layout, in its order.
-        """
+        """By flight and input what of it follows the instruments (N,), SI; None without any."""
         return None
 
     def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """The first guess of the noise as the method needs it.
-
-        Args:
-            noise: standard deviations by flight and output.
-            flights: those fitted.
-        """
+        """The first guess of the noise as the method needs it."""
         return noise
 
     def begins_with(self, data: Data) -> Data:
-        """What the first search goes by, other signals where those measured would mislead it.
-
-        Args:
-            data: the numbers.
-        """
+        """What the first search goes by, other signals where those measured would mislead it."""
         return data
 
     def to_begin_with(
@@ -192,30 +166,17 @@ class Estimator(abc.ABC):
         Jacobian at z; the one given where there is none.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: to begin with.
-            z: the start values.
             known: residuals and Jacobian there with `noise`.
         """
         return noise, known
 
     def whole(self, noise: Noise) -> Noise:
-        """The noise by which a search ends that began with less; the same object otherwise.
-
-        Args:
-            noise: so far.
-        """
+        """The noise by which a search ends that began with less; the same object otherwise."""
         return noise
 
     def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """The noise to ask at the start values what a fit may determine, where a search begins by
         other equations or with another noise than it ends with.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: to begin with.
         """
         return noise
 
@@ -223,8 +184,6 @@ class Estimator(abc.ABC):
         """`prepared` where the method asks more of the problem than its flights.
 
         Args:
-            problem: what is fitted.
-            noise: standard deviations by flight and output.
             flights: those fitted, or those held out.
         """
         return self.prepared(noise, flights)
@@ -233,9 +192,7 @@ class Estimator(abc.ABC):
         """The noise with the level about which the likelihood is laid out in rows.
 
         Args:
-            data: the numbers of the problem.
             e: at any point, with `noise`.
-            noise: so far.
         """
         return noise
 
@@ -245,11 +202,7 @@ class Estimator(abc.ABC):
         """The noise that the rows show, degrees of freedom taken off in proportion, and z.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             e: the `Evaluation` at z with `noise`; None unless `relaxes_rows`.
-            noise: so far.
-            z: the unknowns.
         """
         n = measured_count(data)
         # What the unknowns could fit of the noise is missing in the rows of every signal.
@@ -266,38 +219,17 @@ class Estimator(abc.ABC):
     def with_nuisances(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """z at the end of a search, with the nuisances that neither rows nor noise hang on.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: as relaxed.
-            z: the unknowns.
-        """
+        """z at the end of a search, with the nuisances that neither rows nor noise hang on."""
         return z
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
-        """Whether the optimum moves with the noise, so that it has to be searched again.
-
-        Args:
-            problem: what is fitted.
-            layout: what the unknowns are.
-            before: the noise that the optimum was found with.
-            after: as relaxed there.
-        """
+        """Whether the optimum moves with the noise, so that it has to be searched again."""
         return True
 
     def errors_of(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation
     ) -> list[np.ndarray]:
-        """By signal what the rows are made of, SI, where something is measured.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that the rows were divided by.
-            e: the evaluation that holds the rows.
-        """
+        """By signal what the rows are made of, SI, where something is measured."""
         errors = self.rows_by_signal(layout, data, noise, e)
         # The row of a missing sample is zero, which is no error of that size.
         return [
@@ -308,14 +240,7 @@ class Estimator(abc.ABC):
     def rows_by_signal(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation
     ) -> list[np.ndarray]:
-        """By signal all of its rows times its sd, SI.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that the rows were divided by.
-            e: the evaluation that holds the rows.
-        """
+        """By signal all of its rows times its sd, SI."""
         numbers, rows = self.row_signals(layout, data), np.asarray(e.r)
         # The first rows alone: defects and priors follow.
         return [
@@ -328,10 +253,7 @@ class Estimator(abc.ABC):
         is not given.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             noise: that `e` was evaluated with.
-            e: the evaluation.
         """
         errors = self.errors_of(layout, data, noise, e)
         # With the noise at its optimum the squares over the variance are as many as there are rows:
@@ -349,10 +271,7 @@ class Estimator(abc.ABC):
         """Twice the log-likelihood that is lost between two costs.
 
         Args:
-            layout: what the unknowns are.
             cost: sum of squares of all rows over n, any shape.
-            first: the cost that is compared with.
-            n: how many numbers are measured.
         """
         # The cost is a mean over n: times n it is the sum of squares of whitened rows, minus twice
         # the log-likelihood but for a constant.
@@ -363,8 +282,6 @@ class Estimator(abc.ABC):
         out under Jeffreys' prior, of each signal by itself.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             rows: those of the measurements, traced.
         """
         # Rows where nothing was measured are zero: they add nothing to the sum, and n leaves them
@@ -379,13 +296,7 @@ class Estimator(abc.ABC):
         return total
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """How many independent numbers the noise is estimated from.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that the rows are divided by.
-        """
+        """How many independent numbers the noise is estimated from."""
         return measured_count(data)
 
     @abc.abstractmethod
@@ -395,9 +306,6 @@ class Estimator(abc.ABC):
 
         Args:
             reached: where the fit ended.
-            u: the unknowns there.
-            runs: how many records are drawn.
-            seed: of the draw.
         """
 
     def against_expected(
@@ -407,11 +315,7 @@ class Estimator(abc.ABC):
         let expect; None where the simulation has to explain the record by itself.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             noise: that `e` was evaluated with.
-            e: at z.
-            z: the unknowns.
         """
         return None
 
@@ -419,8 +323,6 @@ class Estimator(abc.ABC):
         """Whether the numbers at the optimum are rounding.
 
         Args:
-            problem: what was fitted.
-            e: at the optimum.
             sd: of the measurement noise, SI, by 'flight/output'.
         """
         return False
@@ -428,24 +330,9 @@ class Estimator(abc.ABC):
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
     ) -> ResponseAgreement | None:
-        """How model and measured frequency responses agree, where these are what is fitted.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: at the optimum.
-            z: the unknowns.
-            fitted: whether the unknowns were fitted to these flights.
-        """
+        """How model and measured frequency responses agree, where these are what is fitted."""
         return None
 
     def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
-        """What a reader should know of the method's own assumptions.
-
-        Args:
-            at: the optimum.
-            e: the evaluation there.
-            names: of the flights.
-            ill: whether it is ill-conditioned.
-        """
+        """What a reader should know of the method's own assumptions."""
         return []

@@ -19,14 +19,7 @@ _TAKES_PART = 1e-3
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
-    """Residuals and their Jacobian, the simulation, and the named unknowns.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by which the rows are divided.
-        z: the unknowns.
-    """
+    """Residuals and their Jacobian, the simulation, and the named unknowns."""
     at = residual_and_jacobian(layout, data, noise, z)
     # Output error has simulated on its way; a filter predicts one step ahead, which is no run.
     outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
@@ -46,25 +39,13 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
 def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output the simulation (N,) with the bias, SI.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-    """
+    """By flight and output the simulation (N,) with the bias, SI."""
     return with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
 @jitted
 def named(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[Array, Array]:
-    """Values of parameters, gains and time shift [SI], and their slopes by the coordinates.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-    """
+    """Values of parameters, gains and time shift [SI], and their slopes by the coordinates."""
 
     def values(z: Array) -> Array:
         u = unpack(layout, data, z)
@@ -119,7 +100,6 @@ def directions(J: np.ndarray, least: float = NULL) -> np.ndarray:
     """Orthonormal directions (n, k) in which the unknowns move finite rows (n, q).
 
     Args:
-        J: the rows' derivatives, of any sizes by column.
         least: part of the largest singular value of columns of one size, below which a direction is
             rounding, or says nothing that the others do not.
     """

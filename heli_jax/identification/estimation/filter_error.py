@@ -85,9 +85,6 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
 
     Args:
         reached: where the fit ended.
-        u: the unknowns there.
-        i: number of the flight.
-        keys: of the draws.
     """
     layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
     drawn_state = _random_first_state(layout, drive, reached.z.dtype)
@@ -356,9 +353,6 @@ def filtered_flights(
     """The innovations of every flight.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by flight and output.
         u: the unknowns, in the units of the model.
     """
     together: dict[int, Innovations] = {}
@@ -515,7 +509,6 @@ def errors_ahead(
 
     Args:
         positional: model, params, inputs, measured and sd, as of `kalman.innovations`.
-        options: as there.
         every: samples of a window, each begun at what the filter predicts for its first.
     """
     drive, first, y, R = begun(*positional, options)

@@ -101,9 +101,6 @@ class FrequencyError(Estimator):
         """A row for each unknown of interest, and one for what is left of the errors.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: with the whitening of each record.
             u: the unknowns, in the units of the model.
         """
         return Residuals(rows_of_lines(layout, data, noise, u), None)
@@ -111,21 +108,13 @@ class FrequencyError(Estimator):
     def refusal(self, problem: Problem) -> str | None:
         """Flights of other outputs, without a part in which every output is there, or without a
         trim.
-
-        Args:
-            problem: what is to be fitted.
         """
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
-        """Where all outputs are there, and about what the model is linearised.
-
-        Args:
-            problem: what is fitted.
-            flights: those of a layout, in its order.
-        """
+        """Where all outputs are there, and about what the model is linearised."""
         return tuple(
             FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
         )
@@ -133,12 +122,7 @@ class FrequencyError(Estimator):
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
     ) -> tuple[dict[str, np.ndarray], ...] | None:
-        """By flight and input what of it follows the instruments.
-
-        Args:
-            problem: says which instruments are used.
-            flights: those of a layout, in its order.
-        """
+        """By flight and input what of it follows the instruments."""
         return instrumented_inputs(problem, flights)
 
     def one_program(self, layout: Layout) -> bool:
@@ -146,12 +130,7 @@ class FrequencyError(Estimator):
         return False
 
     def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """A spectrum to begin with, that of what is measured.
-
-        Args:
-            noise: standard deviations by flight and output.
-            flights: those fitted.
-        """
+        """A spectrum to begin with, that of what is measured."""
         measured = []
         for flight, sd in zip(flights, noise.sd, strict=True):
             whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
@@ -165,11 +144,7 @@ class FrequencyError(Estimator):
         return noise._replace(whitening=whitening, by_instrument=begun, part=all_lines)
 
     def begins_with(self, data: Data) -> Data:
-        """By instrument what follows the instruments, of inputs and outputs.
-
-        Args:
-            data: the numbers of the problem.
-        """
+        """By instrument what follows the instruments, of inputs and outputs."""
         # The equations by instrument have other solutions, far from the least squares of these, and
         # what feedback makes of the signals as they were measured may lead to one.
         by = data.flights[0].by_instrument is not None
@@ -186,10 +161,6 @@ class FrequencyError(Estimator):
         """The lowest frequencies alone, where these tell nearly all of every unknown.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: to begin with.
-            z: the start values.
             known: residuals and Jacobian there with `noise`.
         """
         interest = len(layout.of_interest)
@@ -204,22 +175,13 @@ class FrequencyError(Estimator):
         return (few, (at.r, at.J)) if least_share(part, J) > _NEARLY_ALL else (noise, known)
 
     def whole(self, noise: Noise) -> Noise:
-        """All lines.
-
-        Args:
-            noise: so far.
-        """
+        """All lines."""
         return noise if noise.part >= 1.0 else noise._replace(part=np.ones(()))
 
     def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """By instrument, where there is one; the noise is what the inputs leave of the outputs.
 
         That of the errors at the start values would hold all that is wrong with these.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: to begin with.
         """
         if (whitening := whitening_without_model(layout, data)) is not None:
             noise = noise._replace(whitening=whitening)
@@ -233,11 +195,7 @@ class FrequencyError(Estimator):
         """The spectrum that the errors show, smoothed over frequency and flights.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             e: None: it is not asked for.
-            noise: so far.
-            z: the unknowns.
         """
         errors, machine, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
         part = float(noise.part)
@@ -274,14 +232,7 @@ class FrequencyError(Estimator):
     def with_nuisances(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
-        """Biases and initial states are in none of the rows: the simulation in time has them.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: as relaxed.
-            z: the unknowns.
-        """
+        """Biases and initial states are in none of the rows: the simulation in time has them."""
         return in_time(layout, data, noise, z) if layout.model.linear else z
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
@@ -289,10 +240,7 @@ class FrequencyError(Estimator):
         estimate by instrument, which has none.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             noise: that `e` was evaluated with.
-            e: the evaluation.
         """
         if data.flights[0].by_instrument is not None and float(noise.by_instrument) > 0:
             return float("nan")
@@ -309,8 +257,6 @@ class FrequencyError(Estimator):
         """Of the whitened rows, the spectrum taken as it was estimated.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             rows: those of the measurements, traced.
         """
         return -0.5 * jnp.sum(rows**2)
@@ -322,12 +268,6 @@ class FrequencyError(Estimator):
     def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
         """How much of flights with missing samples is used, where models were linearised, and what
         there is not by instrument.
-
-        Args:
-            at: the optimum.
-            e: the evaluation there.
-            names: of the flights.
-            ill: whether it is ill-conditioned.
         """
         return [
             *cut_notes(at.layout, at.data, names),
@@ -340,9 +280,7 @@ class FrequencyError(Estimator):
 
         Args:
             reached: where the fit ended.
-            u: the unknowns there.
             runs: how many records; one simulation serves them all.
-            seed: of nothing here, since nothing is drawn.
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 

@@ -35,11 +35,7 @@ all cases at least"""
 
 
 def instruments_of(problem: Problem) -> tuple[str, ...]:
-    """The inputs that are taken by their instrument: those asked for, or all that have one.
-
-    Args:
-        problem: its flights hold the instruments.
-    """
+    """The inputs that are taken by their instrument: those asked for, or all that have one."""
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)
@@ -58,11 +54,7 @@ def _lacks(flights: Sequence[Flight], name: str) -> str | None:
 
 
 def absent_instrument(problem: Problem) -> str | None:
-    """Which instrument that was asked for is not there, or is none; None where all are.
-
-    Args:
-        problem: its flights hold the instruments.
-    """
+    """Which instrument that was asked for is not there, or is none; None where all are."""
     known = naming.names(problem.model.Inputs)
     for name in problem.instrument or ():
         if name not in known:
@@ -82,10 +74,6 @@ def instrumented_inputs(
 ) -> tuple[dict[str, np.ndarray], ...] | None:
     """By flight and input what of it follows the instruments (N,), SI; the input itself where it
     has none. None where no input has one.
-
-    Args:
-        problem: says which are used.
-        flights: those of a layout, in its order.
     """
     names = instruments_of(problem)
     if not names or any(n not in f.instruments for f in flights for n in names):
@@ -97,13 +85,7 @@ def instrumented_inputs(
 def following(
     flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and input what of it follows signals (N,): of the named inputs, others as they are.
-
-    Args:
-        flights: with the inputs.
-        names: the inputs in question.
-        signals: by flight the signals, the same ones in each.
-    """
+    """By flight and input what of it follows signals (N,), of the named inputs."""
     made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
     return tuple(
         {**f.inputs, **dict(zip(names, columns.T, strict=True))}
@@ -115,9 +97,6 @@ def as_instruments_have_it(data: Data) -> Data:
     """The same flights as if nothing but the instruments moved them: inputs by instrument, and what
     of the outputs follows those. Of gusts and noise chance's part alone is in them, and nothing of
     what feedback makes of both: to begin a search with.
-
-    Args:
-        data: of a fit by instrument.
     """
     inputs = [naming.asdict(f.by_instrument) for f in data.flights]
     moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
@@ -176,7 +155,6 @@ def strengths(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Strength]:
 
     Args:
         at: where a fit by instrument ended.
-        J: the whitened rows' derivative there, by instrument.
     """
     layout, data, noise, z = at
     # The same program, and the same weights.
@@ -194,22 +172,14 @@ def strengths(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Strength]:
 
 
 def inputs_by_instrument(data: Data) -> tuple[str, ...]:
-    """The inputs that are taken by their instrument.
-
-    Args:
-        data: of a fit by instrument.
-    """
+    """The inputs that are taken by their instrument."""
     first = data.flights[0]
     inputs, by = naming.asdict(first.inputs), naming.asdict(first.by_instrument)
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
 
 
 def instrument_notes(data: Data) -> list[Finding]:
-    """What there is not of an estimate by instrument.
-
-    Args:
-        data: the numbers of the problem.
-    """
+    """What there is not of an estimate by instrument."""
     if data.flights[0].by_instrument is None:
         return []
     words = (

@@ -69,12 +69,7 @@ class Machines(NamedTuple):
 
 
 def alike(layout: Layout, data: Data) -> list[list[int]]:
-    """The flights in groups that differ in numbers alone.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-    """
+    """The flights in groups that differ in numbers alone."""
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
@@ -90,10 +85,7 @@ def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> 
     """Those of one group.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
         u: the unknowns, in the units of the model.
-        members: the flights' numbers.
     """
     first = members[0]
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
@@ -150,12 +142,9 @@ def by_flight(
     """`body(prepared(common), some of each)` over the flights of a group, with a leading axis.
 
     Args:
-        data: the numbers of the problem.
-        members: the flights' numbers.
         prepared: what of it is the same for flights that have one machine.
         body: of a few flights, which have a leading axis in what it is given and what it returns.
         common: of the machine; with a leading axis where each flight has its own.
-        each: of the flights, with a leading axis.
         together: flights of one machine side by side at most.
     """
     count = len(members)
@@ -183,26 +172,14 @@ def first_machine(m: Matrices) -> Machine:
 
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
-    """The records of each flight of a group, with their whitening.
-
-    Args:
-        layout: what the unknowns are.
-        noise: with the whitening of each record.
-        members: the flights' numbers.
-    """
+    """The records of each flight of a group, with their whitening."""
     # Records of one length have one spectrum (`smoothed`): that of the first flight's serve all.
     pairs = zip(records_of(layout), noise.whitening, strict=True)
     return [(record, W) for record, W in pairs if record.flight == members[0]]
 
 
 def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
-    """What the flights of a group measured.
-
-    Args:
-        layout: says in what order.
-        data: the numbers of the problem.
-        members: the flights' numbers.
-    """
+    """What the flights of a group measured."""
     names = layout.outputs[members[0]]
     columns = [[data.flights[i].outputs[n] for n in names] for i in members]
     return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
@@ -230,12 +207,7 @@ class Blocks(NamedTuple):
     """lines that are used, from the lowest frequency"""
 
     def cut(self, v: Array, axis: int = 0) -> Array:
-        """An array with an axis of lines, the blocks as its first axis; zeros beyond the last line.
-
-        Args:
-            v: at all lines.
-            axis: of the lines.
-        """
+        """An array with an axis of lines, the blocks as its first axis; padded with zeros."""
         widths = [(0, 0)] * v.ndim
         widths[axis] = (0, self.count * self.size - self.lines)
         v = jnp.pad(v, widths)
@@ -243,31 +215,17 @@ class Blocks(NamedTuple):
         return jnp.moveaxis(v, axis, 0)
 
     def joined(self, v: Array, axis: int = 0) -> Array:
-        """The inverse of `cut`.
-
-        Args:
-            v: with the blocks as its first axis.
-            axis: of the lines in the result.
-        """
+        """The inverse of `cut`."""
         v = jnp.moveaxis(v, 0, axis)
         v = v.reshape(*v.shape[:axis], self.count * self.size, *v.shape[axis + 2 :])
         return jax.lax.slice_in_dim(v, 0, self.lines, axis=axis)
 
     def within(self, b: Array | int) -> Array:
-        """(size,) whether a line of a block is used.
-
-        Args:
-            b: number of the block.
-        """
+        """(size,) whether a line of a block is used."""
         return b * self.size + jnp.arange(self.size) < self.last
 
     def over(self, step: Callable[[Any, Any], Any], first: Any) -> Any:
-        """`step(b, so far)` for the blocks that are used, one after another.
-
-        Args:
-            step: returns what the next one is given.
-            first: what the first one is given.
-        """
+        """`step(b, so far)` for the blocks that are used, one after another."""
         if self.count == 1:
             return step(0, first)
         used = -(-self.last // self.size)
@@ -275,13 +233,7 @@ class Blocks(NamedTuple):
 
 
 def blocks_of(record: Record, part: Array, numbers: int) -> Blocks:
-    """Those of a record.
-
-    Args:
-        record: which samples it is.
-        part: of its lines that are used.
-        numbers: outputs times states.
-    """
+    """Those of a record."""
     K = record.lines
     count = -(-K * numbers // _NUMBERS)
     # So that a half and a quarter of the lines are whole blocks.
@@ -320,11 +272,7 @@ class Resolved(NamedTuple):
     zero where a state leaves no trace"""
 
     def basis(self, b: Array | int) -> Float[Array, "s m"]:
-        """What the ends' states, and behind these the gusts', add to the rows of a block.
-
-        Args:
-            b: number of the block.
-        """
+        """What the ends' states, and behind these the gusts', add to the rows of a block."""
         # Together with what takes a block out of all of them the products would be several times
         # slower.
         return _basis(*jax.lax.optimization_barrier((self.H[b], self.ends[b])))
@@ -349,14 +297,7 @@ class Errors(NamedTuple):
 def resolved(
     m: Matrices, record: Record, whitening: Complex[Array, "K p p"], part: Array
 ) -> Resolved:
-    """A machine at the lines of a record.
-
-    Args:
-        m: its matrices.
-        record: which samples it is.
-        whitening: of the record's lines.
-        part: of the lines that are used.
-    """
+    """A machine at the lines of a record."""
     blocks = blocks_of(record, part, m.C.size)
     # Beyond the last line those that would follow it, so that nothing is singular there.
     k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
@@ -445,7 +386,6 @@ def at_lines(record: Record, v: Float[Array, "f N c"]) -> Complex[Array, "f K c"
     """The Fourier transform of a record's part of signals, over the root of its length.
 
     Args:
-        record: which samples it is.
         v: over the whole flights; columns behind delays, so that what acted in a part was logged
             before it.
     """
@@ -466,11 +406,7 @@ def errors_of_some(
     """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
-        at: the machine at the record's lines.
-        m: the machine.
-        record: which samples it is.
         signals: over the whole flights.
-        y: what was measured.
         by: the inputs by instrument, and whether their states are asked for: zero if not.
     """
     blocks, f = at.blocks, y.shape[0]
@@ -521,13 +457,7 @@ def errors_of_some(
 def states(
     at: Resolved, b: Array | int, driving: Complex[Array, "f k n"]
 ) -> Complex[Array, "f k n"]:
-    """(zI - Ad)^-1 of what drives them.
-
-    Args:
-        at: the machine at the lines.
-        b: number of the block.
-        driving: B U, and the ends.
-    """
+    """(zI - Ad)^-1 of what drives them."""
     # Flights are columns of the same substitutions.
     seen = jnp.moveaxis(driving @ jnp.conj(at.V), 0, 2)
     return jnp.moveaxis(_solved(at.z[b], at.T, seen, left=True), 2, 0) @ at.V.T
@@ -561,12 +491,7 @@ def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array
 
 
 def by_real(v: Complex[Array, "... a"], M: Float[Array, "a b"]) -> Complex[Array, "... b"]:
-    """v M, without the products of what M has no imaginary part of.
-
-    Args:
-        v: complex numbers.
-        M: a real matrix.
-    """
+    """v M, without the products of what M has no imaginary part of."""
     return jax.lax.complex(jnp.real(v) @ M, jnp.imag(v) @ M)
 
 
@@ -599,15 +524,7 @@ class LineErrors(NamedTuple):
 def errors_of_lines(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"], *, ends: bool = False
 ) -> LineErrors:
-    """The errors at the lines of every record.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: with the whitening of each record.
-        z: the unknowns.
-        ends: whether to say what the ends took.
-    """
+    """The errors at the lines of every record."""
     u, errors, taken, first = unpack(layout, data, z), {}, {}, None
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)

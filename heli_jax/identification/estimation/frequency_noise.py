@@ -73,8 +73,6 @@ def smoothed_with(
     """By record the cross-spectrum E e r^H with other signals, smoothed likewise.
 
     Args:
-        lines: by record at its own frequencies.
-        others: the other signals, likewise.
         part: sd of the Gaussian as a part of the frequency.
     """
     p, r = lines[0].shape[1], others[0].shape[1]
@@ -95,11 +93,7 @@ def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
-    """The sum of e e^H over records.
-
-    Args:
-        v: at the lines of records of one length.
-    """
+    """The sum of e e^H over records."""
     at_line = v.transpose(1, 2, 0)
     return at_line @ np.conj(at_line.transpose(0, 2, 1))
 
@@ -113,10 +107,8 @@ def _over_lines(
     """By length of the record the mean of some powers, smoothed over frequency.
 
     Args:
-        lines: by record.
         numbers: of records of one length the sum of these powers.
         part: as that of `smoothed`.
-        least: likewise.
     """
     # Records of one length have one spectrum and one kernel: their powers are added first.
     of_length = {len(v): [w for w in lines if len(w) == len(v)] for v in lines}
@@ -138,9 +130,6 @@ def whitening_alone(
     lines: Sequence[Complex[np.ndarray, "K p"]],
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes white each signal by itself, with nothing of what they share.
-
-    Args:
-        lines: by record at its own frequencies.
 
     Raises:
         numpy.linalg.LinAlgError: a signal is zero throughout.
@@ -167,7 +156,6 @@ def knots_of(
     and how far it is on the way to the next.
 
     Args:
-        K: lines.
         part: sd of the Gaussian as a part of the frequency.
         least: the same in lines, at least.
     """
@@ -202,7 +190,6 @@ def averages(
     """Independent lines in a smoothed spectrum of K lines: (sum w)^2 / sum w^2.
 
     Args:
-        K: lines of the record.
         counts: lines of a record and how many there are of them, for each length.
         part: sd of the Gaussian as a part of the frequency.
         least: the same in lines, at least.
@@ -254,11 +241,7 @@ def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
-    """log |det W| of what makes noise white: products of triangles, whose diagonals say it.
-
-    Args:
-        W: lower triangular.
-    """
+    """log |det W| of what makes noise white: products of triangles, whose diagonals say it."""
     return np.sum(np.log(np.abs(np.diagonal(W, axis1=1, axis2=2))), axis=1)
 
 
@@ -300,13 +283,7 @@ _UNSEEN = 1e-10
 
 @eqx.filter_jit
 def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
-    """That of the first flight: records of one length share a spectrum.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-    """
+    """That of the first flight: records of one length share a spectrum."""
     members = alike(layout, data)[0]
     return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
 
@@ -314,13 +291,7 @@ def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
 def whitening_by(
     machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], part: float = 1.0
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """By record what makes its errors white; of records of one length the same array.
-
-    Args:
-        machine: that gusts come through.
-        errors: by record at its own frequencies.
-        part: of those, from the lowest, that they are at.
-    """
+    """By record what makes its errors white; of records of one length the same array."""
     size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
@@ -407,11 +378,7 @@ def _cells(
 
 
 def corners_of(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
-    """Of first-order lags, from half of the rate down to the lowest of some frequencies.
-
-    Args:
-        f: in cycles a sample.
-    """
+    """Of first-order lags, from half of the rate down to the lowest of some frequencies."""
     first, last = float(np.min(f)), 0.5
     return last * 0.5 ** np.arange(1.0, np.log2(last / first), _OCTAVES)
 
@@ -419,12 +386,7 @@ def corners_of(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
 def shapes_of(
     f: Float[np.ndarray, " c"], corners: Float[np.ndarray, " b"]
 ) -> Float[np.ndarray, "b1 c"]:
-    """Spectra that a gust's is a sum of: a white one and first-order lags.
-
-    Args:
-        f: in cycles a sample.
-        corners: of the lags.
-    """
+    """Spectra that a gust's is a sum of: a white one and first-order lags."""
     return np.concatenate([np.ones((1, f.size)), 1.0 / (1.0 + (f / corners[:, None]) ** 2)])
 
 
@@ -455,8 +417,6 @@ def powers_of(
     Args:
         ways: by cell and state what a gust of power 1 at the state makes of the outputs.
         shapes: spectra that a gust's is a sum of; the first is white.
-        power: by cell the mean of e e^H.
-        lines: in each cell.
     """
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
     gains = np.swapaxes(gains, 1, 2)
@@ -533,10 +493,6 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
 
     None where there are too few lines to tell. In a closed loop it is too small where feedback
     moves the inputs more than the excitation does.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
     """
     flights = jax.device_get(data.flights)
     lines = []

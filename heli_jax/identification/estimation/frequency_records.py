@@ -49,22 +49,13 @@ class Record(NamedTuple):
 
 
 def lines_of(v: Float[np.ndarray, "N c"]) -> Complex[np.ndarray, "K c"]:
-    """The Fourier transform of signals at a record's own frequencies, over the root of its length.
-
-    Args:
-        v: the samples of one record.
-    """
+    """Fourier transform of signals at a record's own frequencies, over the root of its length."""
     N = len(v)
     return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (N - 1) // 2] / np.sqrt(N)
 
 
 def in_time_of(lines: Complex[np.ndarray, "K c"], samples: int) -> Float[np.ndarray, "N c"]:
-    """The inverse of `lines_of`: signals without a mean.
-
-    Args:
-        lines: at a record's own frequencies.
-        samples: N of the record.
-    """
+    """The inverse of `lines_of`: signals without a mean."""
     whole = np.zeros((samples // 2 + 1, lines.shape[1]), complex)
     whole[1 : 1 + len(lines)] = lines * np.sqrt(samples)
     return np.fft.irfft(whole, samples, axis=0)
@@ -86,20 +77,12 @@ def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
 
 
 def records_of(layout: Layout) -> list[Record]:
-    """All records, flight after flight.
-
-    Args:
-        layout: of a problem for frequency error.
-    """
+    """All records, flight after flight."""
     return [Record(i, a, b) for i, facts in enumerate(layout.of_flights) for a, b in facts.parts]
 
 
 def without_parts(flights: Sequence[Flight]) -> str | None:
-    """Why a flight leaves no record, and what to do; None where each leaves one.
-
-    Args:
-        flights: those to be fitted.
-    """
+    """Why a flight leaves no record, and what to do; None where each leaves one."""
     for flight in flights:
         if parts_of(flight):
             continue
@@ -115,11 +98,7 @@ def without_parts(flights: Sequence[Flight]) -> str | None:
 
 
 def other_outputs(flights: Sequence[Flight]) -> str | None:
-    """Which flights have not the outputs of the others, and what to do; None where all have.
-
-    Args:
-        flights: those to be fitted.
-    """
+    """Which flights have not the outputs of the others, and what to do; None where all have."""
     # The noise's spectrum is one matrix over the outputs.
     common = set.intersection(*(set(f.outputs) for f in flights))
     for flight in flights:
@@ -134,13 +113,7 @@ def other_outputs(flights: Sequence[Flight]) -> str | None:
 
 
 def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]:
-    """By flight that was cut, how much of it is used.
-
-    Args:
-        layout: says which parts there are.
-        data: with sample times and lengths.
-        names: of the flights.
-    """
+    """By flight that was cut, how much of it is used."""
     notes = []
     for i, (flight, facts) in enumerate(zip(data.flights, layout.of_flights, strict=True)):
         parts = facts.parts

@@ -104,22 +104,13 @@ class Resolved(NamedTuple):
     """C (zI - Ad)^-1"""
 
     def ends(self, samples: int) -> Float[Array, "p n N"]:
-        """What the ends of a record add to the outputs, for each state.
-
-        Args:
-            samples: of the record.
-        """
+        """What the ends of a record add to the outputs, for each state."""
         z, turns = _lines(samples)
         return _in_time(jnp.moveaxis(self.H * z[:, None, None], 0, -1), turns)
 
 
 def resolved(m: Matrices, samples: int) -> Resolved:
-    """A model at the lines of a record.
-
-    Args:
-        m: the model.
-        samples: of the record.
-    """
+    """A model at the lines of a record."""
     z, _ = _lines(samples)
     Ad, C = (jax.lax.stop_gradient(v).astype(z.dtype) for v in (m.Ad, m.C))
     R = jnp.linalg.inv(z[:, None, None] * jnp.eye(len(Ad), dtype=z.dtype)[None] - Ad[None])
@@ -132,9 +123,6 @@ def bounded_outputs(
     """The outputs over a record by the bounded solution.
 
     Args:
-        m: the model.
-        signals: what drives it, over the record.
-        at: the model at the record's lines.
         ends: of the states, factors of `Resolved.ends`; zero unless given.
     """
     z, turns = _lines(len(signals.U))
@@ -152,14 +140,7 @@ def bounded_outputs(
 def simulated_outputs(
     m: Matrices, signals: Signals, x0: Float[Array, " n"], block: int
 ) -> Float[Array, "p N"]:
-    """The outputs from the first sample on.
-
-    Args:
-        m: the model.
-        signals: what drives it, over the record.
-        x0: state at the first sample.
-        block: samples in a step of the recurrence.
-    """
+    """The outputs from the first sample on."""
     dt = jnp.ones((), m.Ad.dtype)
     args = ZeroOrderHoldArgs(None, tuple(signals.U.T), dt, None, Discrete(m.Ad, m.B, None))
     states = jnp.stack(blockwise(args, block, tuple(x0)))
@@ -169,9 +150,6 @@ def simulated_outputs(
 def span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
     """Orthonormal directions of a space, zero where a column is none of its own, and what makes the
     columns' factors of components along them.
-
-    Args:
-        basis: what spans it.
     """
     sizes = jnp.linalg.norm(basis, axis=0)
     # A state that no output shows has a column of rounding, which would take some direction off.
@@ -268,13 +246,7 @@ def _by_flight(
     there, None where all outputs forget.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        weights: with the windows.
-        u: the unknowns.
-        group: of flights.
         ends: of each flight; zero unless given.
-        body: of one flight.
     """
     w, (states, offsets) = weights.windows, weights.begun
     N = next(iter(data.flights[group.members[0]].outputs.values())).shape[0]
@@ -345,9 +317,6 @@ def rows_of_responses(
     """Whitened errors of all responses, without what the ends of the records may add.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        weights: with the windows.
         u: the unknowns, in the units of the model.
     """
     rest, groups = jax.lax.stop_gradient(u), _groups(layout, data, weights)
@@ -405,14 +374,7 @@ def rows_of_responses(
 def errors_in_windows(
     layout: Layout, data: Data, weights: ResponseWeights, z: Array
 ) -> Complex[Array, "W k p"]:
-    """Transforms of measured less modelled outputs; zero where an output is not seen.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        weights: with the windows.
-        z: the unknowns.
-    """
+    """Transforms of measured less modelled outputs; zero where an output is not seen."""
     u, of_flight = unpack(layout, data, z), dict[int, Array]()
     # Of all that is seen in the windows, each output by its noise, and not of the responses alone.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
@@ -452,9 +414,6 @@ class FrequencyResponse(Estimator):
         """The whitened errors of all responses, real and imaginary parts.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: with the weights.
             u: the unknowns, in the units of the model.
         """
         # A flight held out that is shorter than a window has no responses.
@@ -463,11 +422,7 @@ class FrequencyResponse(Estimator):
         return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Other than linear models, and flights with too little in windows.
-
-        Args:
-            problem: what is to be fitted.
-        """
+        """Other than linear models, and flights with too little in windows."""
         if not problem.model.linear:
             return (
                 f"model {problem.model.name} is not linear; expected frequency-error, which "
@@ -490,8 +445,6 @@ class FrequencyResponse(Estimator):
         """The weights to begin with, of what is measured.
 
         Args:
-            problem: says which responses.
-            noise: standard deviations by flight and output.
             flights: those fitted, or held out: of these too short ones have no responses.
         """
         try:
@@ -505,15 +458,7 @@ class FrequencyResponse(Estimator):
     def relax(
         self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """The spectrum of what no response explains of the errors.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            e: not asked for.
-            noise: so far.
-            z: the unknowns.
-        """
+        """The spectrum of what no response explains of the errors."""
         z = in_time(layout, data, noise, z)
         u, weights = unpack(layout, data, z), back(noise.whitening)
         weights = weights._replace(simulated=_forgetful(layout, data, u, weights))
@@ -530,10 +475,7 @@ class FrequencyResponse(Estimator):
         """Of complex normal errors of the responses, in SI units of output over input.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             noise: that `e` was evaluated with.
-            e: the evaluation.
         """
         weights: ResponseWeights = noise.whitening
         squares = float(np.sum(np.square(np.asarray(e.r)[: 2 * weights.used.size])))
@@ -544,8 +486,6 @@ class FrequencyResponse(Estimator):
         """Of the whitened rows, the spectrum taken as it was estimated.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
             rows: those of the measurements, traced.
         """
         return -0.5 * jnp.sum(rows**2)
@@ -555,13 +495,7 @@ class FrequencyResponse(Estimator):
         return 0
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
-        """Those that the noise's spectrum is taken from at the lines used.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: with the weights.
-        """
+        """Those that the noise's spectrum is taken from at the lines used."""
         # The nuisances are not taken from them.
         return int(noise.whitening.numbers_of_noise) + layout.determined
 
@@ -570,37 +504,20 @@ class FrequencyResponse(Estimator):
 
         Args:
             reached: where the fit ended.
-            u: the unknowns there.
             runs: how many records; one simulation serves them all.
-            seed: of nothing here, since nothing is drawn.
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
     def errors_in_windows(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> Complex[Array, "W k p"]:
-        """Transforms of measured less modelled outputs; zero where an output is not seen.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: with the weights.
-            z: the unknowns.
-        """
+        """Transforms of measured less modelled outputs; zero where an output is not seen."""
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
     ) -> ResponseAgreement | None:
-        """Chi-squared and Tischler's J of every response.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: at the optimum.
-            z: the unknowns.
-            fitted: whether the unknowns were fitted to these flights.
-        """
+        """Chi-squared and Tischler's J of every response."""
         weights = back(noise.whitening)
         w, used = weights.windows, weights.used
         E = response_of(

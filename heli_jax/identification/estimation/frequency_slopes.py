@@ -40,7 +40,6 @@ def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
     """Parameters, gains and the time shift: all but initial states, biases and offsets.
 
     Args:
-        layout: what the unknowns are.
         u: the unknowns, in the units of the model.
     """
     params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
@@ -52,8 +51,6 @@ def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     """The unknowns with those of a vector in place.
 
     Args:
-        layout: what the unknowns are.
-        u: all of them.
         v: as `shared_of` orders them.
     """
     # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
@@ -70,7 +67,6 @@ def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tupl
     zero.
 
     Args:
-        make: of v.
         v: where.
     """
 
@@ -185,11 +181,7 @@ def products_of_lines(
     by instrument.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
         noise: with the whitening of each record, and whether instruments are used.
-        v: the unknowns that lines depend on.
-        unknowns: makes all of them out of these.
     """
     total = []
     for members in alike(layout, data):
@@ -229,15 +221,7 @@ def _of_record(
     measured_signals: tuple[Signals, Signals, Array],
     instruments: tuple[Signals, Signals] | None,
 ) -> _Sums:
-    """Of one record of a few flights, with a leading axis.
-
-    Args:
-        common: the machine at the lines, itself, and its derivatives.
-        record: which samples it is.
-        by_instrument: whether instruments are used.
-        measured_signals: the inputs, their derivatives, and what was measured.
-        instruments: the inputs by instrument and their derivatives.
-    """
+    """Of one record of a few flights, with a leading axis."""
     (at, m, dm), (signals, ds, y) = common, measured_signals
     by_them = None if instruments is None else (instruments[0], by_instrument > 0.5)
     e = errors_of_some(at, m, record, signals, y, by_them)
@@ -259,11 +243,7 @@ def _summed(
     """Over the lines that are used, block by block: the derivatives of all would leave every cache.
 
     Args:
-        at: the machine at the lines.
-        matrices: the machine and its derivatives.
-        e: the errors.
         driven: states by block, signals at all lines and their derivatives; and by instrument.
-        by_instrument: whether instruments are used.
     """
     blocks, (_, dm) = at.blocks, matrices
     # What passes a machine by, without its states, hangs on no unknown of most.
@@ -345,8 +325,6 @@ def _moved(
     """dF X + dG u + G du (K, 2a, q), real parts and imaginary ones; None where all are zero.
 
     Args:
-        X: states.
-        u: signals.
         slopes: dF (a, n, q) and dG (a, r, q), None where zero.
         of_signals: G (a, r) and du (K, r, q), None where zero.
     """
@@ -386,8 +364,6 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     """Those rows, with the derivative that a step of Gauss and Newton needs.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
         noise: with the whitening of each record, and whether instruments are used.
         u: the unknowns, in the units of the model.
     """

@@ -17,14 +17,7 @@ _ENOUGH = 1e-4
 
 
 def in_time(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
-    """z with the biases, offsets and initial states by which the simulation is nearest in time.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: whose sd weigh the outputs.
-        z: the unknowns, of which those of the flights move.
-    """
+    """z with the biases, offsets and initial states by which the simulation is nearest in time."""
     if layout.first_nuisance == z.shape[0]:
         return z
     # Of a linear model one step is enough.

@@ -85,7 +85,6 @@ def moments_after(
     Args:
         rates: f, of a state (n,) and Inputs, per second.
         intensity: g, of the process noise, see `Model.noise_intensity`.
-        moments: at the step's begin.
         part: the step, with the inputs at its begin and their slopes (None: they stay).
 
     Source: Jategaonkar (2006), chapter 5, of the extended filter's prediction; Runge and Kutta's
@@ -196,7 +195,6 @@ def local_filter(drive: Drive) -> Filter:
         Args:
             x: (n,), corrected.
             P: (n, n).
-            sample: inputs and slopes of each part of the interval.
         """
         held, _, slopes = sample
         estimate = (x, P)
@@ -351,9 +349,7 @@ def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array
     """Covariance of the state at the first sample (P0).
 
     Args:
-        model: of n states.
         params: the model's Params, SI.
-        dtype: of the result.
     """
     sds = initial_sd_of(model, params, dtype)
     return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]

@@ -52,8 +52,6 @@ def scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"], trusted: Bool[Array
     """Columns of equal norm and a cost of order one; an unknown without effect stays put.
 
     Args:
-        r0: residuals at the start.
-        J0: their Jacobian.
         trusted: the unknowns whose column counts however small it is beside the others.
     """
     norms = jnp.linalg.norm(J0, axis=0)
@@ -88,10 +86,7 @@ def trusted_columns(
 
     Args:
         layout: what stands where in z.
-        evaluate: residuals and Jacobian at a point.
         z: where.
-        r: the residuals there.
-        J: their Jacobian.
     """
     # Of parameters of 1e6 and 1e-8 the columns differ by 1e14 for their units alone. Rounding may
     # leave as little of a column that is zero; it does not foretell what the residuals do.
@@ -158,12 +153,7 @@ class _TrustRegion(optx.ClassicalTrustRegion):
     """
 
     def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
-        """As optimistix: a `_Region` without a radius.
-
-        Args:
-            y: the unknowns.
-            f_info_struct: shapes of residuals and Jacobian.
-        """
+        """As optimistix: a `_Region` without a radius."""
         begin = super().init(y, f_info_struct)
         return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
 
@@ -176,15 +166,7 @@ class _TrustRegion(optx.ClassicalTrustRegion):
         f_eval_info: Any,
         state: Any,
     ) -> Any:
-        """As optimistix: the next step size, whether the step counts, and two records of its own.
-
-        Args:
-            first_step: whether nothing has been tried yet.
-            y: the unknowns at the last point that was accepted.
-            y_eval: the unknowns at the point that is judged.
-            f_info, f_eval_info: residuals and Jacobian at each.
-            state: the step size so far.
-        """
+        """As optimistix: next step size, whether the step counts, and two records of its own."""
         size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         cost = f_info.as_min()
         gain = self.predict_reduction(y_eval - y, f_info)
@@ -223,7 +205,6 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         Args:
             rtol: relative to the unknown, or to the size of the residuals.
             atol: in the optimiser's units.
-            convergence_mask: the unknowns whose changes count.
         """
         self.rtol, self.atol = rtol, atol
         self.norm = _norm(convergence_mask)
@@ -245,8 +226,6 @@ def within_reach(
     A bound on the whole step would let one unknown that runs away stop all others.
 
     Args:
-        state: after a step.
-        y: the unknowns at the last point that was accepted.
         reach: by unknown, inf where there is no bound.
         unit: of the unknowns y, in which reach is not given; 0 where one stays put.
     """
@@ -261,8 +240,6 @@ def within_radius(state: Any, y: Float[Array, " q"], limited: Bool[Array, ""] | 
     """The solver's state, its next point no further from y than its radius.
 
     Args:
-        state: after a step.
-        y: the unknowns at the last point that was accepted.
         limited: whether there is to be a radius at all.
     """
     step = state.y_eval - y
@@ -700,9 +677,6 @@ def residual_and_jacobian(
 
     Args:
         layout: what stands where in z.
-        data: the numbers of the problem.
-        noise: of the measurements, by which the rows are divided.
-        z: the unknowns.
     """
     if layout.estimator.one_program(layout):
         # An array and not a number, which would be compiled in: without steps the program of a
@@ -737,10 +711,7 @@ def optimise(
 
     Args:
         layout: what stands where in z.
-        data: the numbers of the problem.
-        noise: of the measurements, by which the rows are divided.
         z0: where to begin.
-        max_steps: after which it is given up.
         held: (q,) whether an unknown stays at its start; none unless given.
         nearing: how to end where another search follows; as near as it gets unless given.
         known: residuals and Jacobian at z0, where they are at hand.
@@ -799,10 +770,7 @@ def _run(
 
     Args:
         layout: what stands where in z.
-        data: the numbers of the problem.
-        noise: of the measurements.
         z0: where to begin.
-        limits: how far it may go.
         known: residuals and Jacobian at z0, where they are at hand.
     """
     (max_steps, trusted, held, nearing), count = (

@@ -37,12 +37,7 @@ _STEADY = 1e-6
 
 
 def condition_of(model: Model, flight: Flight) -> Condition | None:
-    """The steady flight about which a flight of a whole helicopter is linearised; None for others.
-
-    Args:
-        model: of the machine.
-        flight: as measured.
-    """
+    """Steady flight about which a flight of a whole helicopter is linearised; None for others."""
     if model.linear or not is_full_nonlinear(model):
         return None
     condition = mean_condition(flight.outputs, flight.dt)
@@ -51,11 +46,7 @@ def condition_of(model: Model, flight: Flight) -> Condition | None:
 
 
 def cannot_linearise(problem: Problem) -> str | None:
-    """Why a flight's model has no point to be linearised about; None where each has one.
-
-    Args:
-        problem: with the vehicle at its start values.
-    """
+    """Why a flight's model has no point to be linearised about; None where each has one."""
     for flight in problem.training:
         condition = condition_of(problem.model, flight)
         if condition is None:
@@ -73,8 +64,6 @@ def linear_drive(
     """A linear model of a flight, what drives it, and whether its point is one of rest.
 
     Args:
-        layout: of the problem.
-        drive: of the model itself.
         condition: of `condition_of`.
     """
     model = layout.model
@@ -164,11 +153,6 @@ class _LeftOut(NamedTuple):
 def linearisation_notes(at: Solution, e: Evaluation, names: Sequence[str]) -> list[Finding]:
     """By flight where its model was linearised, how far the flight goes from there, and how much
     of the motion that leaves out; then what that does to the estimates.
-
-    Args:
-        at: the optimum.
-        e: the evaluation there.
-        names: of the flights.
     """
     layout, data, noise, _ = at
     if layout.model.linear:

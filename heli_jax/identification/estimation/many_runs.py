@@ -80,9 +80,6 @@ class FusedRuns:
         """Translate and compile, or take what was compiled for the same.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: of the measurements, by which the rows are divided.
             own: what of the records each run has of its own.
 
         Raises:
@@ -377,7 +374,6 @@ def optimise_many(
         starts: where each run begins.
         each: what differs between the runs, a pytree of arrays (k, ...).
         hold: the unknown that stays at its start, by its number.
-        batch: runs side by side, by vmap.
         say: called with a sentence where many runs are no programs of machine code.
     """
     layout, noise = reached.layout, reached.noise

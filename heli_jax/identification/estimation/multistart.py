@@ -74,8 +74,6 @@ class Search:
         """An optimum for each start, all in the coordinates of `layout`.
 
         Args:
-            noise: of the measurements, by which the rows are divided.
-            points: the starts.
             progress: called with a sentence after each of several starts.
             nearing: how to end where another search follows; as near as it gets unless given.
             known: residuals and Jacobian at the first start, where they are at hand.
@@ -202,13 +200,7 @@ def gauss_newton_gain(r: Array | np.ndarray, J: Array | np.ndarray) -> float:
 def named_values(
     layout: Layout, data: Data, z: Float[Array | np.ndarray, " q"]
 ) -> dict[str, float]:
-    """The free parameters' values at z, by name, SI.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-    """
+    """The free parameters' values at z, by name, SI."""
     at, sign, low, high = (np.asarray(v) for v in (z, data.sign, data.low, data.high))
     return {
         n: float(coordinates.to_value(kind, at[i], sign[i], low[i], high[i]))
@@ -219,12 +211,6 @@ def named_values(
 def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[StartRow, ...]:
     """Start, end and cost of every run: the chosen one first, then by reason, best first; equal
     optima of one reason share a number.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        runs: in the order in which they were made.
-        chosen: the one that the fit is the end of.
     """
     reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
@@ -295,8 +281,6 @@ def first_optima(
     """An optimum for each start, after which the noise is relaxed.
 
     Args:
-        search: the optimiser over the problem.
-        at: its first guess.
         starts: makes them of the noise to begin with, and of residuals and Jacobian at the guess.
         report: called with a sentence after each of several.
     """

@@ -73,12 +73,7 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
 
 
 def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
-    """The same without what the method adds, such as a spectrum.
-
-    Args:
-        problem: says which method shares noise between flights.
-        flights: with any outputs.
-    """
+    """The same without what the method adds, such as a spectrum."""
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
     # The median: one flight in which an output hardly moves, or jumps, has no say.
@@ -100,9 +95,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
 
     Args:
-        search: the optimiser over the problem.
         noise: that `best` was found with.
-        best: the optimum to begin with.
     """
     layout, estimator = search.layout, search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
@@ -135,11 +128,8 @@ def _alternated(
     """Optimum and noise that stay, and steps and cost of each search.
 
     Args:
-        search: the optimiser over the problem.
         noise: that `best` was found with.
-        best: the optimum to begin with.
         earlier: how far the noise moved it the last time; inf where that is not known.
-        nearly: whether a search by more of the data follows.
     """
     layout, estimator = search.layout, search.layout.estimator
     trace: list[tuple[int, float]] = []
@@ -188,7 +178,6 @@ def _next_move(moved: float, earlier: float) -> float:
     """How far another noise would move the optimum, in squared joint standard deviations.
 
     Args:
-        moved: how far the last one did.
         earlier: how far the one before it did; inf where that is not known.
     """
     # Moves get smaller less fast the later they are, by up to this much from one to the next. After
@@ -211,8 +200,6 @@ def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> Relaxed
     """The optimum that a search from z leads to, its noise relaxed from `noise`.
 
     Args:
-        search: the optimiser over the problem.
-        noise: to begin with.
         z: where to begin.
     """
     [best] = search.run(noise, z[None, :])
@@ -251,8 +238,6 @@ def gain_left(
     determine is then no question to ask of that point.
 
     Args:
-        r: residuals with the rows of the priors, whitened.
-        J: their derivatives by the unknowns.
         parameters: how many of these, the first, are parameters, of which a step has a size.
         at_bound: those of them that the optimiser may move no further.
     """
@@ -283,10 +268,7 @@ def unless_stuck(
     """The optimum, no longer taken for one where its own slopes say that it is none.
 
     Args:
-        layout: what the unknowns are.
         optimum: where the search ended.
-        e: at that optimum.
-        free: the bounds of the free parameters, by name.
     """
     # A filter's rows hold the level of its variances too, and have no squares to take a share of.
     if not (bool(optimum.best.converged) and layout.estimator.least_squares):

@@ -29,7 +29,6 @@ def free_scales(model_scales: tuple[str, ...], free: Container[str]) -> tuple[st
 
     Args:
         model_scales: `Model.input_scales`.
-        free: the names that are.
     """
     return tuple(n for n in model_scales if n in free)
 
@@ -38,7 +37,6 @@ def not_attenuating(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
     """What the sum of log s has of the scale errors, to be taken off.
 
     Args:
-        layout: what the unknowns are.
         noise: with the derivatives of the last relaxation; none yet: zero.
         u: the unknowns, in the units of the model.
     """
@@ -52,7 +50,6 @@ def slopes_at(layout: Layout, noise: Noise, e: Evaluation, last: int) -> Any:
     """The derivatives of the sum of log s by the scale errors (k,), () where there are none.
 
     Args:
-        layout: what the unknowns are.
         noise: that `e` was evaluated with.
         e: anywhere.
         last: which row it is whose square is that sum, but for a constant and what is taken off.
@@ -99,10 +96,6 @@ _TOLD = 0.1
 def with_own_noise(problem: Problem, noise: Noise) -> Noise:
     """The noise with no derivative yet by each parameter of the model's own process noise that is
     unknown: of models whose inputs are sensors, all of whose noise is such.
-
-    Args:
-        problem: what is fitted.
-        noise: to begin with.
     """
     names = _own(problem) if problem.model.input_scales else ()
     if not names:
@@ -139,7 +132,6 @@ def taken_up(noise: Noise, u: Unknowns) -> Array | float:
     """What log det J'J adds to minus twice the log-likelihood, near where its derivatives are of.
 
     Args:
-        noise: with the derivatives of the last relaxation.
         u: the unknowns, in the units of the model.
     """
     if not noise.own:
@@ -154,12 +146,7 @@ def own_at(
     that logarithm; () where there is none.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
         noise: that `e` was evaluated with.
-        e: at z.
-        z: the unknowns.
-        measured: how many rows are those of the innovations.
     """
     if not noise.own:
         return noise.own

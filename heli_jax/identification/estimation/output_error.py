@@ -30,9 +30,6 @@ class OutputError(Estimator):
         """Signal after signal; with windows the defects between them follow.
 
         Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: of the measurements, by which the rows are divided.
             u: the unknowns, in the units of the model.
         """
         # No measurement enters the simulation: that keeps the estimates free of a bias by output
@@ -51,9 +48,7 @@ class OutputError(Estimator):
 
         Args:
             reached: where the fit ended.
-            u: the unknowns there.
             runs: how many records; one simulation serves them all.
-            seed: of nothing here, since nothing is drawn.
         """
         layout = reached.layout
         simulated = predict(layout, reached.data, u)

@@ -117,13 +117,7 @@ def _reach(layout: Layout, data: Data) -> _Reach:
 
 
 def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[Array, "n q"]:
-    """The whole Jacobian from the derivatives along the colours.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        along: the derivatives of all rows, a column a colour.
-    """
+    """The whole Jacobian from the derivatives along the colours."""
     # A derivative along a direction is the sum over its unknowns. Since no row feels two of them,
     # each row's sum is the derivative by the one that it does feel.
     columns, reach = _columns(layout), _reach(layout, data)
@@ -146,13 +140,7 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
-    """(value - mean) / sd of the parameters' priors; zero where there is none.
-
-    Args:
-        layout: what the unknowns are.
-        data: with means and sds by parameter, in its unit.
-        z: the unknowns.
-    """
+    """(value - mean) / sd of the parameters' priors; zero where there is none."""
     u = unpack(layout, data, z)
     values = jnp.stack(list(u.params.values()))
     # Without a prior the sd is infinite: a row for every parameter keeps the shapes the same.
@@ -173,14 +161,7 @@ def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array
 
 
 def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Array:
-    """The rows whose squares are summed, without their derivative.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by which the rows are divided.
-        z: the unknowns.
-    """
+    """The rows whose squares are summed, without their derivative."""
     return _all_rows(layout, data, noise, z)[0]
 
 
@@ -201,14 +182,7 @@ class ResidualAndJacobian(NamedTuple):
 def differentiate(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:
-    """Residuals and their Jacobian in forward mode, in one pass.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by which the rows are divided.
-        z: the unknowns.
-    """
+    """Residuals and their Jacobian in forward mode, in one pass."""
     # Forwards: there are far more rows than unknowns, and nothing of the simulation is stored.
 
     def rows(z: Array) -> tuple[Array, Any]:

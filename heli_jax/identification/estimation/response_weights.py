@@ -123,7 +123,6 @@ def _correlations(g: np.ndarray, d: int, step: int) -> dict[int, np.ndarray]:
 
     Args:
         g: windows times the turning of each line (k, samples), less their means.
-        step: from a window to the next, in samples.
     """
     a, b = g[: len(g) - d], np.conj(g[d:])
     size, found = np.sum(hann(g.shape[1]) ** 2), {}
@@ -345,11 +344,7 @@ def forgets(
     so over the record: then a simulation of the whole record is sound.
 
     Args:
-        matrices: of the model, with numbers.
         dt: [s].
-        sizes: standard deviation of each input.
-        length: samples of a window.
-        samples: of the record.
     """
     A, B, C = (np.asarray(v, float) for v in matrices[:3])
     if not all(np.isfinite(v).all() for v in (A, B, C)):
@@ -425,8 +420,6 @@ def first_weights(
     """Of what is measured alone: the noise is what no response explains of the outputs.
 
     Args:
-        problem: says which responses.
-        flights: those fitted.
         simulated: by output of the model; by the model at its start values unless given.
 
     Raises:
@@ -466,13 +459,7 @@ def _at_rest(problem: Problem, flights: int) -> tuple[tuple[Any, ...], tuple[dic
 def weighed(
     weights: ResponseWeights, simulated: tuple[bool, ...], density: Complex[np.ndarray, "k p p"]
 ) -> ResponseWeights:
-    """The same with another spectrum of the noise.
-
-    Args:
-        weights: so far.
-        simulated: by output whether the model goes through the windows.
-        density: of the noise.
-    """
+    """The same with another spectrum of the noise."""
     w = weights.windows
     # What goes through the same windows as the record may be of their sidelobes: so is the other.
     # A response at one frequency is not told from the window's shape by less than two periods.
@@ -490,13 +477,7 @@ def weighed(
 
 
 def forgetful_outputs(problem: Problem, flights: Sequence[Flight], w: Windowed) -> tuple[bool, ...]:
-    """By output in windows whether the model at its start values may be simulated.
-
-    Args:
-        problem: model and start values.
-        flights: those fitted.
-        w: in windows.
-    """
+    """By output in windows whether the model at its start values may be simulated."""
     start = problem.start_params()
     parameters = [naming.asdict(naming.replace(start, **f.known)) for f in flights]
     return outputs_that_forget(problem.model, parameters, [f.inputs for f in flights], w)
@@ -512,10 +493,8 @@ def outputs_that_forget(
     """By output in windows whether the model may be simulated over every flight.
 
     Args:
-        model: linear.
         parameters: by flight, by name, SI.
         inputs: by flight, by name, (N,).
-        w: the flights in windows.
     """
     fine = np.ones(len(w.outputs), bool)
     rows = [naming.names(model.Outputs).index(n) for n in w.outputs]
@@ -611,14 +590,7 @@ machine makes of gusts, and white noise: (k, q, q), or None where that says noth
 
 
 def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
-    """The shape that the first flight's machine gives to the noise.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-        w: the flights in windows.
-    """
+    """The shape that the first flight's machine gives to the noise."""
     seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     machine = machine_of(seen, data, z)
     return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
@@ -636,13 +608,7 @@ class _Cells(NamedTuple):
 
 
 def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
-    """The shape that a machine gives to the noise.
-
-    Args:
-        Ad: from sample to sample.
-        C: of the outputs in windows.
-        w: the flights in windows.
-    """
+    """The shape that a machine gives to the noise."""
     cells = _cells(w.lines)
     # A line on a mode that does not decay has no finite response.
     with np.errstate(all="ignore"):
@@ -687,14 +653,7 @@ def ways_of(
     lines: Float[np.ndarray, " c"],
     length: int,
 ) -> Complex[np.ndarray, "c n p p"]:
-    """By line and state what windows show of the outputs in white gusts of power 1.
-
-    Args:
-        Ad: from sample to sample.
-        C: of the outputs.
-        lines: in periods of a window.
-        length: of a window, in samples.
-    """
+    """By line and state what windows show of the outputs in white gusts of power 1."""
     f = lines[:, None] + _OFFSETS
     z = np.exp(2j * np.pi * f / length)[:, :, None, None]
     H = np.swapaxes(C @ np.linalg.inv(z * np.eye(len(Ad)) - Ad), 2, 3)

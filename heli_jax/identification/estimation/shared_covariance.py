@@ -89,7 +89,6 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
     is what the samples before and the outputs before it leave.
 
     Args:
-        system: n states, p outputs.
         records: m of them, no sample missing.
     """
     N, m, p = records.y.shape
@@ -250,9 +249,6 @@ def innovations_together(
     """The innovations of flights that share their covariances, flight after flight.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by flight and output.
         u: the unknowns, in the units of the model.
         group: the numbers of the flights, one of `Layout.one_covariance`.
     """

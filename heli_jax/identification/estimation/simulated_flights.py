@@ -32,14 +32,7 @@ class Drive(NamedTuple):
 
 
 def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
-    """What moves the model through the i-th flight: inputs are (logged + offset) * gain.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns.
-        i: the flight's number.
-    """
+    """What moves the model through the i-th flight: inputs are (logged + offset) * gain."""
     flight, offsets = data.flights[i], u.offsets[i]
     # The later wins: what was known of this flight alone stands above what is estimated of all.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
@@ -76,11 +69,6 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     """The simulated flights (without bias).
 
     Windows of one length are simulated together, whichever flight they belong to.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns.
     """
     by_flight, groups = {}, {}
     for i, flight in enumerate(data.flights):
@@ -159,8 +147,6 @@ def _side_by_side(
 
             Args:
                 v: (signals, windows, samples) of all flights.
-                windows: those of this flight.
-                n: its samples.
             """
             # The sample after these m is the next window's first; past n stand repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
@@ -226,23 +212,13 @@ def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
 
 @jitted
 def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
-    """What is simulated at z, without any derivative.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        z: the unknowns.
-    """
+    """What is simulated at z, without any derivative."""
     u = unpack(layout, data, z)
     return outputs_of(u, predict(layout, data, u))
 
 
 def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output what is simulated, (N,), with the bias, SI.
-
-    Args:
-        simulated: as NumPy arrays.
-    """
+    """By flight and output what is simulated, (N,), with the bias, SI."""
     # In the order of `joined_biases`.
     bias = iter(simulated.biases)
     return tuple(
@@ -272,13 +248,7 @@ def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
 
 
 def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
-    """All that is measured, and its sd, each (n,).
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by flight and output.
-    """
+    """All that is measured, and its sd, each (n,)."""
     # Joined, since XLA makes a kernel of every signal that is treated by itself.
     at = signals(layout)
     sd = jnp.stack([noise.sd[i][n] for i, n in at])
@@ -291,7 +261,6 @@ def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
 
     Args:
         u: the unknowns, in the units of the model.
-        output: whose it is.
         sd: the guess of it, or what is stated.
     """
     sd = sd * u.scales[output] if output in u.scales else sd

@@ -38,9 +38,6 @@ def noise_guess_at(
     disturbances first all together, then each by itself.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
         z0: where the grid has its middle.
     """
     z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
@@ -63,12 +60,8 @@ def one_noise_guess(
     sigma and of every tau, to the greatest likelihood on a coarse grid about it.
 
     Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
         z0: where the grid has its middle.
         names: of the parameters; those that are no unknowns stay.
-        width: of the grid, in decades between its points.
     """
     # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
     steps = {
@@ -93,14 +86,7 @@ def one_noise_guess(
 def finer_noise_guess(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> Float[Array, " q"]:
-    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z: of the coarse search.
-    """
+    """z with each disturbance of the greatest likelihood about it, to a tenth of a decade or so."""
     # As many points as the coarse search has: what was compiled for it serves here too.
     for _ in range(_ROUNDS):
         for d in disturbances_of(layout.model):
@@ -113,14 +99,7 @@ def finer_noise_guess(
 def costs_at(
     layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
 ) -> Float[Array, " s"]:
-    """The mean of the squared rows at each of some points.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        points: in the layout's coordinates.
-    """
+    """The mean of the squared rows at each of some points."""
     # One point after another: side by side they would need the memory of as many filters, for a
     # search of a few points.
     return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
@@ -138,12 +117,6 @@ def coarse_guess(
 ) -> Float[Array, " q"]:
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
     linear least squares; what is not among the unknowns stays.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: the start values.
     """
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
     if not (layout.shift or len(layout.gains) == 1):
@@ -225,13 +198,6 @@ def draw(
     Between two bounds of one sign the draw is uniform in log, between two of different sign
     uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
     and of either sign where that may be any.
-
-    Args:
-        layout: what the unknowns are.
-        problem: with the free parameters' bounds and priors.
-        z0: the first start.
-        starts: how many, the first included.
-        seed: of the draw.
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
@@ -318,11 +284,6 @@ def delay_start(
 
     Args:
         problem: with the free parameters and the model that says which are delays.
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: the start values.
-        known: residuals and Jacobian there.
     """
 
     def evaluate(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

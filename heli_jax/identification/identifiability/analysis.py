@@ -97,9 +97,7 @@ def analyse(
         reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
             where it is not that of white residuals: these must not reach further than the factor
             either.
-        around: what is known of other points.
         remedies: by name of an unknown, a further way out that the model offers.
-        switches: the kinds of nuisances that may be switched off.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
@@ -185,7 +183,6 @@ def _null(
         null: those without effect.
         covariances: (q, q) each, without the weak priors, with them, and as it is reported.
         unknowns: (q,) what the coordinates are.
-        around: what is known of other points.
     """
     bare, covariance, reported = covariances
     null = with_too_wide(null, bare, unknowns)
@@ -217,11 +214,9 @@ def _groups(
     """Return the parameters in null directions, those apart that no direction ties together.
 
     Args:
-        null: the directions.
         covariance: (q, q) of what is determined.
         unknowns: (q,) what the coordinates are.
         of_rows: the sensitivity with the weak priors and without them.
-        around: what is known of other points.
         dead: parameters without effect, which have a sentence of their own, and no combination.
     """
     alive = np.array([u.name not in dead for u in unknowns])
@@ -329,10 +324,6 @@ def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> Weakest:
 def with_combinations(verdict: Verdict, change: Callable[[Combination], Combination]) -> Verdict:
     """Return the verdict with other intervals of its combinations, without those that then
     determine nothing.
-
-    Args:
-        verdict: what the data determine.
-        change: makes the combination with its interval.
     """
 
     def changed(groups: tuple[Group, ...]) -> tuple[Group, ...]:

@@ -31,7 +31,6 @@ def combinations(
         null: unit directions (q,) in relative coordinates.
         covariance: (q, q) of what is determined, in the same.
         unknowns: (q,) what the coordinates are.
-        units: by name, of those that are parameters.
     """
     # From a relative coordinate to log |value|, whose powers these are, or to the value itself.
     to = np.array([u.per_log for u in unknowns])

@@ -166,7 +166,6 @@ class WithoutWeakPriors(NamedTuple):
         where weak priors do not hold it.
 
         Args:
-            v: the direction.
             sensitivity: (any, q) with the weak priors.
         """
         held, free = (np.linalg.norm(rows @ v) for rows in (sensitivity, self.sensitivity))

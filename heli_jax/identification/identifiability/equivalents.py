@@ -70,7 +70,6 @@ def descend(
     there less what a further step promises, infinite where nothing finite is found.
 
     Args:
-        rows: residuals and Jacobian at a point.
         z: (q,) where the search begins.
         moving: (q,) the coordinates that may change.
         floor: to which the ridge falls: zero where all directions are determined.
@@ -156,7 +155,6 @@ class Valley(NamedTuple):
                 named.
             same: whether the residuals themselves have to stay, each of them, and not only the sum
                 of their squares; asked where the valley's own point is no optimum too.
-            priors: whether the parameters' own priors count.
         """
         layout = self.at.layout
         names, z = layout.of_interest, np.array(self.at.z, np.float64)
@@ -339,9 +337,6 @@ def second_solutions(
     """Other admissible values of the free parameters that the data do not tell from those here.
 
     Args:
-        problem: with bounds and priors.
-        at: the point.
-        e: what it tells.
         optimum: whether it is one, about which the other unknowns may follow.
     """
     values = {n: float(v) for n, v in zip(at.layout.of_interest, e.named, strict=True)}

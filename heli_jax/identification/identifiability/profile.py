@@ -72,8 +72,6 @@ def profile(at: Solution, name: str, points: int = 13) -> Profile:
     """Return the profile of a free parameter; white residuals are taken for granted.
 
     Args:
-        at: the optimum that the profile goes through.
-        name: of a free parameter that the data determine.
         points: of the profile; odd, so that the optimum is one of them.
     """
     i = at.layout.free.index(name)
@@ -187,10 +185,6 @@ def beyond_slopes(
     """Ask the likelihood of the parameters whose intervals are wide.
 
     Args:
-        problem: with bounds and priors.
-        at: the optimum.
-        e: what it tells.
-        verdict: what the data determine by the slopes there.
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
     """
     lacking = verdict.not_identifiable

@@ -24,11 +24,6 @@ _AT_END = 1e-3
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
     """The parameters of interest for the verdict, with their size and prior in relative
     coordinates.
-
-    Args:
-        problem: bounds, priors and starts.
-        layout: the order of the unknowns.
-        e: their values at the point.
     """
     dt = problem.training[0].dt
     unknowns = []
@@ -93,9 +88,7 @@ def relative_rows(
     """The parameters of interest, and the Jacobian's rows of the data in relative coordinates.
 
     Args:
-        problem: bounds, priors and starts.
         layout: what stands where in the Jacobian's columns.
-        e: the whitened residuals' Jacobian and the values there.
     """
     unknowns = unknowns_of(problem, layout, e)
     # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
@@ -157,12 +150,9 @@ def verdict_of(
     """What the data determine at one point.
 
     Args:
-        problem: what is free, with bounds and priors.
         layout: what stands where in the Jacobian's columns.
-        e: the whitened residuals' Jacobian and the values there.
         reported: covariance (k, k) of the parameters of interest, in the optimiser's coordinates,
             that the reported intervals have where it is not that of white residuals.
-        around: what is known of points other than this one.
 
     Raises:
         ValueError: the simulation is not finite there.

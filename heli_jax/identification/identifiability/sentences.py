@@ -196,7 +196,6 @@ def _way_out(names: Sequence[str], v: Verdict, count: int = 1, switches: Sequenc
         names: the parameters, gains and the time shift concerned.
         v: which of them are parameters, and what remedies the model has.
         count: how many of them have to be known for the rest to be determined.
-        switches: nuisances whose absence would determine them too.
     """
     parameters = [u.name for u in v.unknowns if u.name in names and u.is_parameter]
     off = [*switches, *dict.fromkeys(s for s in map(_switch, names) if s)]

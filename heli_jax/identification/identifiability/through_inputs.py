@@ -42,10 +42,6 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
 
     None without innovations, and where a simulation leaves its record (an unstable machine), so
     that what of it the inputs make is not known.
-
-    Args:
-        at: the optimum of a method with process noise.
-        e: what it tells.
     """
     if not e.innovations or not (np.isfinite(e.J).all() and np.isfinite(e.r).all()):
         return None
@@ -100,12 +96,7 @@ class ByDisturbance(NamedTuple):
 
 
 def by_disturbance(verdict: Verdict, by_inputs: Verdict) -> ByDisturbance:
-    """Return what the disturbance tells of the parameters.
-
-    Args:
-        verdict: of all that the innovations tell.
-        by_inputs: of what the responses tell.
-    """
+    """Return what the disturbance tells of the parameters."""
     known, alone = verdict.not_identifiable, by_inputs.not_identifiable
     sds = (np.sqrt(np.maximum(np.diag(v.covariance), 0.0)) for v in (verdict, by_inputs))
     each = list(zip(verdict.names, *map(np.ndarray.tolist, sds), strict=True))
@@ -118,14 +109,7 @@ def by_disturbance(verdict: Verdict, by_inputs: Verdict) -> ByDisturbance:
 
 
 def remarks(told: ByDisturbance, names: Sequence[str], *, counts: bool, white: bool) -> list[str]:
-    """Return sentences on parameters that rest on the model of the disturbance.
-
-    Args:
-        told: what the disturbance tells.
-        names: the parameters that do.
-        counts: whether that is counted.
-        white: whether the innovations are white.
-    """
+    """Return sentences on parameters that rest on the model of the disturbance."""
     lines = []
     if names and not white:
         lines.append(
@@ -178,7 +162,6 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
     """Sentences about those parameters of several disturbances that the data do not determine.
 
     Args:
-        layout: what the unknowns are.
         e: residuals and their Jacobian at the point that is asked about.
         skip: parameters of which nothing is to be said, such as those of absent disturbances.
     """
@@ -206,13 +189,7 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
 def _of_columns(
     names: list[str], rows: Float[np.ndarray, "n k"], norms: Float[np.ndarray, " k"]
 ) -> list[Finding]:
-    """The same where every parameter has an effect.
-
-    Args:
-        names: of the parameters.
-        rows: whitened, the other unknowns projected out.
-        norms: of the columns before that.
-    """
+    """The same where every parameter has an effect."""
     if not names:
         return []
     # Over the norms before the projection: a direction is open where little is left of its columns,

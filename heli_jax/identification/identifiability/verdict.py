@@ -201,11 +201,7 @@ class Verdict:
         return tuple(dict.fromkeys(n.label for group in groups for n in group.exchanged))
 
     def nothing(self, sentence: str) -> "Verdict":
-        """No parameter determined, for a reason.
-
-        Args:
-            sentence: the reason.
-        """
+        """No parameter determined, for a reason."""
         return replace(
             self,
             identifiable=False,

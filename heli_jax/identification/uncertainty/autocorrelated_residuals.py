@@ -163,7 +163,6 @@ def sandwich(
     Args:
         layout: of the unknowns z (q,).
         data: says which samples are missing.
-        e: residuals and Jacobian at the optimum.
         curvature: (q, q) what the residuals add to J'J in the Hessian (`residual_curvature`);
             nothing unless given.
     """
@@ -211,9 +210,6 @@ def residual_curvature(
     limit, a stop or a dead band makes of the slopes are kinks, whose differences are no curvature.
 
     Args:
-        layout: of the unknowns.
-        data: the flights.
-        noise: that whitens the residuals.
         z: the optimum (q,), in the optimiser's coordinates.
     """
     # The fit has compiled `slopes`; second derivatives would be another program, and a longer one.
@@ -309,7 +305,6 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
 
     Args:
         residual: (outputs, N), NaN where nothing is measured.
-        runs: how many to draw.
         rng: drawn from, so that a seed gives the same again.
     """
     seen = ~np.isnan(residual)

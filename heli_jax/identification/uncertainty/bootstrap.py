@@ -183,8 +183,6 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
 
     Args:
         fit: with the estimates, and the optimum that all refits begin from.
-        runs: how many records.
-        seed: of noise and disturbance.
 
     Raises:
         ValueError: no run; the time shift is free in a fit in time, or the data do not determine

@@ -168,12 +168,7 @@ def _which(
     booted: Bootstrap | None,
     posterior: Posterior | None,
 ) -> str:
-    """Which interval to believe where some differ from the Gaussian one.
-
-    Args:
-        far: the methods that differ.
-        others: intervals of all methods but the Gaussian one.
-    """
+    """Which interval to believe where some differ from the Gaussian one."""
     verb = "differ" if len(far) > 1 else "differs"
     by = f"by more than {percent(DIFFERENT, 0)} of its width"
     text = f"{' and '.join(far)} {verb} from the Gaussian interval {by}. "

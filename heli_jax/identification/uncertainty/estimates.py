@@ -47,10 +47,6 @@ _TAKES_PART = 0.02
 def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     """By size of a noise the standard deviation of its logarithm, in its own unit; {} where the
     sizes are not relative to one that may vanish.
-
-    Args:
-        at: the optimum.
-        e: what it tells.
     """
     layout = at.layout
     if not (layout.filtered and layout.concentrated and np.isfinite(e.J).all()):
@@ -88,8 +84,6 @@ def estimates_of(
 
     Args:
         problem: with units, bounds and priors.
-        layout: of the unknowns.
-        e: at the optimum.
         verdict: what is identifiable, with the covariance as if residuals were white.
         quantiles: (q,) standard deviations that an interval reaches to either side.
         wider: (q,) by which the standard deviations of white residuals are multiplied.
@@ -132,7 +126,6 @@ def with_limits(
     """The estimates with those ends of their 95 % intervals that are not the slopes'.
 
     Args:
-        estimates: by name.
         limits: by name lower and upper end, in the parameter's unit.
     """
     found = dict(estimates)
@@ -198,8 +191,6 @@ def noise_by_name(
     """Standard deviation of the measurement noise as 'flight/output', in the output's SI unit.
 
     Args:
-        problem: whose flights are named.
-        noise: by flight and output.
         scales: factors on it by output that are unknowns themselves (filter error); 1 unless named.
     """
     return {
@@ -220,8 +211,6 @@ def flight_nuisances(
 
     Args:
         problem: with flights, units and starts.
-        at: the optimum.
-        e: what it tells.
         quantiles: (q,) standard deviations that an interval reaches to either side.
         wider: (q,) by which the standard deviations of white residuals are multiplied.
     """

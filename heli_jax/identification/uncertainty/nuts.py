@@ -34,7 +34,6 @@ def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
     """Names and SI for samples of the vector of unknowns.
 
     Args:
-        fit: whose unknowns they are.
         z: the samples (..., q), in the optimiser's coordinates.
     """
     layout, data = fit.reached.layout, fit.reached.data
@@ -148,10 +147,7 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     priors of the problem; the scale of the noise is integrated out (Jeffreys).
 
     Args:
-        fit: with the optimum that the chains begin about.
-        draws: of each chain, after its warm-up.
         warmup: steps in which step size and mass matrix are adapted.
-        seed: of the chains.
 
     Raises:
         ValueError: blackjax is not installed, or the data do not determine every parameter.
@@ -286,9 +282,6 @@ def log_posterior(
     output error, the common one with filter error, unless it was fixed.
 
     Args:
-        layout: of the unknowns.
-        data: the flights.
-        noise: that whitens the rows.
         z: the unknowns (q,), in the optimiser's coordinates.
     """
     # Draws are of all parameters together: nothing is taken up by those of the mean.

@@ -73,14 +73,10 @@ def standard_errors(
     """As the slopes have them, and where these leave wide intervals as the likelihood has them.
 
     Args:
-        problem: what was fitted.
-        at: the optimum.
-        e: what it tells.
         before: the verdict at the first guess, which stands where the optimum has no Jacobian.
         white: whether the residuals are white and independent between outputs; of a method with
             process noise whether the innovations are.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
-        second: other values that fit as well.
         optimum: whether the point is one, about which the likelihood may be asked.
     """
     around = Around(frozenset(aliased), second, Valley(problem, at, e))
@@ -115,14 +111,7 @@ def _with_process_noise(
     disturbance tells more of a parameter than the inputs do, that of the responses in them alone.
 
     Args:
-        problem: what was fitted.
-        at: the optimum.
-        e: what it tells.
         inputs: what inputs and initial states tell there, of `through_inputs`.
-        errors: by the slopes of all that the innovations tell.
-        around: what is known of points other than the optimum.
-        slopes: makes the errors by the slopes.
-        white: whether the innovations are white.
     """
     # Neither names combinations, which take time to look for.
     by_all, by_inputs = (

@@ -135,7 +135,6 @@ def own_start(model: Model, params: Any) -> dict[str, float]:
     """Where the model begins, by state; what a whole helicopter begins at zero is as in hover.
 
     Args:
-        model: of any machine.
         params: its Params, concrete numbers, SI.
     """
     start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}

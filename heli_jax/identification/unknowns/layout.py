@@ -242,7 +242,6 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     """The static side of a problem over the given flights.
 
     Args:
-        problem: what is free, and which nuisances.
         flights: those whose initial states, biases and offsets stand in z, in this order.
     """
     # All of it is hashable and static: two problems of one layout share their compiled programs.
@@ -277,12 +276,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
 
 
 def within_bounds(layout: Layout, problem: Problem) -> Layout:
-    """The layout whose free parameters are kept within their bounds by logit coordinates.
-
-    Args:
-        layout: of the problem.
-        problem: has the bounds.
-    """
+    """The layout whose free parameters are kept within their bounds by logit coordinates."""
     kinds = tuple(transforms.kind(f) for f in problem.free.values())
     return layout if kinds == layout.kinds else dataclasses.replace(layout, kinds=kinds)
 
@@ -327,10 +321,8 @@ def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
     """The value of a free parameter.
 
     Args:
-        layout: says how its coordinate is to be read.
         data: its sign or scale and its bounds.
         i: which one, in the order of `layout.free`.
-        z: its coordinate, any shape.
     """
     return transforms.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
@@ -342,10 +334,6 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
     thousand records is a random walk; beyond these a likelihood without a maximum would take the
     numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
     of several disturbances each its own, with room for a disturbance that is none.
-
-    Args:
-        layout: which parameters there are.
-        data: sample times, lengths and sizes of the records.
     """
     dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
     longest = functools.reduce(
@@ -377,7 +365,6 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
 
     Args:
         layout: what stands where.
-        data: scales, signs and bounds of the coordinates.
         z: all unknowns (q,), without units.
     """
     q = len(layout.free)

@@ -98,9 +98,7 @@ def coordinate(free: Free, kind: str, value: float) -> float | None:
     """The coordinate of a value; None where it lies outside the bounds, or has none.
 
     Args:
-        free: with the bounds.
         kind: one of `KINDS`.
-        value: in the parameter's unit.
     """
     if not inside(free, value):
         return None
@@ -109,12 +107,7 @@ def coordinate(free: Free, kind: str, value: float) -> float | None:
 
 
 def at_bound(free: Free, value: float) -> bool:
-    """Whether an estimate ended at a bound that was stated.
-
-    Args:
-        free: with the bounds.
-        value: of the estimate.
-    """
+    """Whether an estimate ended at a bound that was stated."""
     low, high = free.lower, free.upper
     width = high - low if low is not None and high is not None else abs(value)
     near = 1e-3 * width
@@ -130,7 +123,6 @@ def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real
 
     Args:
         transform: one of `KINDS`.
-        z: the coordinate, any shape, no unit.
         sign: +1 or -1; the parameter's scale where the transform is linear (`sign_or_scale`).
         low, high: bounds, in the parameter's unit, infinite where there is none.
     """
@@ -157,7 +149,6 @@ def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) ->
 
     Args:
         transform: one of `KINDS`.
-        x: the value, any shape, in the parameter's unit.
         sign: as in `to_value`.
         low, high: bounds, in the parameter's unit, infinite where there is none.
     """

@@ -141,12 +141,7 @@ def misses(expected: Mapping[str, float]) -> bool:
 
 
 def joined_metrics(name: str, records: Sequence[Record]) -> Metrics:
-    """Of one output over all records that have it.
-
-    Args:
-        name: the output.
-        records: by flight.
-    """
+    """Of one output over all records that have it."""
     both = [(r.measured[name], r.simulated[name]) for r in records if name in r.measured]
     measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
     return metrics(measured, predicted)
@@ -156,7 +151,6 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     """Whether the model is adequate to the fitted flights.
 
     Args:
-        problem: what was fitted.
         params: the vehicle with the estimates in place, a record of the model's Params, SI.
         evidence: measured and simulated outputs, and what is left between them.
     """
@@ -278,13 +272,7 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
 
 
 def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
-    """The verdict; where the inputs explain nothing that determines no parameter.
-
-    Args:
-        at: the optimum.
-        e: what it tells.
-        verdict: what the data determine as the model has it.
-    """
+    """The verdict; where the inputs explain nothing that determines no parameter."""
     # Without a disturbance that is asked of the response: it has to stand out of the noise.
     if not verdict.identifiable or not e.innovations:
         return verdict
@@ -309,10 +297,6 @@ def gain_of_inputs(at: Solution, e: Evaluation) -> float:
 
     All unknowns stay as they are: estimated anew without the inputs the likelihood could only be
     larger, and the gain smaller, so that a gain of no account is certain.
-
-    Args:
-        at: the optimum.
-        e: what it tells.
     """
     if not any(_moving(flight) for flight in at.data.flights):
         return float("nan")

@@ -81,8 +81,6 @@ def advice_for(
 
     Args:
         problem: what was fitted: what it has switched on already is no advice.
-        output: the output that is not explained, with its numbers.
-        records: the fitted flights.
         unstable: whether the model is, over the length of the record.
         apart: whether other outputs are followed well: then this one's sensor is at fault, not the
             inputs, which all outputs share.

@@ -55,12 +55,7 @@ class FastMode(NamedTuple):
 def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], ...]:
-    """By flight and output the sd that residuals leave to noise, without what a model misses, SI.
-
-    Args:
-        problem: the flights that are fitted.
-        sd: of the residuals, by flight and output.
-    """
+    """By flight and output the sd that residuals leave to noise, less what a model misses, SI."""
     # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
     return tuple(
         {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
@@ -89,9 +84,6 @@ class Modes(NamedTuple):
         input moves, in the free motion: of the modes that the output shows best all of it.
 
         Args:
-            k: of the eigenvalues.
-            problem: names the model's inputs and outputs.
-            flight: says how far the inputs move.
             noise: sd by output, SI.
         """
         outputs = naming.names(problem.model.Outputs)
@@ -117,7 +109,6 @@ def modes_about(problem: Problem, params: Any, at: OperatingPoint) -> Modes | No
     """The model's modes about a point; None where its matrices are not finite.
 
     Args:
-        problem: whose model it is.
         params: of the flight, SI.
         at: where the model is linearised.
     """
@@ -138,7 +129,6 @@ def fast_modes(
     """For each fitted flight the fastest mode that its samples cannot show and that is not known.
 
     Args:
-        problem: the flights and what is free.
         values: of the free parameters, SI; gains and shifts among them move no mode.
         noise: sd by flight and output, SI; without it nothing is said to be undetermined.
     """
@@ -219,7 +209,6 @@ def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMo
 
     Args:
         modes: of `fast_modes` at an optimum.
-        valley: about that optimum.
     """
     # A filter's rows hold the level of its variances too, and no squares to take a part of.
     if not valley.at.layout.estimator.least_squares:

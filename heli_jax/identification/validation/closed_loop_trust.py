@@ -98,7 +98,6 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
 
     Args:
         at: where the fit ended.
-        J: the whitened rows' derivative there.
     """
     layout = at.layout
     if layout.estimator.fits_responses:
@@ -246,7 +245,6 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
 
     Args:
         moved: of `moved_by_feedback`.
-        loop: who closes it.
     """
     if not loop.closed:
         return ()
@@ -259,11 +257,7 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
 
 
 def knows_no_gusts(problem: Problem) -> bool:
-    """Whether a fit is one in time without gusts in its model.
-
-    Args:
-        problem: says the method.
-    """
+    """Whether a fit is one in time without gusts in its model."""
     estimator = estimator_of(problem.method)
     in_time = not (estimator.by_instrument or estimator.fits_responses)
     return in_time and not estimator.process_noise
@@ -398,9 +392,7 @@ def weak_by_instrument(
     """The unknowns of interest of which instruments tell too little; () of a fit without any.
 
     Args:
-        problem: with flights and instruments.
         at: where the fit ended.
-        J: the whitened rows' derivative there.
     """
     layout = at.layout
     if not layout.estimator.by_instrument or not instruments_of(problem):

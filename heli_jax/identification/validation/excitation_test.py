@@ -45,9 +45,6 @@ class Followed(NamedTuple):
 def outputs_against_excitation(problem: Problem) -> dict[str, float]:
     """By output the probability that noise alone follows the excitation as much; outputs with gaps
     and of too few lines are left out.
-
-    Args:
-        problem: with the flights, their inputs and instruments.
     """
     by = instruments_of(problem)
     sums: dict[str, np.ndarray] = {}
@@ -82,7 +79,6 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
     """By output what of its residual follows the excitation; outputs of too few lines are left out.
 
     Args:
-        problem: with the flights, their inputs and instruments.
         at: where a fit by frequency error ended.
     """
     errors = jax.device_get(errors_of_lines(*at).errors)
@@ -101,8 +97,6 @@ def errors_against_excitation(
     Args:
         flights: those of the layout, fitted or held out.
         at: where they are evaluated.
-        errors: by record.
-        by: the inputs that are taken by their instrument.
     """
     layout, _, noise, _ = at
     sums: dict[str, np.ndarray] = {}

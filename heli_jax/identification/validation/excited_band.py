@@ -30,12 +30,7 @@ def moving_outputs(flight: Flight) -> tuple[Flight | None, str]:
 
 
 def with_outputs(flight: Flight, names: Collection[str]) -> Flight:
-    """The flight with some of its outputs.
-
-    Args:
-        flight: any.
-        names: of the outputs to keep.
-    """
+    """The flight with some of its outputs."""
     outputs, sd = (
         {n: v for n, v in of.items() if n in names} for of in (flight.outputs, flight.sd)
     )
@@ -73,11 +68,7 @@ class SeenParts(NamedTuple):
 
 
 def seen_parts(flights: Sequence[Flight]) -> SeenParts:
-    """Parts without a hole, few missing samples bridged by straight lines.
-
-    Args:
-        flights: of one sample time.
-    """
+    """Parts without a hole, few missing samples bridged by straight lines."""
     used: list[str] = []
     left_out: list[str] = []
     filled: list[dict[str, np.ndarray]] = [{} for _ in flights]
@@ -203,9 +194,6 @@ class _Pooled(NamedTuple):
 def excitation_of(flights: Sequence[Flight]) -> Excitation:
     """What the inputs excite; flights of one sample time are looked at together, since what one of
     them tells apart is told apart.
-
-    Args:
-        flights: those that are fitted.
     """
     dt = flights[0].dt
     alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]

@@ -21,11 +21,7 @@ from heli_jax.identification.validation.follows_response import (
 
 
 def why_untested(problem: Problem) -> Untested | None:
-    """Why nothing was tested of any flight; None where something was.
-
-    Args:
-        problem: whose flights are tested.
-    """
+    """Why nothing was tested of any flight; None where something was."""
     reasons = {
         label: tested
         for label, f in zip(labels(problem.training), problem.training, strict=True)
@@ -44,7 +40,6 @@ def feedback_of(
     none is a stick that anybody moves.
 
     Args:
-        problem: flights, and the model, which says what is delayed.
         delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
             delays [s]; None before a fit, and of one that did not arrive.
     """
@@ -81,11 +76,7 @@ def _delay(
 
 
 def untested(problem: Problem) -> dict[tuple[str, ...], list[str]]:
-    """By outputs of which feedback cannot be told, since too much is missing, the flights.
-
-    Args:
-        problem: whose flights are tested.
-    """
+    """By outputs of which feedback cannot be told, since too much is missing, the flights."""
     lacking: dict[tuple[str, ...], list[str]] = {}
     for label, flight in zip(labels(problem.training), problem.training, strict=True):
         tested = decimated(flight, {}, RATE).outputs

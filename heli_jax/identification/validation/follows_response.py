@@ -46,9 +46,6 @@ rounding"""
 def lag_blocks(longest: int) -> list[tuple[int, int]]:
     """Lags in samples, in groups that grow with the lag: what follows the response does so over a
     while, and few sums over many lags see it where each lag by itself would not.
-
-    Args:
-        longest: lag.
     """
     blocks, first = [], 1
     while first <= longest:
@@ -73,7 +70,6 @@ def correlations_with_sums(
     Args:
         u: NaN where it is missing.
         e: likewise, in whole rows.
-        blocks: first and last lag of each, in samples.
     """
     seen = np.isfinite(u) & np.isfinite(e).all(axis=1)
     u, e = np.where(seen, u, 0.0), np.where(seen[:, None], e, 0.0)
@@ -394,11 +390,7 @@ def _sureness(one: Feedback) -> tuple[float, float]:
 
 
 def rates_of(flight: Flight) -> tuple[float, ...]:
-    """Samples a second at which a flight is looked at [Hz].
-
-    Args:
-        flight: inputs and outputs as measured.
-    """
+    """Samples a second at which a flight is looked at [Hz]."""
     # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
     # a sample, and how it moved there, is not known, and an output that answers to it would pass
     # for news.
@@ -464,7 +456,6 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     """Return the signals of a flight that are correlated, or the reason why none are.
 
     Args:
-        flight: inputs and outputs as measured.
         earlier: by input, how much earlier than logged it is to be taken [s].
         rate: samples a second at most [Hz].
     """
@@ -561,7 +552,6 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
     """A flight averaged down.
 
     Args:
-        flight: as measured.
         earlier: by how many samples an input is taken earlier than logged, where it is.
         rate: samples a second at most [Hz].
     """

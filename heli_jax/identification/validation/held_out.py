@@ -43,11 +43,7 @@ def validate(
     Nothing is raised where that fails: the notes say so.
 
     Args:
-        problem: what was fitted.
-        layout: of the fitted flights.
         z: (q,) the optimum of the fitted flights in `layout`.
-        noise: that of the fitted flights.
-        held: the flights held out.
     """
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)

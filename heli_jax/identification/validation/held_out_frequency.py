@@ -78,9 +78,6 @@ _FEWEST = 12
 def band_edges(hz: Float[np.ndarray, " K"]) -> list[tuple[float, float]]:
     """Bands between the lowest and the highest of some frequencies, at 1, 3, 10, 30 ... Hz, each
     with some lines.
-
-    Args:
-        hz: the lines.
     """
     low, high = float(np.min(hz)), float(np.max(hz))
     decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
@@ -110,11 +107,7 @@ def validate_in_frequency(
     Nothing is raised where that fails: the notes say so.
 
     Args:
-        problem: what was fitted.
         at: where the fit ended.
-        e: the evaluation there.
-        held: the flights held out.
-        feedback: whether inputs are used that follow the outputs.
     """
     estimator = at.layout.estimator
     if not held or not estimator.noise_spectrum:

@@ -92,9 +92,7 @@ def rates_against_modes(
     no mode matters, the natural frequency [Hz] of the fastest, else 0.
 
     Args:
-        problem: whose model it is.
         params: the model's Params, SI.
-        flight: the record.
         noise: sd by output, SI.
     """
     modes, hidden = _modes_that_show(problem, params, flight, _shown_from(flight, noise))
@@ -169,8 +167,6 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 
     Args:
         flight: says what the input does between samples, and who decided that.
-        name: of the input.
-        u: its samples.
     """
     if np.ptp(u) == 0:
         return None
@@ -228,10 +224,6 @@ def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | No
 
     A controller that runs faster than the log moves its input between the samples, by what it saw
     of the response there.
-
-    Args:
-        flight: the record.
-        name: of the input.
     """
     u = flight.inputs[name]
     # Held because somebody said so: then it is known between its samples.

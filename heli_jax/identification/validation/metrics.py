@@ -47,10 +47,6 @@ FAR = 1e4
 def diverges(m: Metrics, times: float = 10.0) -> bool:
     """Whether a simulation left what was measured: it is not finite, or its error has several
     times the variance of the signal.
-
-    Args:
-        m: of the simulation.
-        times: how many.
     """
     return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
@@ -122,7 +118,6 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
     Args:
         u: one signal (N,), any unit; NaN counts as its mean.
         residual: the other (N,), as the first.
-        lags: how many samples to either side, below N.
     """
     a, b = _centred(u), _centred(residual)
     n = a.size
@@ -256,12 +251,7 @@ _SEEN = 0.95
 
 
 def is_decimated(flight: Flight, output: str) -> bool:
-    """Whether an output was logged at a higher rate than the flight has.
-
-    Args:
-        flight: as it is fitted.
-        output: one of its outputs.
-    """
+    """Whether an output was logged at a higher rate than the flight has."""
     facts = None if flight.source is None else flight.source.facts.get((output, "output"))
     return facts is not None and facts.usual < _FEWER * flight.dt
 
@@ -271,7 +261,6 @@ def whiteness_in_band(innovations: np.ndarray, together: int) -> Whiteness:
 
     Args:
         innovations: (N,) over their standard deviations, NaN where nothing is measured.
-        together: how many signals are judged side by side.
     """
     found, seen = whiteness(innovations, together), np.isfinite(innovations)
     if found.white or np.mean(seen) < _SEEN:

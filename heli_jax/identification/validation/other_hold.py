@@ -38,11 +38,8 @@ def other_hold(
     in standard deviations; empty where nothing is told.
 
     Args:
-        problem: what is fitted.
         at: the point, with the layout and the numbers that it belongs to.
-        e: the evaluation there with the holds taken.
         sd: by name, SI; what J and the noise let expect unless given.
-        skip: unknowns that the data do not determine.
         in_doubt: only of inputs that their log let be taken as linear, since a command that changes
             at every sample looks the same; and nothing where an input acts on an output directly,
             which would need a program of its own, as long in compiling as that of the fit.
@@ -84,11 +81,6 @@ class LikelierHold(NamedTuple):
 def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> LikelierHold | None:
     """The problem with the inputs held that their log let be taken as linear, where the record
     bears that out beyond doubt; None where it does not, or where nothing was left to the log.
-
-    Args:
-        problem: what was fitted.
-        at: the optimum.
-        wider: by how much autocorrelated residuals widen intervals.
     """
     moving = [moving_inputs(problem, f, in_doubt=True) for f in problem.training]
     # Before anything is computed: most logs leave nothing open.
@@ -138,8 +130,6 @@ def moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]:
     """The inputs whose hold matters.
 
     Args:
-        problem: names them.
-        flight: says what they do.
         in_doubt: those alone whose log let a straight line be taken.
     """
     return {

@@ -66,8 +66,6 @@ def explained_by_estimates(
 
     Args:
         r: the flight's rows, in units of the fitted flights' noise.
-        J: their derivative.
-        information: of the fit.
     """
     A, b = information + J.T @ J, J.T @ r
     sizes = np.sqrt(np.diag(A))
@@ -92,8 +90,6 @@ def own_estimates(
         rows: the flight's, at some unknowns, in the noise that is left there.
         before: the same in a noise that knows nothing of how far the estimates are off.
         values: of the parameters [SI] there, and their slopes.
-        z: the unknowns at the fit's estimates.
-        fit: what they are compared with.
     """
     at = _step(rows(z), fit)
     if at is None:

@@ -92,9 +92,6 @@ def lines_of(
     """Whitened by the residual's autoregression; None of records too short or without a residual.
 
     Args:
-        e: measured less simulated.
-        J: its derivatives by the unknowns.
-        drives: what may drive what the model lacks.
         holes: the samples before which others are missing.
     """
     n = e.size - ORDER
@@ -163,11 +160,7 @@ class Residual(NamedTuple):
 
 
 def residual_of(records: Sequence[Lines]) -> Residual:
-    """The residual of one output, of which `strongest` asks.
-
-    Args:
-        records: those of the output.
-    """
+    """The residual of one output, of which `strongest` asks."""
     e, J, angles = (
         np.concatenate(each)
         for each in zip(*[(r.e, r.J, r.angles) for r in _lowest(records)], strict=True)
@@ -190,7 +183,6 @@ def strongest(
     """The strongest answer of the residual to a drive through a filter of a bank.
 
     Args:
-        records: those of one output.
         drives: columns of `Lines.drives` that are asked for.
         bank: damping of the filters and the logarithm between their frequencies.
         beside: columns whose answer through the same filter is taken off first.
@@ -247,7 +239,6 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
 
     Args:
         records: those of one output; of their drives nothing is asked.
-        k: how many of the unknowns, the first, are parameters.
     """
     e, J = (np.concatenate([record[i] for record in _lowest(records)]) for i in range(2))
     nuisances = directions(_real(J[:, k:]), _SAME) if J.shape[1] > k else np.zeros((2 * e.size, 0))
@@ -274,11 +265,7 @@ def pulled_away(records: Sequence[Lines], k: int) -> float:
 
 
 def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
-    """The step of the unknowns to where the whitened residual is least.
-
-    Args:
-        records: of all outputs.
-    """
+    """The step of the unknowns to where the whitened residual is least."""
     e = _real(np.concatenate([record.e for record in records])[:, None])
     J = _real(np.concatenate([record.J for record in records]))
     return _steps(J, np.zeros((len(J), 2)), e)[1]
@@ -322,7 +309,6 @@ def _asked(
 
     Args:
         filters: dampings and frequencies [rad a sample].
-        columns: that go through them.
         known: an orthonormal basis of the sensitivities; residuals have nothing of it.
         residual: whose products come second, of the columns beside first, then of each drive.
     """
@@ -380,7 +366,6 @@ def _gains(asked: _Asked, answers: Float[np.ndarray, "F c 2 r"]) -> Float[np.nda
     """Gains: the part of each residual's squares that a drive through a filter explains.
 
     Args:
-        asked: the products of the columns.
         answers: those with the residuals, of the columns beside first, then of each drive.
     """
     b = answers.shape[1] - asked.cross.shape[1]
@@ -437,7 +422,6 @@ def _responses(
 
     Args:
         filters: dampings and frequencies [rad a sample].
-        back: of a delay by one sample.
     """
     w, damping = (np.array([one[i] for one in filters]) for i in (1, 0))
     plain = ~np.isfinite(damping)

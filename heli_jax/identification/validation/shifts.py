@@ -78,11 +78,7 @@ class Lead(NamedTuple):
 
 
 def leads(flights: Sequence[tuple[str, Flight]]) -> list[Lead]:
-    """By flight and input the surest lead of an output.
-
-    Args:
-        flights: by what each is called.
-    """
+    """By flight and input the surest lead of an output."""
     surest: dict[tuple[str, str], Lead] = {}
     for label, flight in flights:
         for output, y in flight.outputs.items():
@@ -106,7 +102,6 @@ def led_by(
 
     Args:
         y: the output, NaN where nothing is measured.
-        inputs: by name, any unit.
         dt: [s].
     """
     moving = {n: u for n, u in inputs.items() if np.isfinite(u).all() and np.ptp(u) > 0}
@@ -231,10 +226,6 @@ def late_angles(
 ) -> list[tuple[str, str, str, Lateness]]:
     """By flight, rate and angle how much later the angle is, where that matters and the model has
     no filter and no delay behind either.
-
-    Args:
-        model: its axes name rates and angles.
-        flights: by what each is called.
     """
     known = {n.rsplit("_filter", 1)[0].rsplit("_late", 1)[0] for n in states_behind(model)}
     known |= dict(model.delay_lines).keys()
@@ -410,11 +401,6 @@ class Shift(NamedTuple):
 def input_shift(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
     """The inputs that the record places at another time; None where none is clear, where inputs are
     shifted or delayed by an unknown already, or where rows are no samples in time.
-
-    Args:
-        problem: what was fitted.
-        at: the optimum.
-        e: the evaluation there.
     """
     if not _in_time(at) or set(problem.free) & set(problem.model.delay_parameters):
         return None
@@ -542,11 +528,6 @@ def _in_units(at: Solution, e: Evaluation, step: np.ndarray) -> dict[str, float]
 def late_steps(problem: Problem, at: Solution, e: Evaluation) -> tuple[float, dict[str, float]]:
     """The longest time between samples [s] of inputs that move in steps in their logs, and by
     parameter how far half of it moves the estimate [SI]; (0, {}) where there is none.
-
-    Args:
-        problem: what is to be fitted.
-        at: the start values.
-        e: the evaluation there.
     """
     names = [n for n in stepped(problem.training) if _is_logged(problem, n)]
     if not (names and _in_time(at) and np.all(np.isfinite(e.J))):
@@ -564,11 +545,7 @@ def late_steps(problem: Problem, at: Solution, e: Evaluation) -> tuple[float, di
 
 
 def stepped(flights: Sequence[Flight]) -> tuple[str, ...]:
-    """The inputs that move in steps in their logs.
-
-    Args:
-        flights: whose holds were decided by the log.
-    """
+    """The inputs that move in steps in their logs."""
     names = [
         n
         for f in flights

@@ -167,7 +167,6 @@ def against_start(
     another flight shows, in which it moves the output further and the right way, goes before it.
 
     Args:
-        flights: by what each is called.
         simulated: by flight and output (N,), SI.
         sticks: by output the input that moves it, of `sticks_of`; of others any input may.
     """
@@ -275,12 +274,7 @@ class Oversized(NamedTuple):
 
 
 def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
-    """Angles and rates of a log that are too large to be in the unit that they are read in.
-
-    Args:
-        model: whose axes say which outputs are attitudes and rates.
-        flight: as read from a log.
-    """
+    """Angles and rates of a log that are too large to be in the unit that they are read in."""
     headings = {a.angle for a in axes_of(model) if a.rate == "r"} | {"psi", "yaw"}
     for name, signal in (flight.source.outputs if flight.source else {}).items():
         values = flight.outputs.get(name)
@@ -365,7 +359,6 @@ def inputs_in_other_units(
     """Inputs that look like degrees for radians, per cent for plain numbers, or the reverse.
 
     Args:
-        flights: by what each is called.
         simulated: at the start values, by flight and output (N,), SI.
         sticks: by output the input that moves it, of `sticks_of`; of others any input may.
     """

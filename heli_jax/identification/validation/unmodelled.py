@@ -83,11 +83,7 @@ class OwnSamples(NamedTuple):
 
 
 def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
-    """Where an output was sampled; None where too much of its own samples is missing.
-
-    Args:
-        seen: whether there is one, on the grid.
-    """
+    """Where an output was sampled; None where too much of its own samples is missing."""
     rows = np.flatnonzero(seen)
     if rows.size == seen.size:
         return OwnSamples(rows, 1)
@@ -133,9 +129,6 @@ def usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
 
     Args:
         at: where the fit ended.
-        e: what that tells.
-        i: the flight.
-        name: the output.
     """
     if name not in at.layout.outputs[i]:
         return False
@@ -156,8 +149,6 @@ def own_of(at: Solution, i: int, name: str) -> OwnSamples | None:
 
     Args:
         at: where the fit ended.
-        i: the flight.
-        name: the output.
     """
     return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
 
@@ -168,8 +159,6 @@ def of_one_clock(at: Solution, e: Evaluation, name: str) -> list[tuple[int, OwnS
 
     Args:
         at: where the fit ended.
-        e: what that tells.
-        name: the output.
     """
     flights = [(i, own_of(at, i, name)) for i in longest(at) if usable(at, e, i, name)]
     samples = [(i, own) for i, own in flights if own is not None]
@@ -181,7 +170,6 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
 
     Args:
         at: where the fit ended.
-        e: what that tells.
     """
     layout, data, noise, z = at
     if layout.estimator is OUTPUT_ERROR:
@@ -250,9 +238,6 @@ def drives(
 
     Args:
         at: where the fit ended.
-        e: what that tells.
-        i: the flight.
-        name: the output.
         moving: of `moving_inputs`.
     """
     inputs = naming.asdict(at.data.flights[i].inputs)
@@ -298,8 +283,6 @@ def changing(
     Args:
         at: where the fit ended.
         J: by flight and output (N, q) the derivative of the residual by all unknowns.
-        name: the output.
-        flights: those that are looked at.
     """
     k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
     t = np.linspace(-1.0, 1.0, sum(sizes))
@@ -311,12 +294,7 @@ def changing(
 
 
 def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
-    """With k further drives a record: what a change of each parameter in that record alone does.
-
-    Args:
-        lines: of each record.
-        k: how many of the unknowns, the first, are parameters.
-    """
+    """With k further drives a record: what a change of each parameter in that record alone does."""
     out = []
     for i, record in enumerate(lines):
         more = np.zeros((record.e.size, k * len(lines)), complex)
@@ -372,9 +350,6 @@ def unmodelled(
 
     Args:
         at: where the fit ended.
-        e: what that tells.
-        flights: what each is called.
-        coloured: whether the residuals in time are autocorrelated.
     """
     layout, nothing = at.layout, ([], (1.0, {}))
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):

@@ -56,7 +56,6 @@ def bode(flight: FittedFlight, baseline: Baseline | None) -> Panels:
     is, and thin as the continuous H(i omega). An estimated gain and time shift are included.
 
     Args:
-        flight: the fitted model at one flight.
         baseline: the RLS, whose input and output are taken; the first ones without it.
     """
     model, signals, dt = flight.model, flight.signals, sample_time(flight.signals)
@@ -333,12 +332,8 @@ def draw_response(
     """A measured response: gain and phase with 95 % intervals, and coherence.
 
     Args:
-        names: of the input and the output.
         omega: (k,) [rad/s]
         pair: with H, sd, coherence and picture, (k,) each, and half95 (`flight_responses.Pair`).
-        unit: of output over input.
-        note: below the title.
-        averages: independent ones.
         fits: transfer functions, each a label and its response (k,).
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))

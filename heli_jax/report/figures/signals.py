@@ -80,7 +80,6 @@ def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Panels
     """Every coefficient of the recursive least squares over time, the a's above the b's.
 
     Args:
-        baseline: the recursive least squares.
         log_start: time in the log of its flight's first sample [s], where there is a log.
     """
     n, history = baseline.order, baseline.history
@@ -136,8 +135,6 @@ def residual_correlation(
     input, with 99 % bands.
 
     Args:
-        signals: one flight, measured and simulated.
-        output: whose residual.
         together: how many residuals are tested side by side (Bonferroni, as in `whiteness`).
         test: of the fit, whose numbers the figure says; made here unless given.
     """
