@@ -55,7 +55,7 @@ def prepared(flights: list[Flight], **more: Any) -> Prepared:
     sd = tuple({n: np.float64(NOISE[n]) for n in sorted(f.outputs)} for f in flights)
     z = jnp.asarray(start_vector(layout, data, of))
     noise = Noise(sd, np.zeros(()))
-    level = layout.estimator.with_level(data, evaluate(layout, data, noise, z), noise)
+    level = layout.objective.noise_at_start(layout, data, evaluate(layout, data, noise, z), noise)
     return Prepared(of, layout, data, level, z)
 
 
@@ -97,7 +97,7 @@ def one_fit(seed: int, records: int, seconds: float) -> dict[str, Any]:
 def at_cost(of: Prepared, z: jax.Array) -> float:
     """The log-likelihood."""
     e = evaluate(of.layout, of.data, of.noise, z)
-    return of.layout.estimator.log_likelihood(of.layout, of.data, of.noise, e)
+    return of.layout.objective.log_likelihood(of.layout, of.data, of.noise, e)
 
 
 def table(fits: list[dict[str, Any]]) -> str:

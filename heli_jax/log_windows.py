@@ -21,7 +21,6 @@ from heli_jax.identification.design.windows import (
     window_samples,
 )
 from heli_jax.identification.fit import windows
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.numerics.white_noise import noise_guess
@@ -97,7 +96,7 @@ def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -
     flights = list(problem.training)
     # Filter error estimates the noise itself; parts of a split log are no flights of the file.
     same = len(stated) == len(flights) and any(stated)
-    if not same or estimator_of(problem.method).process_noise:
+    if not same or problem.noise_model == "disturbance":
         return windows(problem, length)
     guessed: list[str] = []
     every = labels(problem.training)

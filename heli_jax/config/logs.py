@@ -39,7 +39,7 @@ from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.row_clock import by_rate
 from heli_jax.flights.table import Table
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 
 _PULSE = (800.0, 2200.0)
 """us; what receivers and servos know"""
@@ -146,7 +146,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
 def _noise_given(experiment: Experiment) -> bool:
     """Whether filter error takes the outputs' stated noise as it is."""
     fit, disturbance = experiment.config.fit, experiment.config.disturbance
-    if fit is None or disturbance is None or not estimator_of(fit.method).process_noise:
+    if fit is None or disturbance is None or objective_of(fit.method).noise_model != "disturbance":
         return False
     return "sigma_y" in disturbance.fixed
 

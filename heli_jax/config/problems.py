@@ -21,7 +21,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located, nearest, require_known
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.read import require_moving_outputs, require_some_time
-from heli_jax.identification.methods import METHODS, estimator_of
+from heli_jax.identification.methods import METHODS, objective_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.linear_models.read import is_shipped
 from heli_jax.simulation.simulate import substeps_for
@@ -131,7 +131,7 @@ def _of_method(
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     # A fit that is asked for with windows says itself where its method has none.
-    asked = method == config.fit.method or estimator_of(method).windows
+    asked = method == config.fit.method or objective_of(method).noise_model == "white"
     shooting = config.fit.shooting if asked else None
     return {
         "model": model,
@@ -148,7 +148,7 @@ def _of_method(
 def _responses(experiment: Experiment) -> ResponseOptions:
     """Which frequency responses are fitted, where the method fits any."""
     config, method = experiment.config.frequency, experiment.config.fit
-    if method is not None and not estimator_of(method.method).fits_responses:
+    if method is not None and not objective_of(method.method).fits_responses:
         for key in ("pairs", "coherence"):
             # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
             if config is not None and getattr(config, key):
@@ -206,7 +206,7 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
                 f"{path}: fit.intervals.nuts: {package} is not installed, expected the extra "
                 "bayes: pip install 'heli_jax[bayes]'"
             )
-    in_frequency = estimator_of(config.method).noise_spectrum
+    in_frequency = objective_of(config.method).noise_model == "spectrum"
     if config.intervals.bootstrap and config.nuisance.time_shift and not in_frequency:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with fit.nuisance.time_shift, "
@@ -350,7 +350,9 @@ def _instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
         config: whose `instrument` may be meant for the start, or for a method of `also`.
     """
     others = [m for m in (config.start.method, *config.also) if m in METHODS]
-    if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
+    if objective_of(method).noise_model == "spectrum" or not any(
+        objective_of(m).noise_model == "spectrum" for m in others
+    ):
         return config.by_instrument
     return None
 

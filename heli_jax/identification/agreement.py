@@ -3,8 +3,7 @@
 import numpy as np
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions
+from heli_jax.identification.estimation.evaluation import Evaluation, directions
 from heli_jax.identification.result import Signals
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Layout
@@ -72,7 +71,7 @@ def whiteness_of(
             }
     else:
         errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
-        if layout.estimator.rows_are_samples and np.isfinite(e.J).all():
+        if layout.noise_model == "white" and np.isfinite(e.J).all():
             U, at = directions(e.J), 0
             for s, outputs in zip(signals, layout.outputs, strict=True):
                 for n in outputs:

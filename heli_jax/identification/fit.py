@@ -26,11 +26,11 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
 from heli_jax.identification.estimation.noise_covariance import first_noise, unless_stuck
+from heli_jax.identification.estimation.objective import noise_unknowns
 from heli_jax.identification.identifiability.analysis import Around
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.search import SearchResult, first_guess, search
@@ -83,7 +83,7 @@ def check(problem: Problem) -> Check:
     """
     _require_problem(problem)
     guess = _with_likely_gusts(problem)
-    noise = guess.layout.estimator.as_it_ends(guess.layout, guess.data, guess.noise)
+    noise = guess.layout.objective.noise_of_check(guess.layout, guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     c = context_of(problem, guess)
@@ -129,7 +129,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
         ValueError: the length fits no flight, no window may be used, or the simulation is not
             finite at the start values.
     """
-    if not estimator_of(problem.method).rows_by_flight:
+    if problem.noise_model == "spectrum":
         # Which part says most is asked of the simulation, whatever the fit goes by.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
     guess = _with_likely_gusts(problem)
@@ -221,7 +221,7 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
     assert c.optimum is not None
     # AIC and BIC count all that was estimated, and no disturbances that do not show: with sigma_w =
     # 0 the correlation time has no meaning either.
-    unknowns = layout.determined + layout.estimator.noise_unknowns(layout) - len(c.absent)
+    unknowns = layout.determined + noise_unknowns(layout) - len(c.absent)
     findings = diagnose(c)
     estimates = {n: c.estimates[n] for n in layout.free}
     doubted = distrusted(findings, estimates) if c.status != "not-converged" else {}
@@ -240,7 +240,7 @@ def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[st
         verdict_before=c.before,
         verdict=c.verdict,
         noise=c.noise,
-        log_likelihood=layout.estimator.log_likelihood(layout, data, noise, c.e),
+        log_likelihood=layout.objective.log_likelihood(layout, data, noise, c.e),
         unknowns=unknowns,
         signals=(*c.signals, *held.signals),
         metrics=c.metrics,

@@ -1,6 +1,6 @@
 """The methods of estimation by name: the one place where a new one is entered.
 
-A method is an `Estimator` (`estimation/estimator.py`) in a file of its own. Entries name it by
+A method is an `Objective` (`estimation/objective.py`) in a file of its own. Entries name it by
 module and object, so that a problem can be stated before anything that solves it is imported.
 """
 
@@ -14,7 +14,7 @@ class Method(NamedTuple):
     """One way to estimate."""
 
     home: str
-    """`module:object` of its Estimator"""
+    """`module:object` of its Objective"""
     label: str
     """as reports call it"""
 
@@ -23,17 +23,17 @@ class Method(NamedTuple):
 _ESTIMATION = "heli_jax.identification.estimation"
 
 METHODS = {
-    "output-error": Method(f"{_ESTIMATION}.output_error:ESTIMATOR", "output error"),
-    "filter-error": Method(f"{_ESTIMATION}.filter_error:ESTIMATOR", "filter error"),
-    "frequency-error": Method(f"{_ESTIMATION}.frequency_error:ESTIMATOR", "frequency error"),
+    "output-error": Method(f"{_ESTIMATION}.output_error:OBJECTIVE", "output error"),
+    "filter-error": Method(f"{_ESTIMATION}.filter_error:OBJECTIVE", "filter error"),
+    "frequency-error": Method(f"{_ESTIMATION}.frequency_error:OBJECTIVE", "frequency error"),
     "frequency-response": Method(
-        f"{_ESTIMATION}.frequency_response:ESTIMATOR", "frequency response"
+        f"{_ESTIMATION}.frequency_response:OBJECTIVE", "frequency response"
     ),
 }
 
 
-def estimator_of(method: str) -> Any:
-    """The Estimator of a method.
+def objective_of(method: str) -> Any:
+    """The Objective of a method.
 
     Typed Any since its class stands above this module in the order of imports.
 

@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.finding import found
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.result import Fit, Status
 from heli_jax.identification.validation.other_hold import likelier_hold
@@ -168,7 +168,7 @@ def choose(
         ValueError: a candidate is estimated by instrument.
     """
     for name, problem in problems.items():
-        method = estimator_of(problem.method)
+        method = objective_of(problem.method)
         # Responses by instrument have the likelihood of their errors.
         if method.by_instrument and not method.fits_responses and instruments_of(problem):
             raise ValueError(
@@ -396,7 +396,7 @@ def disturbed_sets(
     if len(names) < 2:
         raise ValueError(f"expected two disturbances or more to choose from, got {len(names)}")
     listed = ", ".join(names)
-    # A model with one disturbance, not the model without: the same estimator, the same noise and so
+    # A model with one disturbance, not the model without: the same objective, the same noise and so
     # a likelihood that can be set beside the others'.
     problems = {
         "no disturbance": _by_filter_error(problem, with_disturbance(model, names[0]), silent=True)

@@ -24,7 +24,7 @@ from heli_jax.identification.free import (
     check_free,
     warn_of_degrees,
 )
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
@@ -143,14 +143,19 @@ class Problem:
         for flight in self.flights:
             _check_flight(flight, self)
         _check_model(self)
-        refusal = estimator_of(self.method).refusal(self)
+        refusal = objective_of(self.method).refusal(self)
         if refusal is not None:
             raise ValueError(f"method {self.method}: {refusal}")
 
     @property
+    def noise_model(self) -> str:
+        """What the method takes the noise for (`Objective.noise_model`)."""
+        return objective_of(self.method).noise_model
+
+    @property
     def noise(self) -> dict[str, Free]:
         """The parameters of the disturbances that filter error estimates, with their starts."""
-        if not estimator_of(self.method).process_noise:
+        if self.noise_model != "disturbance":
             return {}
         # Of the size of the motion, and a second: a coarse search takes it from there.
         sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
@@ -166,7 +171,7 @@ class Problem:
     @property
     def noise_names(self) -> tuple[str, ...]:
         """The parameters of the disturbances that filter error estimates."""
-        if not estimator_of(self.method).process_noise:
+        if self.noise_model != "disturbance":
             return ()
         names = [n for d in disturbances_of(self.model) for n in (d.sigma, d.tau)]
         return tuple(n for n in names if n not in self.fixed_noise)
@@ -175,7 +180,7 @@ class Problem:
     def filtered_noise(self) -> dict[str, Free]:
         """By output the start of the sd of its sensor's noise where that came through on-board
         low-passes and the samples bear it out; filter error estimates it by itself."""
-        if not estimator_of(self.method).process_noise or self.noise_is_fixed:
+        if self.noise_model != "disturbance" or self.noise_is_fixed:
             return {}
         # A model's own parameter of that name is its own noise of that sensor.
         own = naming.names(self.model.Params)
@@ -190,7 +195,7 @@ class Problem:
     @property
     def noise_is_fixed(self) -> bool:
         """Whether the measurement noise is taken as stated."""
-        return estimator_of(self.method).process_noise and "sigma_y" in self.fixed_noise
+        return self.noise_model == "disturbance" and "sigma_y" in self.fixed_noise
 
     @functools.cached_property
     def push_scales(self) -> dict[str, float]:
@@ -269,12 +274,12 @@ class Problem:
 
 def _check_method(problem: Problem) -> None:
     model = problem.model
-    if problem.instrument and not estimator_of(problem.method).by_instrument:
+    if problem.instrument and problem.noise_model != "spectrum":
         raise ValueError(
             f"instrument: method {problem.method} takes no input by an instrument, expected "
             "frequency-error, frequency-response, or none"
         )
-    if not estimator_of(problem.method).process_noise:
+    if problem.noise_model != "disturbance":
         return
     if model.noise_intensity is None:
         raise ValueError(
@@ -319,7 +324,7 @@ def _check_windows(problem: Problem) -> None:
     ):
         raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
     # A filter corrects its state at every sample, which is what windows are for.
-    if not estimator_of(problem.method).windows:
+    if problem.noise_model != "white":
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
     # Nothing measured says where a window begins.
     if not problem.nuisance.initial_state:

@@ -17,7 +17,6 @@ from heli_jax.identification.estimation.multistart import FirstGuess, Search, na
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.identifiability.equivalents import same_responses
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -74,9 +73,7 @@ def _diverges(at: SearchState) -> bool:
     """True if the search failed, the simulation diverges at its start and windows are possible."""
     problem, guess = at.problem, at.guess
     possible = (
-        estimator_of(problem.method).windows
-        and problem.window is None
-        and problem.nuisance.initial_state
+        problem.noise_model == "white" and problem.window is None and problem.nuisance.initial_state
     )
     if bool(at.best.best.converged) or not possible:
         return False
@@ -127,7 +124,7 @@ def _needs_further_starts(at: SearchState) -> bool:
     layout, best = at.search.layout, at.best
     if at.drawn is not None or not layout.model.linear or layout.disturbance:
         return False
-    if layout.estimator.rows_are_samples:
+    if layout.noise_model == "white":
         # By the noise of the first guess: with the relaxed one each output would leave as much.
         e, noise = evaluate(layout, at.search.data, best.noise, best.best.z), at.guess.noise
         left = sum(
@@ -137,7 +134,7 @@ def _needs_further_starts(at: SearchState) -> bool:
         )
         explained = 1.0 - left / at.search.variation(noise)
         return not (bool(best.best.converged) and explained > _LITTLE)
-    return layout.estimator.noise_spectrum and left_stability(at.problem, at.search, best)
+    return layout.noise_model == "spectrum" and left_stability(at.problem, at.search, best)
 
 
 def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) -> bool:
@@ -207,7 +204,9 @@ def _same_responses(at: SearchState) -> list[StartPoint]:
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))
         e = evaluate(layout, search.data, best.noise, z)
-        points.append(StartPoint(layout.estimator.with_level(search.data, e, best.noise), z))
+        points.append(
+            StartPoint(layout.objective.noise_at_start(layout, search.data, e, best.noise), z)
+        )
     return points
 
 

@@ -11,7 +11,7 @@ from heli_jax.dynamics.disturbance import lacks_disturbance
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, sentences
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.methods import METHODS, estimator_of
+from heli_jax.identification.methods import METHODS, objective_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.follows_response import Feedback
@@ -260,7 +260,7 @@ class Fit:
     @property
     def overconfident(self) -> bool:
         """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
-        spectrum = estimator_of(self.method).noise_spectrum
+        spectrum = objective_of(self.method).noise_model == "spectrum"
         return not self.white and not self.coloured and not spectrum
 
     @property

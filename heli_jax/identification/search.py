@@ -3,20 +3,18 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from heli_jax.finding import found
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import significant_disturbances
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.multistart import (
     FirstGuess,
     Progress,
     Run,
     Search,
     StartRow,
-    first_optima,
     named_values,
     rank,
     table,
@@ -44,10 +42,10 @@ def first_guess(problem: Problem) -> FirstGuess:
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
-    begun = layout.estimator.begins_with(data)
+    begun = layout.objective.data_at_start(data)
     z = coarse_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
-    level = layout.estimator.with_level(data, e, noise)
+    level = layout.objective.noise_at_start(layout, data, e, noise)
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z, e = _in_free_motion(layout, data, noise, z, e)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
@@ -98,22 +96,26 @@ def search(
     """
     layout, data = guess.layout, guess.data
 
-    def points(noise: Noise, known: tuple[Any, Any]) -> Float[Array, "s q"]:
-        if starts is None:
-            return delay_start(problem, layout, guess.begun, noise, guess.z, known)[None]
-        return draw(layout, problem, guess.z, starts, seed)
+    known: Any = (guess.e.r, guess.e.J)
+    if starts is None:
+        points = delay_start(problem, layout, guess.begun, guess.noise, guess.z, known)[None]
+    else:
+        points = draw(layout, problem, guess.z, starts, seed)
 
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
     over = Search(problem, layout, data, first_steps)
-    first = first_optima(over, guess, points, report)
-    best = relax_noise_covariance(over, first.noise, min(first.optima, key=rank))
+    # Residuals at the first start are those of the first guess.
+    same = guess.begun is data and bool(np.array_equal(points[0], guess.z))
+    first = Search(problem, layout, guess.begun, first_steps)
+    optima = first.run(guess.noise, points, report, known=known if same else None)
+    best = relax_noise_covariance(over, guess.noise, min(optima, key=rank))
     over.max_steps = max_steps
     if layout.sigmas:
         best = significant_disturbances(over, best)
-    name = "start" if len(first.optima) == 1 else "starts"
-    runs = [Run(name, z, run) for z, run in zip(first.points, first.optima, strict=True)]
+    name = "start" if len(optima) == 1 else "starts"
+    runs = [Run(name, z, run) for z, run in zip(points, optima, strict=True)]
     chosen = min(runs, key=lambda run: rank(run.optimum))
     state = SearchState(problem, over, guess, best, starts, seed)
     for restart in RESTARTS:

@@ -14,7 +14,7 @@ from heli_jax import naming
 from heli_jax.analysis.spectra import COHERENT
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.held_out_agreement import LEVEL
@@ -67,11 +67,11 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     for name, estimate in fit.estimates.items():
         lines += _of_parameter(name, estimate, own_prior=problem.free[name].prior is not None)
     lines += _of_relations(fit)
-    estimator = estimator_of(fit.method)
     # With process noise estimated, a simulation departs from the record even with the true
     # parameters: the gates apply to the prediction one step ahead, and the simulation informs.
     # Where the noise's spectrum is estimated the fit simulates nothing either.
-    filtered = estimator.process_noise or estimator.noise_spectrum
+    noise_model = objective_of(fit.method).noise_model
+    filtered = noise_model != "white"
     sources = (
         (fit.metrics, "simulated", not filtered),
         (fit.one_step, "one step ahead", True),
@@ -84,7 +84,8 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
             lines += _of_agreement(name, m, source, judged=judged, fitted_mean=fitted_mean)
     lines += _of_held_out(fit)
     lines += _of_disturbance(fit)
-    lines += _of_whiteness(fit, f"whiteness of {estimator.errors}, p-value")
+    errors = "innovations" if noise_model == "disturbance" else "residuals"
+    lines += _of_whiteness(fit, f"whiteness of {errors}, p-value")
     lines += _of_excitation(problem, fit)
     return tuple(lines)
 
@@ -276,7 +277,7 @@ def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
     for name, w in fit.whiteness.items():
         remark = f"{w.lags} lags, {percent(w.outside, 1)} of them outside the 99 % band"
         lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
-    if not estimator_of(fit.method).noise_spectrum:
+    if objective_of(fit.method).noise_model != "spectrum":
         return lines
     why = "not asked: the noise's spectrum is estimated, and need not be white"
     return [line._replace(gate="", passed=None, remark=why) for line in lines]

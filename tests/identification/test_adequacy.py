@@ -180,8 +180,7 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
     ("vaf", "worse"), [(-0.3, True), (np.nan, True), (-0.05, False), (0.4, False)]
 )
 def test_flights_held_out_are_held_against_their_mean(monkeypatch, vaf, worse):
-    estimator = SimpleNamespace(process_noise=False, noise_spectrum=False)
-    at = SimpleNamespace(layout=SimpleNamespace(estimator=estimator))
+    at = SimpleNamespace(layout=SimpleNamespace(noise_model="white"))
     fitted = SimpleNamespace(at=at, held_out=HeldOut())
     monkeypatch.setattr(held_out, "pooled_metrics", lambda _: {"p": SimpleNamespace(vaf=vaf)})
     found = list(held_out.held_out_predicted(fitted))

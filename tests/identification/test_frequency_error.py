@@ -111,7 +111,7 @@ def test_the_noise_to_check_by_is_what_the_inputs_leave():
     problem = Problem(roll.model, params, [flight], free, method="frequency-error")
     layout = layout_of(problem, [flight])
     data, begun = data_of(problem, [flight], layout), first_noise(problem, [flight])
-    noise = layout.estimator.as_it_ends(layout, data, begun)
+    noise = layout.objective.noise_of_check(layout, data, begun)
     hz = np.arange(1, noise.whitening[0].shape[0] + 1) / (t.size * DT)
     true = np.abs(0.3 * scipy.signal.freqz(*slow, hz, fs=1 / DT)[1]) ** 2 + 3e-3**2
     found = 1.0 / np.abs(noise.whitening[0][:, 0, 0]) ** 2
@@ -152,7 +152,7 @@ def test_a_flight_is_cut_at_its_missing_samples():
         method="frequency-error",
     )  # fmt: skip
     layout = layout_of(problem, problem.training)
-    assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
+    assert layout.flight_facts[0].parts == ((0, 700), (701, 1200))
     data, noise = data_of(problem, problem.training, layout), first_noise(problem, [exact])
     at_truth = start_vector(layout, data, problem)
     lines = errors_of_lines(layout, data, noise, at_truth).errors
@@ -268,7 +268,7 @@ def test_errors_that_overflow_have_no_spectrum(tmp_path):
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise, z = first_noise(problem, problem.training), start_vector(layout, data, problem)
-    same, relaxed = layout.estimator.relax(layout, data, None, noise, z)
+    same, relaxed = layout.objective.relax(layout, data, noise, z)
     assert same is z
     assert np.isnan(relaxed.log_variance_ratio)
     assert relaxed.whitening is noise.whitening

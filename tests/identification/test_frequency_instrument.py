@@ -135,7 +135,7 @@ def moved_if_gone_on_with(found: Fit) -> float:
     q = len(layout.of_interest)
     J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)[:, :q]
     for _ in range(4):
-        z, noise = layout.estimator.relax(layout, data, None, noise, z)
+        z, noise = layout.objective.relax(layout, data, noise, z)
         z = optimise(layout, data, noise, z).z
     return float(np.linalg.norm(J @ np.asarray(z - found.reached.z)[:q]))
 

@@ -12,7 +12,7 @@ from heli_jax import Free, Nuisance, Prior, Problem, fit, models
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.identification.estimation import many_runs
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_ERROR
+from heli_jax.identification.estimation.filter_error import OBJECTIVE as FILTER_ERROR
 from heli_jax.identification.estimation.many_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.uncertainty.bootstrap import bootstrap, refit
@@ -119,7 +119,7 @@ def test_a_run_that_leaves_all_numbers_is_not_a_number():
 
 
 @pytest.mark.parametrize(
-    "changed", [{"shift": True}, {"windows": ((3, 50),)}, {"estimator": FILTER_ERROR}]
+    "changed", [{"shift": True}, {"windows": ((3, 50),)}, {"objective": FILTER_ERROR}]
 )
 def test_what_has_no_such_program(changed):
     layout, data, noise, _ = pieces(problem(one()))

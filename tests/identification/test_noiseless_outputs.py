@@ -31,7 +31,7 @@ def low_passed(y, hz):
 
 def found_of(process_noise, **outputs):
     flight = Flight(dt=DT, inputs={"lat": np.zeros(N)}, outputs=outputs)
-    layout = SimpleNamespace(estimator=SimpleNamespace(process_noise=process_noise))
+    layout = SimpleNamespace(noise_model="disturbance" if process_noise else "white")
     asked = SimpleNamespace(flights=[("flight 1", flight)], at=SimpleNamespace(layout=layout))
     return list(smoothed(asked))
 

@@ -15,15 +15,12 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations
-from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.directions import projected
 from heli_jax.identification.identifiability.sensitivity import relative_rows, verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout
+from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.unknowns.transforms import scale
 
 FREE = 1e-3
@@ -60,27 +57,6 @@ def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivi
     count = layout.first_nuisance - len(unknowns)
     shared = np.hstack([rows.sensitivity, rows.nuisances[:, :count]])
     return Sensitivity(unknowns, shared, rows.nuisances[:, count:])
-
-
-def row_places(layout: Layout, data: Data, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flight and the sample of each row of a `Sensitivity`, (n,) each; -1 for none.
-
-    Args:
-        count: of the rows. Behind those of the samples stand a filter's variances, one a sample, or
-            the defects between windows, which belong to a flight alone.
-    """
-    numbers = signal_numbers(layout, data)
-    flights = np.array([i for i, _ in signals(layout)])
-    begins = np.searchsorted(numbers, np.arange(flights.size))
-    of_samples = np.array([flights[numbers], np.arange(numbers.size) - begins[numbers]])
-    places = np.full((2, count), -1)
-    places[:, : numbers.size] = of_samples
-    if not layout.estimator.rows_are_samples and count >= 2 * numbers.size:
-        places[:, count - numbers.size :] = of_samples
-    elif layout.continuity is not None:
-        defects = [(windows - 1) * len(layout.states) for windows, _ in layout.windows]
-        places[0, numbers.size :] = np.repeat(np.arange(len(defects)), defects)
-    return places[0], places[1]
 
 
 # Any: of NumPy or of JAX.
@@ -184,7 +160,7 @@ def unstated_gusts(problem: Problem) -> list[str]:
     Args:
         problem: with its vehicle, where a size may be stated.
     """
-    if not estimator_of(problem.method).process_noise:
+    if problem.noise_model != "disturbance":
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]
     stated = {n: float(getattr(problem.vehicle, n)) for n in sizes}

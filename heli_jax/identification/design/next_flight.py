@@ -22,14 +22,12 @@ from heli_jax.identification.design.accuracy import (
     expected_sd,
     not_determined,
     own_unknowns,
-    row_places,
     sensitivity_at,
     together,
     triangle,
 )
 from heli_jax.identification.design.windows import DETERMINES
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution, layout_of
@@ -59,7 +57,7 @@ def look_at_missing(
     None where the method's rows are not samples of one output each.
     """
     # The rows of a filter's predictions belong to all outputs together, which say each other's.
-    if not at.layout.estimator.rows_are_samples:
+    if at.layout.noise_model != "white":
         return None
     have = {n for names in at.layout.outputs for n in names}
     lacking = [n for n in naming.names(problem.model.Outputs) if n not in have]
@@ -187,12 +185,12 @@ class Plan(NamedTuple):
 def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
     """Compare manoeuvres; None where nothing can be compared."""
     # A filter of a nonlinear model would be compiled for every candidate by itself.
-    if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
+    if not (at.layout.noise_model == "white" or at.layout.model.linear):
         return None
     # Rows that weigh all flights together do not say what one more would add, and those at
     # frequencies are none of samples.
-    estimator = at.layout.estimator
-    if not estimator.rows_by_flight or estimator.noise_spectrum:
+    objective = at.layout.objective
+    if objective.noise_model == "spectrum":
         return None
     # Of a simulation that diverges there is nothing to compare with.
     if not np.isfinite(e.J).all():
@@ -206,7 +204,7 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     if not candidates:
         return None
     now, each = sensitivity_at(problem, at.layout, e), _flown(problem, at, i, candidates, m)
-    flights, _ = row_places(at.layout, at.data, len(now.shared))
+    flights = objective.tags(at.layout, at.data, len(now.shared)).flight
     once_more = now.part(flights == i)
     lacking = not_determined(problem, at.layout, e)
     absent = np.array([u.name in lacking for u in now.unknowns])
@@ -274,7 +272,7 @@ def _flown(
         )
         data = at.data._replace(flights=(part,))
         s = sensitivity_at(problem, layout, evaluate(layout, data, noise, z))
-        each.append(s.part(row_places(layout, data, len(s.shared))[0] == 0))
+        each.append(s.part(layout.objective.tags(layout, data, len(s.shared)).flight == 0))
     return each
 
 

@@ -32,13 +32,11 @@ from heli_jax.identification.design.accuracy import (
     expected_sd,
     not_determined,
     own_unknowns,
-    row_places,
     sensitivity_at,
     together,
     triangle,
 )
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
@@ -283,13 +281,13 @@ def rank_windows(
     Raises:
         ValueError: the length fits no flight, or no window may be used.
     """
-    if at.layout.estimator.noise_spectrum:
+    if at.layout.noise_model == "spectrum":
         raise ValueError(
             f"windows: method {problem.method} has no rows in time to rank them by, expected "
             "output-error or filter-error"
         )
     samples = window_samples(problem, length)
-    if at.layout.estimator.rows_are_samples:
+    if at.layout.noise_model == "white":
         s, spans, notes = _simulated(problem, at, e, samples)
     else:
         s, spans, notes = *_filtered(problem, at, e, samples), ()
@@ -385,7 +383,7 @@ def _simulated(
     s = sensitivity_at(problem, layout, here)
     weights = _prior_weights(layout, cuts, problem.training, samples, shooting=shooting)
     s = s._replace(own=s.own / weights)
-    flight, k = row_places(layout, data, len(s.shared))
+    flight, _, k, _ = layout.objective.tags(layout, data, len(s.shared))
     # Half a window on where windows hold several cells; of one cell the second cut is.
     step, spans = max(samples // cell // 2, 1) * cell, {}
     for c, (i, first, last) in enumerate(cuts):
@@ -480,7 +478,7 @@ def _filtered(
 ) -> tuple[Sensitivity, dict[_Span, np.ndarray]]:
     """The rows of a filter over the whole record, by window: a filter forgets how it began."""
     s = sensitivity_at(problem, at.layout, e)
-    flight, k = row_places(at.layout, at.data, len(s.shared))
+    flight, _, k, _ = at.layout.objective.tags(at.layout, at.data, len(s.shared))
     own, spans = s.own.copy(), {}
     for i, f in enumerate(problem.training):
         own[flight == i] /= _share(samples, f)

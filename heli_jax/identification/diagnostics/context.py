@@ -17,7 +17,7 @@ from heli_jax.identification.agreement import (
     whiteness_of,
 )
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.filter_error import SECONDS, predictions_ahead
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
@@ -240,13 +240,13 @@ class Context:
         if not self.fitted:
             return None
         layout, data, noise, z = self.at
-        return layout.estimator.response_agreement(layout, data, noise, z)
+        return layout.objective.response_agreement(layout, data, noise, z)
 
     @cached_property
     def followed(self) -> dict[str, Followed]:
         """In frequency, by output what of its residual follows the excitation."""
-        estimator = self.at.layout.estimator
-        if not estimator.noise_spectrum or estimator.fits_responses:
+        objective = self.at.layout.objective
+        if objective.noise_model != "spectrum" or objective.fits_responses:
             return {}
         return residual_against_excitation(self.problem, self.at)
 
@@ -283,7 +283,7 @@ class Context:
         if layout.disturbance and set(layout.disturbance) <= set(self.absent):
             return None
         at = self.at
-        return layout.estimator.against_expected(layout, at.data, at.noise, self.e, at.z)
+        return layout.objective.expected_error(layout, at.data, at.noise, self.e, at.z)
 
     @cached_property
     def ahead(self) -> bool:
@@ -302,7 +302,7 @@ class Context:
         asked = self.arrived and self.explains and not (self.instruments or self.ahead)
         if not asked or self.follows:
             return [], (1.0, {})
-        coloured = self.errors.coloured and not self.at.layout.estimator.noise_spectrum
+        coloured = self.errors.coloured and self.at.layout.noise_model != "spectrum"
         names = [label for label, _ in self.flights]
         return unmodelled(self.at, self.e, names, coloured=coloured)
 
@@ -318,7 +318,7 @@ class Context:
     def unrelated(self) -> dict[str, float]:
         """In frequency, by output the probability that it follows the excitation by chance, where
         that is so of every output; else empty."""
-        if not (self.fitted and self.at.layout.estimator.noise_spectrum):
+        if not (self.fitted and self.at.layout.noise_model == "spectrum"):
             return {}
         p_values = outputs_against_excitation(self.problem)
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
@@ -447,7 +447,7 @@ class Context:
         layout, errors = self.at.layout, self.errors
         found = {k: v for k, v in self.estimates.items() if k not in layout.free}
         # A method that does not see initial states and biases has no interval of them.
-        if layout.estimator.nuisances_in_rows:
+        if layout.noise_model != "spectrum":
             numbers = (errors.quantiles, errors.wider)
             found |= self._bounded(flight_nuisances(self.problem, self.at, self.e, *numbers))
         gone = {n: without_disturbance(found[n], size=n in layout.sigmas) for n in self.absent}
@@ -483,4 +483,4 @@ class Context:
     @cached_property
     def rounding(self) -> bool:
         """Whether the numbers are rounding: a filter of too little noise."""
-        return self.at.layout.estimator.ill_conditioned(self.problem, self.e, self.noise)
+        return self.at.layout.objective.ill_conditioned(self.problem, self.e, self.noise)

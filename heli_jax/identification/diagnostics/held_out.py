@@ -14,9 +14,8 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
     if c.held_out.in_frequency is not None:
         yield from c.held_out.in_frequency.findings
         return
-    estimator = c.at.layout.estimator
     # With gusts in the model, or no simulation in the fit, a simulation says little.
-    if estimator.process_noise or estimator.noise_spectrum:
+    if c.at.layout.noise_model != "white":
         return
     for name, m in pooled_metrics(c.held_out.signals).items():
         # By more than chance makes of an output that does not respond.

@@ -6,7 +6,7 @@ from heli_jax.dynamics.model import axes_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.estimation.frequency_instrument import STRONG
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
@@ -37,7 +37,7 @@ def feedback_tested(c: Context) -> Iterator[Finding]:
 def inputs_follow_response(c: Context) -> Iterator[Finding]:
     """A closed loop, and what it does to estimates by this method."""
     present = [one for one in c.feedback if one.present]
-    estimator, names = estimator_of(c.problem.method), tuple(c.estimates)
+    objective, names = objective_of(c.problem.method), tuple(c.estimates)
     harmed = c.arrived and not c.independent and knows_no_gusts(c.problem)
     if not present:
         if harmed and is_unstable(c.problem, c.params, _HELD):
@@ -48,13 +48,13 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
         return
     # With disturbances in the model and white innovations the noise model is right, and the direct
     # estimate is unbiased in a closed loop too.
-    if estimator.process_noise and c.fitted and c.white:
+    if objective.noise_model == "disturbance" and c.fitted and c.white:
         return
-    code = "loop.feedback-filtered" if estimator.process_noise else FEEDBACK
+    code = "loop.feedback-filtered" if objective.noise_model == "disturbance" else FEEDBACK
     # Before a fit it is a doubt about the record; after one the residuals say whether it harms.
     severity = "note" if c.fitted and not harmed else "doubt"
     inputs = tuple(dict.fromkeys(one.input for one in present))
-    if estimator.by_instrument and set(inputs) <= set(c.stated_instruments):
+    if objective.noise_model == "spectrum" and set(inputs) <= set(c.stated_instruments):
         code, severity = "loop.excitation-logged", "ok"
     sure = min(present, key=lambda one: one.p_value)
     late = list(dict.fromkeys(one.input for one in present if not one.delay_known))

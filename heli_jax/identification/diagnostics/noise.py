@@ -25,8 +25,8 @@ def residuals_white(c: Context) -> Iterator[Finding]:
         return
     # By the correlation at one sample, which is the number that the sentence gives.
     worst = max((c.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    estimator, converged = c.at.layout.estimator, c.status != "not-converged"
-    allowed = estimator.noise_spectrum or c.errors.coloured
+    objective, converged = c.at.layout.objective, c.status != "not-converged"
+    allowed = objective.noise_model == "spectrum" or c.errors.coloured
     narrow = converged and not allowed
     yield found(
         TOO_NARROW if narrow else COLOURED,
@@ -34,7 +34,7 @@ def residuals_white(c: Context) -> Iterator[Finding]:
         *not_white,
         value=worst.lag1,
         distrusts=c.free if narrow and abs(worst.lag1) > _FAR_TOO_NARROW else (),
-        errors=estimator.errors,
+        errors="innovations" if objective.noise_model == "disturbance" else "residuals",
         outside=worst.outside,
         limit=_FAR_TOO_NARROW,
         allowed="the intervals allow for it" if converged and allowed else "",

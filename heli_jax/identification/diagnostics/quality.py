@@ -132,7 +132,7 @@ def quantisation(c: Context) -> Iterator[Finding]:
 
 def smoothed(c: Context) -> Iterator[Finding]:
     """Outputs that have no noise of a sensor."""
-    filtered = c.at.layout.estimator.process_noise
+    filtered = c.at.layout.noise_model == "disturbance"
     for label, flight in c.flights:
         names = noiseless(flight.outputs)
         if names:

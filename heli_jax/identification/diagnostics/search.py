@@ -45,7 +45,7 @@ def search_told(c: Context) -> Iterator[Finding]:
     if c.optimum is not None:
         names = [label for label, _ in c.flights]
         yield from c.optimum.notes
-        yield from c.at.layout.estimator.notes(c.at, c.e, names, c.rounding)
+        yield from c.at.layout.objective.findings(c.at, c.e, names, c.rounding)
 
 
 def prior_contradicted(c: Context) -> Iterator[Finding]:
@@ -85,6 +85,6 @@ def log_cautions(c: Context) -> Iterator[Finding]:
 
 def band_unused(c: Context) -> Iterator[Finding]:
     """A stated band that is none of the fit's."""
-    estimator, band = c.at.layout.estimator, c.problem.frequency.band
-    if band is not None and estimator.noise_spectrum and not estimator.fits_responses:
+    objective, band = c.at.layout.objective, c.problem.frequency.band
+    if band is not None and objective.noise_model == "spectrum" and not objective.fits_responses:
         yield found("frequency.band-unused", "note", low=band[0], high=band[1])

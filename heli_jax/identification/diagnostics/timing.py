@@ -59,7 +59,7 @@ def inputs_late(c: Context) -> Iterator[Finding]:
     layout, model = c.at.layout, c.problem.model
     if c.fitted:
         freed = layout.shift or set(model.delay_parameters) & set(c.free)
-        judged = c.arrived and c.explains and not layout.estimator.noise_spectrum
+        judged = c.arrived and c.explains and layout.noise_model != "spectrum"
         if freed or judged:
             return
     follow = {(one.flight, one.input) for one in c.feedback if one.present}

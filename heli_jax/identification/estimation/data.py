@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.simulated_flights import (
     simulated_at,
     with_biases,
 )
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -41,7 +41,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     def column(values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
 
-    by = estimator_of(problem.method).instrumented(problem, flights)
+    by = objective_of(problem.method).instrumented(problem, flights)
     follows = [None] * len(flights) if by is None else by
     numbers = Data(
         base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
@@ -136,7 +136,7 @@ def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
     """What is simulated at z."""
     # By the program that is to be compiled anyway, where that simulates on its way: one more for
     # the simulation alone would take longer than the derivatives that nobody asks for here.
-    if layout.estimator.rows_are_samples:
+    if layout.noise_model == "white":
         ones = tuple({n: np.ones((), z.dtype) for n in names} for names in layout.outputs)
         at = residual_and_jacobian(layout, data, Noise(ones, np.zeros((), z.dtype)), z)
         if at.simulated is not None:

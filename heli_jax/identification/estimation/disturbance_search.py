@@ -6,8 +6,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
@@ -122,7 +121,7 @@ def _without(
     z = optimum.best.z.at[at].set(np.log(smallest) - _NONE)
     # The rows are laid out about the level of their own innovations.
     alone = evaluate(layout, data, optimum.noise, z)
-    noise = layout.estimator.with_level(data, alone, optimum.noise)
+    noise = layout.objective.noise_at_start(layout, data, alone, optimum.noise)
     without = relaxed_from(search, noise, z)
     ratio = 2.0 * (log_likelihood_of(search, optimum) - log_likelihood_of(search, without))
     return without, ratio

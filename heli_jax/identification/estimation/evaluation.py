@@ -1,11 +1,13 @@
 """Everything that one point tells, for what is not compiled."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
@@ -16,6 +18,28 @@ NULL = 1e-8
 a direction: the square of that is rounding in float64"""
 _TAKES_PART = 1e-3
 """part of a unit direction without effect from which on a coordinate is lost with it"""
+
+
+class Evaluation(NamedTuple):
+    """Everything that one point tells, as NumPy arrays."""
+
+    simulated: tuple[dict[str, np.ndarray], ...]
+    """with the bias, SI, by flight and output (N,)"""
+    raw: tuple[dict[str, np.ndarray], ...]
+    """measured - simulated, SI, by flight and output (N,); NaN where nothing is measured"""
+    state_rms: np.ndarray
+    """(flights, states) root mean square of each simulated state"""
+    innovations: tuple[Innovations, ...]
+    r: np.ndarray
+    """(n,) whitened residuals with the rows of the priors"""
+    J: np.ndarray
+    """(n, q) derivative of r by z"""
+    named: np.ndarray
+    """values of the named unknowns, in their units"""
+    slopes: np.ndarray
+    """their derivatives by their own coordinates"""
+    z: np.ndarray
+    """(q,) where it is"""
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
@@ -119,21 +143,3 @@ def pseudoinverse(J: np.ndarray) -> np.ndarray:
     # The triangle has the same singular values, and q rows instead of n.
     Q, R = np.linalg.qr(np.asarray(J, np.float64) / norms)
     return np.linalg.pinv(R, rcond=NULL) @ Q.T / norms[:, None]
-
-
-def least_share(part: np.ndarray, J: np.ndarray) -> float:
-    """Of what whitened rows tell of any combination of coordinates, the least that others tell.
-
-    Args:
-        part: the others (m, q).
-        J: the rows (n, q).
-    """
-    if not (np.isfinite(J).all() and np.isfinite(part).all()):
-        return 0.0
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
-    # Combinations that no row tells of are of neither.
-    kept = sizes > 1e-10 * sizes[0]
-    along = (part / norms) @ (right[kept].T / sizes[kept])
-    return float(np.linalg.svd(along, compute_uv=False)[-1] ** 2) if kept.any() else 0.0

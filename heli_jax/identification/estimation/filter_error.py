@@ -19,8 +19,7 @@ from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.kalman import (
     SMALL,
     Estimate,
@@ -41,6 +40,8 @@ from heli_jax.identification.estimation.noise_scales import (
     taken_up,
     with_own_noise,
 )
+from heli_jax.identification.estimation.objective import Objective, RowTags
+from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import (
     Drive,
@@ -48,6 +49,7 @@ from heli_jax.identification.estimation.simulated_flights import (
     measured_count,
     measured_signals,
     measurement_sd,
+    signal_numbers,
     signals,
 )
 from heli_jax.identification.problem import Problem
@@ -138,27 +140,24 @@ _ATTENUATES = 0.02
 """part by which the derivatives by scale errors change, from which on these move with them"""
 
 
-class FilterError(Estimator):
+class FilterError(Objective):
     """One-step predictions of an (extended) Kalman filter against the measured outputs."""
 
-    # Arguments of the methods: see `Estimator`.
-
-    errors = "innovations"
-    process_noise = True
-    shared_noise = True
-    # Each holds the common factor of all samples, and the variances have rows of their own.
-    rows_are_samples = False
-    # Small innovations alone are no fit: the variances that they are held against count too.
-    least_squares = False
+    noise_model = "disturbance"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """The innovations over their sd, and what makes their Jacobian Fisher's information."""
         by_flight = filtered_flights(layout, data, noise, u)
         return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
-    def one_program(self, layout: Layout) -> bool:
-        """A filter takes longer to evaluate than a step to be called for."""
-        return False
+    def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
+        """Return what the rows are: innovations, one row of the scale unless that is concentrated
+        out, and the variances of the same samples."""
+        tags = super().tags(layout, data, count)
+        n = int(tags.residual.sum())
+        for of_rows in tags[:3]:
+            of_rows[count - n :] = of_rows[:n]
+        return tags
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
         """With every sigma_w and sigma_y unknown their common factor is concentrated out, and every
@@ -173,7 +172,7 @@ class FilterError(Estimator):
         outputs = tuple(sorted({n for f in problem.training for n in f.outputs}))
         return outputs[concentrated:], concentrated
 
-    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+    def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """With a derivative by each scale error that is free and by the noise of what is
         integrated, which no relaxation has found yet."""
         noise = with_own_noise(problem, noise)
@@ -182,7 +181,7 @@ class FilterError(Estimator):
             return noise
         return noise._replace(scale_slopes=np.zeros(len(scales), noise.log_variance_ratio.dtype))
 
-    def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
+    def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level that the innovations show."""
         level = innovation_sums(e, noise)[1] / measured_count(data)
         # An unstable start: the optimiser has to find out of it by the rows themselves.
@@ -190,16 +189,16 @@ class FilterError(Estimator):
         return noise._replace(log_variance_ratio=np.asarray(level, noise.log_variance_ratio.dtype))
 
     def relax(
-        self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """All noise changes by one factor, that of the disturbance in z included, so that the
         optimum stays where it is."""
-        n = measured_count(data)
+        n, e = measured_count(data), evaluate(layout, data, noise, z)
         freedom = n / max(n - layout.determined, 1)
         squares, logs = innovation_sums(e, noise)
         level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
-            measured = self.row_signals(layout, data).size
+            measured = signal_numbers(layout, data).size
             slopes = slopes_at(layout, noise, e, measured)
             own = own_at(layout, data, noise, e, z, measured)
             return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes, own=own)
@@ -239,23 +238,6 @@ class FilterError(Estimator):
             return float(-0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs))
         return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
 
-    def noise_unknowns(self, layout: Layout) -> int:
-        """The common factor; the others stand in z."""
-        return int(layout.concentrated)
-
-    def deviance(self, layout: Layout, cost: np.ndarray | float, first: float, n: int) -> Any:
-        """With the scale concentrated out the cost is the variance, whose logarithm counts."""
-        return n * (np.log(cost / first) if layout.concentrated else cost - first)
-
-    def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
-        """The scale of all noise is integrated out together, unless it was given."""
-        if not layout.concentrated:
-            return -0.5 * jnp.sum(rows**2)
-        # As in `Estimator.log_density`, but with one scale for all rows together.
-        counted = [jnp.isfinite(y) for f in data.flights for y in f.outputs.values()]
-        n = jnp.sum(jnp.concatenate(counted).astype(rows.dtype))
-        return -0.5 * n * jnp.log(jnp.sum(rows**2))
-
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """Each run with a disturbance drawn anew."""
         return [
@@ -265,7 +247,7 @@ class FilterError(Estimator):
             for i in range(len(reached.data.flights))
         ]
 
-    def against_expected(
+    def expected_error(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float]:
         """By output, the power of the simulation's error over that which disturbance and noise
@@ -324,7 +306,9 @@ class FilterError(Estimator):
             or ratios.max() > _DIGITS
         )
 
-    def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
+    def findings(
+        self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
+    ) -> list[Finding]:
         """What is wrong with the filter, and the remedy."""
         if ill:
             return [found("search.ill-conditioned")]
@@ -448,7 +432,7 @@ def _root_mean_square(y: Array | np.ndarray) -> float:
     return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
 
 
-ESTIMATOR = FilterError()
+OBJECTIVE = FilterError()
 
 
 # Predictions some seconds ahead, from the state that a filter has estimated by then.

@@ -18,22 +18,14 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import (
-    Estimator,
-    Evaluation,
-    Nearing,
-    Residuals,
-)
-from heli_jax.identification.estimation.evaluation import least_share
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     as_instruments_have_it,
@@ -58,13 +50,14 @@ from heli_jax.identification.estimation.frequency_records import (
 )
 from heli_jax.identification.estimation.frequency_slopes import rows_of_lines
 from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
     condition_of,
     linearisation_notes,
 )
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
+from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
+from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -74,28 +67,15 @@ from heli_jax.identification.unknowns.layout import (
     Unknowns,
 )
 
-_FEW = 0.25
-"""part of the lines that a search begins with: a fraction of two, the same in all precisions"""
-_NEARLY_ALL = 0.9
-"""of what all lines tell of any combination of unknowns"""
-_MANY = 300_000
-"""numbers at all lines times unknowns, below which these take no time"""
 
-
-class FrequencyError(Estimator):
+class FrequencyError(Objective):
     """The model's response to the inputs against the measured outputs, at each frequency."""
 
-    rows_are_samples = False
-    nuisances_in_rows = False
-    noise_spectrum = True
-    rows_by_flight = False
-    relaxes_rows = False
-    least_squares = False
-    errors = "residuals"
-    by_instrument = True
-    # Evaluations are what a fit costs, and a spectrum is nearly the same half of a standard
-    # deviation away.
-    nearing = Nearing(0.3)
+    noise_model = "spectrum"
+
+    def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
+        """Rows are sums over the lines of all flights."""
+        return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """A row for each unknown of interest, and one for what is left of the errors.
@@ -113,7 +93,7 @@ class FrequencyError(Estimator):
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
 
-    def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
+    def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
         """Where all outputs are there, and about what the model is linearised."""
         return tuple(
             FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
@@ -125,60 +105,18 @@ class FrequencyError(Estimator):
         """By flight and input what of it follows the instruments."""
         return instrumented_inputs(problem, flights)
 
-    def one_program(self, layout: Layout) -> bool:
-        """Thousands of small matrices are inverted: a step is cheap to call for beside that."""
-        return False
+    def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """Add the spectrum of what is measured."""
+        return first_spectrum(noise, flights)
 
-    def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """A spectrum to begin with, that of what is measured."""
-        measured = []
-        for flight, sd in zip(flights, noise.sd, strict=True):
-            whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
-            for first, last in parts_of(flight):
-                measured.append(lines_of(whole[first:last]))
-        # As if all of it were noise: each frequency by its own size. White noise would give all
-        # the say to where the record is largest, gusts included.
-        whitening = whitening_alone(measured)
-        # Least squares at first: near that estimate the equations by instrument have one solution.
-        begun, all_lines = np.zeros(()), np.ones(())
-        return noise._replace(whitening=whitening, by_instrument=begun, part=all_lines)
-
-    def begins_with(self, data: Data) -> Data:
+    def data_at_start(self, data: Data) -> Data:
         """By instrument what follows the instruments, of inputs and outputs."""
         # The equations by instrument have other solutions, far from the least squares of these, and
         # what feedback makes of the signals as they were measured may lead to one.
         by = data.flights[0].by_instrument is not None
         return as_instruments_have_it(data) if by else data
 
-    def to_begin_with(
-        self,
-        layout: Layout,
-        data: Data,
-        noise: Noise,
-        z: Float[Array, " q"],
-        known: tuple[Array, Array],
-    ) -> tuple[Noise, tuple[Array, Array]]:
-        """The lowest frequencies alone, where these tell nearly all of every unknown.
-
-        Args:
-            known: residuals and Jacobian there with `noise`.
-        """
-        interest = len(layout.of_interest)
-        numbers = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
-        if numbers * interest < _MANY:
-            return noise, known
-        few = noise._replace(part=np.asarray(_FEW))
-        at = residual_and_jacobian(layout, data, few, z)
-        # Each line weighs by what was measured at it, the motion included: of the low frequencies,
-        # where there is most of it, this says rather too little.
-        J, part = (np.asarray(v)[:, :interest] for v in (known[1], at.J))
-        return (few, (at.r, at.J)) if least_share(part, J) > _NEARLY_ALL else (noise, known)
-
-    def whole(self, noise: Noise) -> Noise:
-        """All lines."""
-        return noise if noise.part >= 1.0 else noise._replace(part=np.ones(()))
-
-    def as_it_ends(self, layout: Layout, data: Data, noise: Noise) -> Noise:
+    def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
         """By instrument, where there is one; the noise is what the inputs leave of the outputs.
 
         That of the errors at the start values would hold all that is wrong with these.
@@ -190,23 +128,20 @@ class FrequencyError(Estimator):
         return noise._replace(by_instrument=np.ones(()))
 
     def relax(
-        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum that the errors show, smoothed over frequency and flights.
 
         Args:
-            e: None: it is not asked for.
         """
         errors, machine, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
-        part = float(noise.part)
-        errors = [v[: int(part * len(v))] for v in errors]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]
         # Powers of errors that overflow have no spectrum.
         with np.errstate(all="ignore"):
             try:
-                whitening = whitening_by(machine, errors, part)
+                whitening = whitening_by(machine, errors)
                 sound = all(np.isfinite(W).all() for W in whitening)
             except np.linalg.LinAlgError:
                 sound = False
@@ -218,8 +153,6 @@ class FrequencyError(Estimator):
         # Records of one length have one spectrum.
         by_id = {id(W): -2.0 * log_determinants(W) for W in whitening}
         logs = np.concatenate([by_id[id(W)] for W in whitening])
-        if part < 1.0:
-            whitening = _at_lowest(whitening, noise.whitening)
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
@@ -227,9 +160,9 @@ class FrequencyError(Estimator):
             rms = np.sqrt(np.mean(np.abs(own) ** 2, axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
         by = np.asarray(float(data.flights[0].by_instrument is not None))
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by, noise.part)
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
 
-    def with_nuisances(
+    def finish(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> Float[Array, " q"]:
         """Biases and initial states are in none of the rows: the simulation in time has them."""
@@ -253,19 +186,9 @@ class FrequencyError(Estimator):
         lines = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))
 
-    def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
-        """Of the whitened rows, the spectrum taken as it was estimated.
-
-        Args:
-            rows: those of the measurements, traced.
-        """
-        return -0.5 * jnp.sum(rows**2)
-
-    def noise_unknowns(self, layout: Layout) -> int:
-        """None that is counted: a smooth spectrum, and that of each candidate model its own."""
-        return 0
-
-    def notes(self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool) -> list[Finding]:
+    def findings(
+        self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
+    ) -> list[Finding]:
         """How much of flights with missing samples is used, where models were linearised, and what
         there is not by instrument.
         """
@@ -285,16 +208,19 @@ class FrequencyError(Estimator):
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
-def _at_lowest(
-    new: Sequence[Complex[np.ndarray, "k p p"]], old: Sequence[Complex[np.ndarray, "K p p"]]
-) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """By record the new whitening at the lowest lines and the old one beyond; of records that share
-    one the same array."""
-    made: dict[int, np.ndarray] = {}
-    for W, before in zip(new, old, strict=True):
-        if id(W) not in made:
-            made[id(W)] = np.concatenate([W, np.asarray(before)[len(W) :]])
-    return tuple(made[id(W)] for W in new)
+def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
+    """Return the noise with the spectrum of what is measured, as if all of it were noise.
+
+    White noise would give all the say to where the record is largest, gusts included.
+    """
+    measured = []
+    for flight, sd in zip(flights, noise.sd, strict=True):
+        whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
+        for first, last in parts_of(flight):
+            measured.append(lines_of(whole[first:last]))
+    whitening = whitening_alone(measured)
+    # Least squares at first: near that estimate the equations by instrument have one solution.
+    return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
 
 
-ESTIMATOR = FrequencyError()
+OBJECTIVE = FrequencyError()

@@ -73,7 +73,7 @@ def alike(layout: Layout, data: Data) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
-        facts = layout.of_flights[i : i + 1]
+        facts = layout.flight_facts[i : i + 1]
         key = (n, layout.outputs[i], layout.holds[i], facts, tuple(flight.known))
         # An offset of its own moves the point about which a flight is linearised.
         key = key if layout.model.linear else (i, *key)
@@ -120,7 +120,7 @@ def _machine(
 ) -> tuple[Matrices, Signals, Float[Array, " n"]]:
     i, flight = of
     data = data._replace(flights=_with(data.flights, i, flight))
-    condition = layout.of_flights[i].condition if layout.of_flights else None
+    condition = layout.flight_facts[i].condition if layout.flight_facts else None
     model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
     model, inputs, linear = between_samples(model, drive.inputs, drive.inputs, layout.hold(i))
     Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
@@ -185,10 +185,7 @@ def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f 
     return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
 
 
-# The lines of a record so many at a time, and how many of these blocks are gone through.
-#
-# What is made for one block stays in the processor's caches. How many are gone through is a number
-# like any other and not part of the program: a search may begin with the lowest ones alone.
+# The lines of a record so many at a time: what is made for one block stays in the caches.
 
 
 _NUMBERS = 20_000
@@ -203,8 +200,6 @@ class Blocks(NamedTuple):
     """of the record"""
     count: int
     size: int
-    last: Array
-    """lines that are used, from the lowest frequency"""
 
     def cut(self, v: Array, axis: int = 0) -> Array:
         """An array with an axis of lines, the blocks as its first axis; padded with zeros."""
@@ -221,24 +216,19 @@ class Blocks(NamedTuple):
         return jax.lax.slice_in_dim(v, 0, self.lines, axis=axis)
 
     def within(self, b: Array | int) -> Array:
-        """(size,) whether a line of a block is used."""
-        return b * self.size + jnp.arange(self.size) < self.last
+        """(size,) True for the lines of a block that are the record's."""
+        return b * self.size + jnp.arange(self.size) < self.lines
 
     def over(self, step: Callable[[Any, Any], Any], first: Any) -> Any:
-        """`step(b, so far)` for the blocks that are used, one after another."""
-        if self.count == 1:
-            return step(0, first)
-        used = -(-self.last // self.size)
-        return jax.lax.fori_loop(0, used, step, first)
+        """`step(b, so far)` for one block after another."""
+        return step(0, first) if self.count == 1 else jax.lax.fori_loop(0, self.count, step, first)
 
 
-def blocks_of(record: Record, part: Array, numbers: int) -> Blocks:
+def blocks_of(record: Record, numbers: int) -> Blocks:
     """Those of a record."""
     K = record.lines
     count = -(-K * numbers // _NUMBERS)
-    # So that a half and a quarter of the lines are whole blocks.
-    count = count if count == 1 else 4 * -(-count // 4)
-    return Blocks(K, count, -(-K // count), jnp.floor(part * K).astype(int))
+    return Blocks(K, count, -(-K // count))
 
 
 _NO_END = 1e-10
@@ -294,11 +284,9 @@ class Errors(NamedTuple):
     """measured less what the inputs add to the outputs past the states"""
 
 
-def resolved(
-    m: Matrices, record: Record, whitening: Complex[Array, "K p p"], part: Array
-) -> Resolved:
+def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
     """A machine at the lines of a record."""
-    blocks = blocks_of(record, part, m.C.size)
+    blocks = blocks_of(record, m.C.size)
     # Beyond the last line those that would follow it, so that nothing is singular there.
     k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
     z = np.exp(2j * np.pi * k / (record.samples + 2 * blocks.size))
@@ -531,7 +519,7 @@ def errors_of_lines(
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
 
         def ready(m: Matrices, parts: Any = parts) -> Any:
-            return m, [resolved(m, record, W, jnp.asarray(noise.part_used)) for record, W in parts]
+            return m, [resolved(m, record, W) for record, W in parts]
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> list[Any]:
             m, ats = common

@@ -289,13 +289,13 @@ def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
 
 
 def whitening_by(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], part: float = 1.0
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array."""
     size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
     size = np.where(size > 0, size, 1.0)
     scaled = [e / size for e in errors]
-    before = _before(machine, scaled, size, part)
+    before = _before(machine, scaled, size)
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], GUST_PART, least=GUST_LEAST
     )
@@ -324,7 +324,6 @@ def _before(
     machine: Machine,
     errors: Sequence[Complex[np.ndarray, "K p"]],
     size: Float[np.ndarray, " p"],
-    part: float,
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
     """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
     p = errors[0].shape[1]
@@ -332,7 +331,7 @@ def _before(
     flat = {K: np.broadcast_to(np.eye(p, dtype=complex), (K, p, p)) for K in lengths}
     with np.errstate(all="ignore"):
         of_length = {K: [e for e in errors if len(e) == K] for K in lengths}
-        at = {K: _cells(machine, of_length[K], size, part) for K in lengths}
+        at = {K: _cells(machine, of_length[K], size) for K in lengths}
         cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
         corners = corners_of(cells.f)
         # A line on a mode that does not decay has no finite response.
@@ -356,7 +355,6 @@ def _cells(
     machine: Machine,
     errors: Sequence[Complex[np.ndarray, "K p"]],
     size: Float[np.ndarray, " p"],
-    part: float,
 ) -> _Cells:
     """A cell around each knot of records of one length."""
     K = len(errors[0])
@@ -365,7 +363,7 @@ def _cells(
     power = summed_powers(np.stack(errors)) / len(errors)
     count = np.diff(np.append(edges, K)).astype(float)
     power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
-    f = part * (at + 1) / (2 * K + 1)
+    f = (at + 1) / (2 * K + 1)
     Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
     n = len(Ad)
     z = np.exp(2j * np.pi * f)[:, None, None]

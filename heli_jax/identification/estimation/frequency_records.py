@@ -78,7 +78,7 @@ def parts_of(flight: Flight) -> tuple[tuple[int, int], ...]:
 
 def records_of(layout: Layout) -> list[Record]:
     """All records, flight after flight."""
-    return [Record(i, a, b) for i, facts in enumerate(layout.of_flights) for a, b in facts.parts]
+    return [Record(i, a, b) for i, facts in enumerate(layout.flight_facts) for a, b in facts.parts]
 
 
 def without_parts(flights: Sequence[Flight]) -> str | None:
@@ -115,7 +115,7 @@ def other_outputs(flights: Sequence[Flight]) -> str | None:
 def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]:
     """By flight that was cut, how much of it is used."""
     notes = []
-    for i, (flight, facts) in enumerate(zip(data.flights, layout.of_flights, strict=True)):
+    for i, (flight, facts) in enumerate(zip(data.flights, layout.flight_facts, strict=True)):
         parts = facts.parts
         n = next(iter(flight.outputs.values())).shape[0]
         used = sum(b - a for a, b in parts)

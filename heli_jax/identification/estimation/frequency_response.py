@@ -36,7 +36,7 @@ from heli_jax.analysis.response_agreement import (
 )
 from heli_jax.analysis.spectra import Windowed, window_transforms
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
@@ -47,7 +47,9 @@ from heli_jax.identification.estimation.frequency_lines import (
 )
 from heli_jax.identification.estimation.frequency_slopes import shared_of, with_shared
 from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
+from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
+from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
     back,
@@ -399,16 +401,15 @@ def errors_in_windows(
     return jnp.concatenate([of_flight[i] for i in sorted(of_flight)])
 
 
-class FrequencyResponse(Estimator):
+class FrequencyResponse(Objective):
     """The model's frequency responses against those of the flights together."""
 
-    rows_are_samples = False
-    least_squares = False
-    nuisances_in_rows = False
-    noise_spectrum = True
+    noise_model = "spectrum"
     fits_responses = True
-    by_instrument = True
-    errors = "residuals"
+
+    def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
+        """Rows are responses of all flights together."""
+        return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """The whitened errors of all responses, real and imaginary parts.
@@ -437,11 +438,7 @@ class FrequencyResponse(Estimator):
             return str(e)
         return None
 
-    def one_program(self, layout: Layout) -> bool:
-        """Windows are transformed: a step is cheap to call for beside that."""
-        return False
-
-    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+    def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """The weights to begin with, of what is measured.
 
         Args:
@@ -456,7 +453,7 @@ class FrequencyResponse(Estimator):
         return noise._replace(whitening=on_device(weights))
 
     def relax(
-        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum of what no response explains of the errors."""
         z = in_time(layout, data, noise, z)
@@ -481,18 +478,6 @@ class FrequencyResponse(Estimator):
         squares = float(np.sum(np.square(np.asarray(e.r)[: 2 * weights.used.size])))
         constant = weights.numbers * float(np.log(np.pi))
         return 2.0 * weights.log_determinant - 0.5 * squares - constant
-
-    def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
-        """Of the whitened rows, the spectrum taken as it was estimated.
-
-        Args:
-            rows: those of the measurements, traced.
-        """
-        return -0.5 * jnp.sum(rows**2)
-
-    def noise_unknowns(self, layout: Layout) -> int:
-        """None that is counted: a smooth spectrum, and that of each candidate model its own."""
-        return 0
 
     def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
         """Those that the noise's spectrum is taken from at the lines used."""
@@ -581,4 +566,4 @@ def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple
     return tuple(sd)
 
 
-ESTIMATOR = FrequencyResponse()
+OBJECTIVE = FrequencyResponse()

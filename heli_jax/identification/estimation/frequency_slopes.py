@@ -195,7 +195,7 @@ def products_of_lines(
             return (
                 m,
                 dm,
-                [resolved(m, record, W, jnp.asarray(noise.part_used)) for record, W in parts],
+                [resolved(m, record, W) for record, W in parts],
             )
 
         def of_some(common: Any, some: Any, parts: Any = parts) -> Products:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 

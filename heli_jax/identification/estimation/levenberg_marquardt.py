@@ -20,7 +20,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import stages
-from heli_jax.identification.estimation.estimator import Nearing
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
 from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
@@ -299,10 +298,6 @@ _REACH = 3.0
 """of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
 
 
-_WHOLE = 0.9
-"""part of the gain that a whole step of Gauss and Newton makes at least"""
-
-
 class Constants(NamedTuple):
     """What stays the same throughout one run."""
 
@@ -316,11 +311,6 @@ class Constants(NamedTuple):
     """how far one step may go, by unknown"""
     with_radius: Bool[Array, ""]
     """whether a refused step shortens the next ones, beside what damping does"""
-    damping: Float[Array, ""]
-    """of the first step, in the optimiser's units"""
-    unchecked: Float[Array, ""]
-    """gain, in joint standard deviations squared, of a step that is taken as the last one without
-    an evaluation of where it leads"""
 
 
 class _Rows(NamedTuple):
@@ -341,8 +331,6 @@ class State(NamedTuple):
     done: Bool[Array, ""]
     arrived: Bool[Array, ""]
     """whether it is done because it arrived"""
-    ahead: Float[Array, ""]
-    """what the last step, not evaluated, took off the sum of squares in the optimiser's units"""
 
 
 def _linear(xi: Array, rows: _Rows) -> tuple[Array, None]:
@@ -390,9 +378,7 @@ def begin(constants: Constants) -> State:
     rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
     shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
     solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
-    size = (1.0 / constants.damping).astype(xi.dtype)
-    solver = eqx.tree_at(lambda s: s.search_state.step_size, solver, size)
-    return State(xi, solver, jnp.asarray(False), jnp.asarray(False), jnp.zeros((), xi.dtype))
+    return State(xi, solver, jnp.asarray(False), jnp.asarray(False))
 
 
 def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
@@ -404,21 +390,10 @@ def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     fine = result == optx.RESULTS.successful
     gain = gain_ahead(new.f_info, constants.scaling.residual_norm)
-    foreseen = _fall(new.f_info, new.y_eval - xi)
-    # Damped or shortened, a step says that the parabola is not to be relied on.
-    whole = foreseen * constants.scaling.residual_norm**2 > _WHOLE * gain
-    last = (gain < constants.unchecked) & whole & fine
-    done |= (gain < ARRIVED) | last
-    xi = jnp.where(last, new.y_eval, xi)
-    stepped = State(xi, new, done | ~fine, done & fine, jnp.where(last, foreseen, 0.0))
+    done |= gain < ARRIVED
+    stepped = State(xi, new, done | ~fine, done & fine)
     # Side by side a run that is done stays, while the slowest goes on.
     return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), stepped, state)
-
-
-def _fall(f_info: Any, step: Float[Array, " q"]) -> Float[Array, ""]:
-    """What a step takes off the sum of squares, as the linear residuals have it."""
-    moved = f_info.jac.mv(step)
-    return -jnp.sum((2.0 * f_info.residual + moved) * moved)
 
 
 def point(constants: Constants, xi: Array) -> Array:
@@ -465,8 +440,7 @@ def _constants(z0: Array, units: Scaling, kinds: _Kinds) -> Constants:
     ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
     tikhonov = jnp.where(kinds.linear, ties, kinds.tikhonov)
     mask, reach = jnp.asarray(kinds.mask), jnp.asarray(kinds.reach)
-    one, none = jnp.ones((), z0.dtype), jnp.zeros((), z0.dtype)
-    return Constants(z0, units, tikhonov, mask, reach, jnp.asarray(True), one, none)
+    return Constants(z0, units, tikhonov, mask, reach, jnp.asarray(True))
 
 
 def _kinds_of(layout: Layout, dtype: np.dtype) -> _Kinds:
@@ -497,7 +471,7 @@ class Optimum(NamedTuple):
     converged: Array | np.ndarray
     """the optimiser's own word, and everything finite"""
     moved: Array | np.ndarray = np.asarray(np.inf)
-    """squared distance from the start in joint standard deviations; inf where it was not asked"""
+    """squared distance from the start in joint standard deviations; inf of several runs"""
 
 
 _SHOWN = 0.3
@@ -631,8 +605,7 @@ def _not_begun(q: int, dtype: np.dtype) -> _Standing:
     def shapes() -> _Standing:
         zeros = jnp.zeros(q, dtype)
         units, none = Scaling(zeros, jnp.ones((), dtype)), jnp.zeros(q, bool)
-        one = jnp.ones((), dtype)
-        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True), one, one)
+        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True))
         return _Standing(jnp.asarray(0), units, begin(constants))
 
     # Of NumPy: nothing is compiled for it.
@@ -670,6 +643,12 @@ def _in_blocks(
         steps = max(1, int(_SHOWN * (done - before) / spent))
 
 
+def _in_one_program(layout: Layout) -> bool:
+    """True if a whole run is compiled as one program: worth it where the rows take no longer to
+    evaluate than a step takes to be called for, as the short recurrence of a linear model."""
+    return layout.noise_model == "white" and layout.model.linear
+
+
 def residual_and_jacobian(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> ResidualAndJacobian:
@@ -678,7 +657,7 @@ def residual_and_jacobian(
     Args:
         layout: what stands where in z.
     """
-    if layout.estimator.one_program(layout):
+    if _in_one_program(layout):
         # An array and not a number, which would be compiled in: without steps the program of a
         # whole run would then be another.
         begun, none = _not_begun(z.shape[0], z.dtype), nothing_trusted(layout)
@@ -689,8 +668,7 @@ def residual_and_jacobian(
 @jax.jit
 def _optimum(residual_norm: Array, state: State, z: Array, count: np.ndarray | int) -> Optimum:
     rows = state.solver.f_info.residual
-    cost = (jnp.sum(jnp.square(rows), axis=-1) - state.ahead) * residual_norm**2
-    cost = cost / jnp.asarray(count, cost.dtype)
+    cost = jnp.sum(jnp.square(rows), axis=-1) * residual_norm**2 / jnp.asarray(count, rows.dtype)
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z), axis=-1)
     moved = jnp.full_like(cost, jnp.inf)
     return Optimum(z, cost, state.solver.num_steps, state.arrived & finite, moved)
@@ -704,7 +682,6 @@ def optimise(
     max_steps: int = 200,
     *,
     held: np.ndarray | None = None,
-    nearing: Nearing | None = None,
     known: tuple[Array, Array] | None = None,
 ) -> Optimum:
     """The least-squares optimum from z0.
@@ -713,7 +690,6 @@ def optimise(
         layout: what stands where in z.
         z0: where to begin.
         held: (q,) whether an unknown stays at its start; none unless given.
-        nearing: how to end where another search follows; as near as it gets unless given.
         known: residuals and Jacobian at z0, where they are at hand.
     """
     free = np.ones(layout.size, bool) if held is None else ~held
@@ -725,7 +701,7 @@ def optimise(
     at: Any = z0  # of NumPy or JAX, which what is compiled takes alike
     trusted, steps, stayed = nothing_trusted(layout), 0, layout.size + 1
     while True:
-        limits = _Limits(max_steps - steps, trusted, held, nearing)
+        limits = _Limits(max_steps - steps, trusted, held)
         run = _run(layout, data, noise, at, limits, known)
         known = None
         steps, at = steps + int(run.optimum.steps), run.optimum.z
@@ -739,11 +715,9 @@ def optimise(
         trusted = trusted | trusted_columns(layout, evaluate, at, run.r, run.J)
         if not (awakened(np.asarray(run.unit), np.asarray(run.J), trusted) & free).any():
             break
-    optimum = run.optimum._replace(steps=np.asarray(steps))
-    if nearing is None:
-        return optimum
-    way = np.asarray(at) - np.asarray(z0)
-    return optimum._replace(moved=np.sum((np.asarray(run.J) @ way) ** 2))
+    with np.errstate(all="ignore"):  # a run that diverged moved by no number
+        moved = np.sum((np.asarray(run.J) @ (np.asarray(at) - np.asarray(z0))) ** 2)
+    return run.optimum._replace(steps=np.asarray(steps), moved=moved)
 
 
 class _Limits(NamedTuple):
@@ -755,7 +729,6 @@ class _Limits(NamedTuple):
     """(q,) the unknowns that may move however small their column is"""
     held: np.ndarray | None
     """(q,) those that stay"""
-    nearing: Nearing | None
 
 
 def _run(
@@ -773,11 +746,8 @@ def _run(
         z0: where to begin.
         known: residuals and Jacobian at z0, where they are at hand.
     """
-    (max_steps, trusted, held, nearing), count = (
-        limits,
-        measured_count(data) * np.asarray(noise.part_used),
-    )
-    if layout.estimator.one_program(layout) and held is None:
+    (max_steps, trusted, held), count = limits, measured_count(data)
+    if _in_one_program(layout) and held is None:
         end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
         _, units, state = end.standing
         optimum = _optimum(units.residual_norm, state, end.z, count)
@@ -793,9 +763,6 @@ def _run(
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
     constants = constants_of(layout, z0, scaling(r0, J0, trusted))
-    if nearing is not None:
-        unchecked, damping = (np.asarray(v, z0.dtype) for v in nearing)
-        constants = constants._replace(unchecked=unchecked, damping=damping)
     if held is not None:
         # Initial states alone, from far off: steps that are shortened end in the next valley (a
         # pendulum near the top of its swing).

@@ -22,8 +22,7 @@ from heli_jax.dynamics.jacobians import about, jacobians, linearised, point
 from heli_jax.dynamics.model import Model
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
@@ -190,7 +189,7 @@ def linearisation_notes(at: Solution, e: Evaluation, names: Sequence[str]) -> li
 def _trial(layout: Layout, data: Data, z: Array, i: int) -> _Trial:
     u = unpack(layout, data, z)
     own = driven(layout, data, u, i)
-    model, drive, rest = linear_drive(layout, own, layout.of_flights[i].condition)
+    model, drive, rest = linear_drive(layout, own, layout.flight_facts[i].condition)
     first = point(layout.model, drive.params)[0] if own.state is None else own.state
     A = jacobians(model, drive.params).A
     return _Trial(drive.params, drive.inputs, first, u.shift, A, rest)
@@ -274,7 +273,7 @@ def _rows(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
 
 
 def _note(layout: Layout, data: Data, i: int, left: _LeftOut) -> str:
-    flight, condition = data.flights[i], layout.of_flights[i].condition
+    flight, condition = data.flights[i], layout.flight_facts[i].condition
     n, dt = left.signal.shape[1], float(flight.dt)
     where = "its initial state, since the mean of its inputs has no equilibrium"
     if condition is not None:

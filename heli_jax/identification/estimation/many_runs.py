@@ -142,7 +142,7 @@ class FusedRuns:
 
 def _refused(layout: Layout) -> str | None:
     """Why a problem has no such program; None where it may have one."""
-    if type(layout.estimator) is not OutputError:
+    if type(layout.objective) is not OutputError:
         return "a method other than output error"
     if layout.shift:
         return "a time shift among the unknowns"

@@ -1,14 +1,14 @@
 """Where the optimiser starts and how it is run: a first guess, several starts, bounds."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.estimator import Evaluation, Nearing
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
@@ -68,19 +68,17 @@ class Search:
         points: Float[Array | np.ndarray, "s q"],
         progress: Progress | None = None,
         *,
-        nearing: Nearing | None = None,
         known: tuple[Array, Array] | None = None,
     ) -> list[Optimum]:
         """An optimum for each start, all in the coordinates of `layout`.
 
         Args:
             progress: called with a sentence after each of several starts.
-            nearing: how to end where another search follows; as near as it gets unless given.
             known: residuals and Jacobian at the first start, where they are at hand.
         """
         # One of them is taken out of NumPy's arrays in no time.
-        ends, points = (nearing, known), np.asarray(points)
-        runs = self._run(self.layout, noise, points, progress, ends)
+        points = np.asarray(points)
+        runs = self._run(self.layout, noise, points, progress, known)
         # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
         # good a place is.
         runs = [self._better_than_nothing(run, noise) for run in runs]
@@ -92,7 +90,7 @@ class Search:
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
             starts = np.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
-            again = self._run(self.bounded, noise, starts, progress, (nearing, None))
+            again = self._run(self.bounded, noise, starts, progress)
             for i, run in zip(left, again, strict=True):
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
         return runs
@@ -103,7 +101,7 @@ class Search:
         noise: Noise,
         points: np.ndarray,
         progress: Progress | None,
-        ends: tuple[Nearing | None, tuple[Array, Array] | None],
+        known: tuple[Array, Array] | None = None,
     ) -> list[Optimum]:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
@@ -116,8 +114,7 @@ class Search:
                 points[i],
                 self.max_steps,
                 held=self._held,
-                nearing=ends[0],
-                known=ends[1] if i == 0 else None,
+                known=known if i == 0 else None,
             )
             # z stays on the device, from where the next program takes it.
             run = jax.device_get(optimum)._replace(z=optimum.z)
@@ -132,7 +129,7 @@ class Search:
         layout = self.layout
         # Their weak priors alone would lead the initial states to zero: for a machine that is not
         # linear, with a rotor that stands still, a place from which no search in time comes back.
-        if layout.model.linear or layout.estimator.nuisances_in_rows:
+        if layout.model.linear or layout.noise_model != "spectrum":
             return None
         return np.arange(layout.size) >= layout.first_nuisance
 
@@ -261,43 +258,3 @@ class FirstGuess(NamedTuple):
     e: Evaluation
     begun: Data
     """what the first search goes by"""
-
-
-class FirstOptima(NamedTuple):
-    """Where each start led, and by what."""
-
-    search: Search
-    noise: Noise
-    points: Float[Array, "s q"]
-    optima: list[Optimum]
-
-
-def first_optima(
-    search: Search,
-    at: FirstGuess,
-    starts: Callable[[Noise, tuple[Any, Any]], Float[Array, "s q"]],
-    report: Progress | None = None,
-) -> FirstOptima:
-    """An optimum for each start, after which the noise is relaxed.
-
-    Args:
-        starts: makes them of the noise to begin with, and of residuals and Jacobian at the guess.
-        report: called with a sentence after each of several.
-    """
-    layout, estimator = at.layout, at.layout.estimator
-    r_J: tuple[Any, Any] = (at.e.r, at.e.J)
-    first = Search(search.problem, layout, at.begun, search.max_steps)
-    quick, quickly = estimator.to_begin_with(layout, at.data, at.noise, at.z, r_J)
-    points = starts(quick, quickly)
-
-    def run(noise: Noise, known: tuple[Array, Array]) -> list[Optimum]:
-        # Residuals at the first start are those of the first guess.
-        same = at.begun is at.data and bool(np.array_equal(points[0], at.z))
-        ends = known if same else None
-        return first.run(noise, points, report, nearing=estimator.nearing, known=ends)
-
-    optima = run(quick, quickly)
-    # What a part of the data leads to nowhere may be found by all of them.
-    if quick is not at.noise and not any(bool(o.converged) for o in optima):
-        quick, optima = at.noise, run(at.noise, r_J)
-    return FirstOptima(first, quick, points, optima)

@@ -9,37 +9,23 @@ from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
 from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
 from heli_jax.identification.free import Free
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise
 from heli_jax.numerics.white_noise import noise_guess
 
-_ROUNDS = 8
-"""of the optimiser at most"""
-_ROUNDS_OF_SPECTRA = 30
-"""the same where the noise is a spectrum: in slow gusts it settles by a fifth a round, of which
-the later ones are an evaluation or two"""
+_ROUNDS = 30
+"""of the optimiser at most: in slow gusts a spectrum settles by a fifth a round"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
-_DAMPING = 0.01
-"""of the first step of a search from an optimum with another noise, in the optimiser's units"""
-_SETTLED = 3e-3
-"""squared joint standard deviations by which another noise would move the optimum, below which the
-relaxation of a noise that is a spectrum has ended"""
-_NEARLY = 0.4
-"""the same where a search by more of the data follows"""
-_SLOWER = 3.0
-"""times the fall from one such move to the next may the following fall be"""
-_NEAR = 1.0
-"""such a move, above which the fall after it says nothing: what moves fast is then done, and what
-moves slowly is still to come"""
+_SETTLED = 1e-4
+"""move of the optimum, in squared joint standard deviations, below which it has ended as well"""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -69,7 +55,7 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
     Where an output has one noise in all flights, what is not stated is guessed from all of them.
     """
     noise = first_noise_sizes(problem, flights)
-    return estimator_of(problem.method).prepared_for(problem, noise, flights)
+    return objective_of(problem.method).first_noise(problem, noise, flights)
 
 
 def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
@@ -77,7 +63,7 @@ def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
     # The median: one flight in which an output hardly moves, or jumps, has no say.
-    if estimator_of(problem.method).shared_noise:
+    if problem.noise_model == "disturbance":
         outputs = {n for guess in guesses for n in guess}
         pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
         guesses = [{n: pooled[n] for n in guess} for guess in guesses]
@@ -90,78 +76,41 @@ def first_noise_sizes(problem: Problem, flights: Sequence[Flight]) -> Noise:
 
 
 def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> RelaxedOptimum:
-    """Alternate between the optimum and the noise until both stay.
+    """Alternate between the optimum and the noise until one of them stays.
 
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
 
     Args:
         noise: that `best` was found with.
     """
-    layout, estimator = search.layout, search.layout.estimator
+    layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]
-    # Where the first search began says nothing of the noise.
-    best, earlier = best._replace(moved=np.asarray(np.inf)), np.inf
-    if estimator.whole(noise) is not noise:
-        best, noise, rounds = _alternated(search, noise, best, earlier, nearly=True)
-        earlier, trace, noise = float(best.moved), [*trace, *rounds], estimator.whole(noise)
-        # From here on by all of the data: what a part of them said is no verdict.
-        best = best._replace(moved=np.asarray(np.inf), converged=np.asarray(True))
-    best, noise, rounds = _alternated(search, noise, best, earlier)
-    notes = _not_settled(best, len(rounds))
-    best = best._replace(z=estimator.with_nuisances(layout, search.data, noise, best.z))
-    return RelaxedOptimum(best, noise, (*trace, *rounds), notes=notes)
-
-
-def _not_settled(best: Optimum, rounds: int) -> tuple[Finding, ...]:
-    """Whether a spectrum still moved the optimum in the last of all its rounds."""
-    moved = float(best.moved)
-    if rounds < _ROUNDS_OF_SPECTRA or not bool(best.converged) or not _SETTLED <= moved < np.inf:
-        return ()
-    return (
-        found("search.noise-not-settled", value=moved**0.5, rounds=rounds, limit=_SETTLED**0.5),
-    )
-
-
-def _alternated(
-    search: Search, noise: Noise, best: Optimum, earlier: float, *, nearly: bool = False
-) -> tuple[Optimum, Noise, list[tuple[int, float]]]:
-    """Optimum and noise that stay, and steps and cost of each search.
-
-    Args:
-        noise: that `best` was found with.
-        earlier: how far the noise moved it the last time; inf where that is not known.
-    """
-    layout, estimator = search.layout, search.layout.estimator
-    trace: list[tuple[int, float]] = []
-    for _ in range(_ROUNDS if estimator.nearing is None else _ROUNDS_OF_SPECTRA):
-        e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
-        z, new = estimator.relax(layout, search.data, e, noise, best.z)
+    moved, notes = np.inf, ()
+    for _ in range(_ROUNDS):
+        z, new = objective.relax(layout, search.data, noise, best.z)
         change = _changed(noise, new)
         # Residuals that overflowed show no noise, and where they do is no optimum.
         if not np.isfinite(change):
             best = best._replace(converged=np.asarray(False))
             break
-        moves = estimator.noise_matters(search.problem, layout, noise, new)
+        moves = objective.noise_matters(search.problem, layout, noise, new)
         # The noise first and the parameters after it: the parameters of one round are the best for
-        # the noise of the round before, and where both stay they are so for each other.
+        # the noise of the round before, and where one stays so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        settled = _next_move(float(best.moved), earlier) < _SETTLED
-        if change < _UNCHANGED or settled or not bool(best.converged):
+        if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
             break
-        if not moves:
-            break
-        earlier = float(best.moved) if np.isfinite(best.moved) else earlier
-        # Near its optimum a search needs no damping, which would only take it longer.
-        nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
-        [best] = search.run(noise, _without_nuisances(layout, best.z)[None], nearing=nearing)
+        [best] = search.run(noise, _without_nuisances(layout, best.z)[None])
         trace.append((int(best.steps), float(best.cost)))
-        # With less than that the noise stays as well; by more than a prediction where it is that of
-        # the intervals.
         moved = float(best.moved)
-        if moved < _SETTLED or (nearly and _next_move(moved, earlier) < _NEARLY):
-            break
-    return best, noise, trace
+    else:
+        notes = (
+            found(
+                "search.noise-not-settled", value=moved**0.5, rounds=_ROUNDS, limit=_SETTLED**0.5
+            ),
+        )
+    best = best._replace(z=objective.finish(layout, search.data, noise, best.z))
+    return RelaxedOptimum(best, noise, tuple(trace), notes=notes)
 
 
 def _changed(noise: Noise, new: Noise) -> float:
@@ -174,24 +123,12 @@ def _changed(noise: Noise, new: Noise) -> float:
     return change + slopes_changed(noise, new) + float(own_changed(noise, new))
 
 
-def _next_move(moved: float, earlier: float) -> float:
-    """How far another noise would move the optimum, in squared joint standard deviations.
-
-    Args:
-        earlier: how far the one before it did; inf where that is not known.
-    """
-    # Moves get smaller less fast the later they are, by up to this much from one to the next. After
-    # a search that found no step that is not known.
-    falls = _SLOWER * moved / earlier if 0.0 < earlier <= _NEAR else 1.0
-    return moved * min(falls, 1.0)
-
-
 def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarray, " q"]:
     """z where a search goes by rows that nuisances have no part in, in which their weak priors
     alone would be a misfit."""
     # A model that is not linear is linearised where they put it.
     without = np.array(z)
-    if not layout.estimator.nuisances_in_rows and layout.model.linear:
+    if layout.noise_model == "spectrum" and layout.model.linear:
         without[layout.first_nuisance :] = 0.0
     return without
 
@@ -210,7 +147,7 @@ def log_likelihood_of(search: Search, optimum: RelaxedOptimum) -> float:
     """At an optimum and its noise."""
     layout, data = search.layout, search.data
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
-    return layout.estimator.log_likelihood(layout, data, optimum.noise, e)
+    return layout.objective.log_likelihood(layout, data, optimum.noise, e)
 
 
 # Whether a search that says so has arrived at an optimum.
@@ -271,7 +208,7 @@ def unless_stuck(
         optimum: where the search ended.
     """
     # A filter's rows hold the level of its variances too, and have no squares to take a share of.
-    if not (bool(optimum.best.converged) and layout.estimator.least_squares):
+    if not (bool(optimum.best.converged) and layout.noise_model == "white"):
         return optimum
     # What lies beyond a bound is a gain that no optimiser may take.
     at_bound = [

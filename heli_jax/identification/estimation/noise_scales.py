@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from heli_jax.identification.estimation.estimator import Estimator, Residuals
+from heli_jax.identification.estimation.objective import Objective
+from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.simulated_flights import (
     Run,
     joined_biases,
@@ -21,10 +22,8 @@ from heli_jax.identification.estimation.simulated_flights import (
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
 
-class OutputError(Estimator):
+class OutputError(Objective):
     """The simulation, driven by the logged inputs alone, against the measured outputs."""
-
-    windows = True
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """Signal after signal; with windows the defects between them follow.
@@ -76,4 +75,4 @@ def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> 
     return rows
 
 
-ESTIMATOR = OutputError()
+OBJECTIVE = OutputError()

@@ -1,7 +1,7 @@
 """The one residual: fit, identifiability and uncertainty all differentiate this function.
 
-The rows of the measurements are the method's (`estimator`); those of the priors, (value - mean) /
-sd, follow, then those of the weak priors.
+The rows of the measurements are the method's (`Objective.residuals`); those of the priors,
+(value - mean) / sd, follow, then those of the weak priors.
 """
 
 from typing import Any, NamedTuple
@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.estimator import Residuals
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.simulated_flights import SimulatedOutputs, outputs_of
+from heli_jax.identification.estimation.simulated_flights import Run, SimulatedOutputs, outputs_of
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 
@@ -22,6 +21,17 @@ from heli_jax.numerics.jitted import jitted
 #
 # Unknowns that no row shares get one direction of differentiation together ("colouring": Curtis,
 # Powell and Reid, 1974); the columns are told apart afterwards by the rows that they can reach.
+
+
+class Residuals(NamedTuple):
+    """What a method makes small."""
+
+    rows: Float[Array, " n"]
+    """whitened; zero where nothing is measured. Those of the priors are added to them"""
+    runs: tuple[Run, ...] | None
+    """by flight the simulated `Run`s on whose way the rows came; None where none was simulated"""
+    innovations: tuple[Innovations, ...] = ()
+    """by flight, where predictions one step ahead are what is compared"""
 
 
 class _Columns(NamedTuple):
@@ -38,7 +48,7 @@ def seeded(layout: Layout) -> np.ndarray | None:
     """The directions (q, colours) in which to differentiate; None where each is one unknown's."""
     # One window has no neighbour to share directions with. A filter's rows, through the scale that
     # is concentrated out, feel every unknown.
-    if not layout.estimator.rows_are_samples or sum(count for count, _ in layout.windows) < 2:
+    if layout.noise_model != "white" or sum(count for count, _ in layout.windows) < 2:
         return None
     colour = _columns(layout).colour
     seeds = np.zeros((layout.size, int(colour.max()) + 1))
@@ -155,7 +165,7 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
 def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Residuals]:
     """All rows: those of the measurements, then the priors'."""
     # The measurements' rows first: what asks for them alone need not know how many priors follow.
-    residuals = layout.estimator.residuals(layout, data, noise, unpack(layout, data, z))
+    residuals = layout.objective.residuals(layout, data, noise, unpack(layout, data, z))
     rows = [residuals.rows, prior_rows(layout, data, z), weak_rows(layout, z)]
     return jnp.concatenate(rows), residuals
 

@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     without_size,
 )
 from heli_jax.identification.estimation.residual import rows_of
-from heli_jax.identification.estimation.simulated_flights import predict
+from heli_jax.identification.estimation.simulated_flights import predict, signal_numbers
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
@@ -331,9 +331,9 @@ def _between(low: float, high: float, step: float) -> np.ndarray:
 def _step(layout: Layout, data: Data, J: np.ndarray, i: int) -> float:
     """The step between values of a delay [s], by how fast its effect on the rows changes."""
     dt = min(float(f.dt) for f in data.flights)
-    if not layout.estimator.rows_are_samples:
+    if layout.noise_model != "white":
         return dt
-    signal = layout.estimator.row_signals(layout, data)
+    signal = signal_numbers(layout, data)
     effect = np.asarray(J[: signal.size, i], np.float64)
     moves = np.diff(effect)[np.diff(signal) == 0]
     with np.errstate(all="ignore"):

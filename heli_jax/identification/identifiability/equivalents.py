@@ -14,8 +14,7 @@ import scipy.linalg
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import named
+from heli_jax.identification.estimation.evaluation import Evaluation, named
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.identifiability.combinations import combinations
 from heli_jax.identification.identifiability.verdict import Combination, SecondSolution, Unknown
@@ -343,7 +342,7 @@ def second_solutions(
     values = {n: values[n] for n in problem.free if n in values}
     # At the start values nothing has been fitted: any step would make the other the better one. Of
     # rows that are sums over frequencies none stays.
-    if len(values) < 2 or not (optimum or at.layout.estimator.rows_are_samples):
+    if len(values) < 2 or not (optimum or at.layout.noise_model == "white"):
         return ()
     finite = np.isfinite(e.r).all() and np.isfinite(e.J).all()
     if not (finite and all(map(math.isfinite, values.values()))):

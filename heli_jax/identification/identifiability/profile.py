@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate, pseudoinverse
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
@@ -155,8 +154,10 @@ def deviance_of(at: Solution, first: float, squares: float) -> float:
     if squares <= 0.0:
         return 0.0
     n = measured_count(at.data)
-    # Filter error has the noise at its best too, output error keeps it: the method says which.
-    deviance = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
+    # The cost is a mean over n. With the scale concentrated out it is the variance, whose logarithm
+    # counts.
+    cost, least = squares / n, first / n
+    deviance = n * (np.log(cost / least) if at.layout.concentrated else cost - least)
     return max(0.0, float(deviance))
 
 
@@ -310,7 +311,7 @@ def _open_at_rest(
     of the parameters. Where the data do not tell these states from rest, it may as well be none.
     """
     layout = at.layout
-    if not layout.estimator.nuisances_in_rows or any(count > 1 for count, _ in layout.windows):
+    if layout.noise_model == "spectrum" or any(count > 1 for count, _ in layout.windows):
         return []
     kinds = np.array([w.kind for w in weak_unknowns(problem, layout)])
     held = np.zeros(layout.size, bool)

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import NULL
+from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.analysis import NOTHING_ELSE, Around, analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict

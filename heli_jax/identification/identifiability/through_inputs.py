@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax.finding import Finding, found
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.identifiability.directions import projected
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.unknowns.layout import FlightData, Layout, Solution
@@ -58,7 +57,8 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     # Between the samples' rows and the priors' stand those of the innovations' variances, which
     # are noise too.
     priors = len(at.layout.free) + at.layout.size - at.layout.first_nuisance
-    J[at.layout.estimator.row_signals(at.layout, at.data).size : len(J) - priors] = 0.0
+    tags = at.layout.objective.tags(at.layout, at.data, len(J) - priors)
+    J[: len(J) - priors][~tags.residual] = 0.0
     if not np.isfinite(J).all():
         return None
     # Rounding of a column that is none, as that of a disturbance's size, would be scaled to one.

@@ -20,8 +20,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import NULL, deviations
+from heli_jax.identification.estimation.evaluation import NULL, Evaluation, deviations
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 

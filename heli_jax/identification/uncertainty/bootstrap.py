@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming, stages
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.frequency_error import ESTIMATOR as FREQUENCY_ERROR
+from heli_jax.identification.estimation.frequency_error import OBJECTIVE as FREQUENCY_ERROR
+from heli_jax.identification.estimation.frequency_error import first_spectrum
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
@@ -71,7 +72,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
             the noise's spectrum.
     """
     at, names = fit.reached, naming.names(fit.reached.layout.model.Inputs)
-    if at.layout.estimator.noise_spectrum:
+    if at.layout.noise_model == "spectrum":
         raise ValueError(f"refit: not available with method {fit.method}")
     if not records:
         raise ValueError("refit: expected one record at least, got none")
@@ -191,7 +192,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     if runs < 1:
         raise ValueError(f"bootstrap: expected at least 1 run, got {runs}")
     at = fit.reached
-    in_frequency = at.layout.estimator.noise_spectrum
+    in_frequency = at.layout.noise_model == "spectrum"
     if at.layout.shift and not in_frequency:
         raise ValueError("bootstrap: not available with a free time shift")
     if fit.not_identifiable:
@@ -219,7 +220,7 @@ def _records(
 ) -> tuple[dict[str, Array], ...]:
     """By flight and output (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
-    noise_free = at.layout.estimator.records(at, u, runs, seed)
+    noise_free = at.layout.objective.records(at, u, runs, seed)
     records = []
     each = zip(at.data.flights, at.noise.sd, noise_free, strict=True)
     for i, (flight, sds, outputs) in enumerate(each):
@@ -323,7 +324,7 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
 def _in_lines(at: Solution) -> tuple[Layout, Noise]:
     """Layout and noise by which the residual stands at the lines of whole records."""
     layout, data = at.layout, at.data
-    if layout.estimator is FREQUENCY_ERROR:
+    if layout.objective is FREQUENCY_ERROR:
         return layout, at.noise
     flights = [
         Flight(
@@ -337,8 +338,8 @@ def _in_lines(at: Solution) -> tuple[Layout, Noise]:
     if (why := without_parts(flights)) is not None:
         raise ValueError(f"bootstrap: {why}")
     facts = tuple(FlightFacts(parts_of(f), f.dt) for f in flights)
-    layout = dataclasses.replace(layout, estimator=FREQUENCY_ERROR, of_flights=facts)
-    noise, z = FREQUENCY_ERROR.prepared(at.noise, flights), at.z
+    layout = dataclasses.replace(layout, objective=FREQUENCY_ERROR, flight_facts=facts)
+    noise, z = first_spectrum(at.noise, flights), at.z
     for _ in range(_ROUNDS):
-        _, noise = FREQUENCY_ERROR.relax(layout, data, None, noise, z)
+        _, noise = FREQUENCY_ERROR.relax(layout, data, noise, z)
     return layout, noise

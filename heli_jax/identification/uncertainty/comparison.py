@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax.errors import require_kind
 from heli_jax.identification.identifiability.profile import Profile, profile
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
@@ -119,7 +119,7 @@ def _sentences(
 ) -> list[str]:
     sentences = []
     # In frequency both go by the noise's spectrum, as the intervals do.
-    white = fit.coloured and not estimator_of(fit.method).noise_spectrum
+    white = fit.coloured and objective_of(fit.method).noise_model != "spectrum"
     if white and any({"profile", "nuts"} & set(by) for by in by_parameter.values()):
         # Only what can be had: no bootstrap with a free time shift, no filter without an axis.
         bootstrap_too = booted is not None or not fit.reached.layout.shift

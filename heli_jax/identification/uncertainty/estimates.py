@@ -9,8 +9,12 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import sensor_noise
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import combined_deviations, deviations, evaluate
+from heli_jax.identification.estimation.evaluation import (
+    Evaluation,
+    combined_deviations,
+    deviations,
+    evaluate,
+)
 from heli_jax.identification.estimation.filter_error import innovation_sums
 from heli_jax.identification.estimation.simulated_flights import measured_count
 from heli_jax.identification.identifiability.sensitivity import unknowns_of

@@ -288,5 +288,5 @@ def log_posterior(
     rows = rows_of(layout, data, noise._replace(own=()), z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
     # The rows of the priors come last and have no scale to be integrated out.
-    measured = layout.estimator.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
+    measured = layout.objective.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
     return measured - 0.5 * jnp.sum(rest**2)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.analysis import Around, with_combinations
 from heli_jax.identification.identifiability.equivalents import Valley
 from heli_jax.identification.identifiability.profile import (
@@ -157,18 +157,16 @@ def _by_slopes(
 ) -> StandardErrors:
     """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
     estimated, the sandwich; the arguments are those of `standard_errors`."""
-    layout, estimator = at.layout, at.layout.estimator
+    layout, objective = at.layout, at.layout.objective
     usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
-    freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)
+    freedom = max(objective.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
     quantiles = np.full(layout.size, quantile)
-    # Rows that are dependent under white noise too say nothing by the residuals' whiteness.
-    white = white and estimator.rows_are_white
-    if white or not (usable and estimator.rows_are_samples):
+    if white or not (usable and objective.noise_model == "white"):
         verdict = verdict_of(problem, layout, e, around=around) if usable else before
         # Weighed by the noise's own spectrum, the bound allows for it as it stands.
-        allowed = usable and not white and estimator.noise_spectrum
+        allowed = usable and not white and objective.noise_model == "spectrum"
         return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
     errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.

@@ -18,7 +18,7 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise, with_sensor_noise
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.transforms import Real
@@ -94,8 +94,8 @@ class Layout(eqx.Module):
     """filter error: outputs whose sensor's noise came through on-board low-passes, of unknown sd"""
     scaled: tuple[str, ...] = eqx.field(static=True)
     """filter error: outputs whose noise has an unknown factor of its own"""
-    estimator: Any = eqx.field(static=True)
-    """the method's `Estimator`, whose class stands above this module"""
+    objective: Any = eqx.field(static=True)
+    """the method's `Objective`, whose class stands above this module"""
     concentrated: bool = eqx.field(static=True)
     """filter error: whether a common factor of all noise is taken out of the likelihood"""
     solver: str | None = eqx.field(static=True)
@@ -110,8 +110,13 @@ class Layout(eqx.Module):
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
     one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     """filter error: groups of flights that share the covariances of one Kalman filter"""
-    of_flights: tuple[Any, ...] = eqx.field(static=True, default=())
-    """by flight what the method takes of it before anything is traced (`Estimator.of_flights`)"""
+    flight_facts: tuple[Any, ...] = eqx.field(static=True, default=())
+    """by flight what the method takes of it before anything is traced (`Objective.flight_facts`)"""
+
+    @property
+    def noise_model(self) -> str:
+        """What the method takes the noise for (`Objective.noise_model`)."""
+        return self.objective.noise_model
 
     @property
     def of_interest(self) -> tuple[str, ...]:
@@ -196,8 +201,6 @@ class Noise(NamedTuple):
     by_instrument: Any = ()
     """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
     as it does until the search by instrument has somewhere to begin"""
-    part: Any = ()
-    """frequency error: the part of a record's lines, from the lowest, that is used"""
     scale_slopes: Any = ()
     """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
     unknown (k,), see `noisy_scales`; () where the model has none"""
@@ -205,11 +208,6 @@ class Noise(NamedTuple):
     """filter error: by parameter of a sensor model's own process noise the derivative of what the
     parameters of the mean take up by its logarithm, and that logarithm (2,), see
     `restricted_likelihood`; () where there is none"""
-
-    @property
-    def part_used(self) -> Any:
-        """Of the lines; 1 where a method has none."""
-        return 1.0 if isinstance(self.part, tuple) else self.part
 
 
 class Solution(NamedTuple):
@@ -245,8 +243,8 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         flights: those whose initial states, biases and offsets stand in z, in this order.
     """
     # All of it is hashable and static: two problems of one layout share their compiled programs.
-    estimator = estimator_of(problem.method)
-    scaled, concentrated = estimator.scaled_outputs(problem)
+    objective = objective_of(problem.method)
+    scaled, concentrated = objective.scaled_outputs(problem)
     nuisance = problem.nuisance
     return Layout(
         model=with_sensor_noise(problem.model, tuple(problem.filtered_noise)),
@@ -262,7 +260,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         disturbance=tuple(problem.noise),
         filtered=tuple(problem.filtered_noise),
         scaled=scaled,
-        estimator=estimator,
+        objective=objective,
         concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,
@@ -271,7 +269,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
         one_covariance=_one_covariance(problem, flights),
-        of_flights=estimator.of_flights(problem, flights),
+        flight_facts=objective.flight_facts(problem, flights),
     )
 
 
@@ -293,7 +291,7 @@ def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
 
 def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tuple[int, ...], ...]:
     """The flights of a linear model without missing samples, in groups of one covariance."""
-    if not (problem.model.linear and estimator_of(problem.method).process_noise):
+    if not (problem.model.linear and problem.noise_model == "disturbance"):
         return ()
     groups: dict[Any, list[int]] = {}
     for i, flight in enumerate(flights):

@@ -21,8 +21,7 @@ import numpy as np
 import scipy.special
 
 from heli_jax import naming
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
@@ -308,7 +307,7 @@ def gain_of_inputs(at: Solution, e: Evaluation) -> float:
 
 
 def _likelihood(at: Solution, data: Data, e: Evaluation) -> float:
-    return at.layout.estimator.log_likelihood(at.layout, data, at.noise, e)
+    return at.layout.objective.log_likelihood(at.layout, data, at.noise, e)
 
 
 def _moving(flight: FlightData) -> list[str]:

@@ -9,7 +9,6 @@ from heli_jax import naming
 from heli_jax.analysis.operating_point import modes_of_flight
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.validation.metrics import cross_correlation
 from heli_jax.messages import sentence
@@ -85,7 +84,7 @@ def advice_for(
         apart: whether other outputs are followed well: then this one's sensor is at fault, not the
             inputs, which all outputs share.
     """
-    name, filtered = output.output, estimator_of(problem.method).process_noise
+    name, filtered = output.output, problem.noise_model == "disturbance"
     correlation, at_start, lag = _agreement(problem, name, records)
     if min(correlation, at_start) < AGAINST:
         inputs = naming.names(problem.model.Inputs)

@@ -211,7 +211,7 @@ def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMo
         modes: of `fast_modes` at an optimum.
     """
     # A filter's rows hold the level of its variances too, and no squares to take a part of.
-    if not valley.at.layout.estimator.least_squares:
+    if valley.at.layout.noise_model != "white":
         return list(modes)
     values = dict(zip(valley.at.layout.of_interest, valley.e.named, strict=True))
     worse = max(SAME, _AS_GOOD * float(np.sum(np.square(np.asarray(valley.e.r, np.float64)))))

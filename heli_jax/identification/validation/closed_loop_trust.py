@@ -48,7 +48,7 @@ from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_noise import LEAST, machine_of, smoothed
 from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.follows_response import Feedback
@@ -100,9 +100,9 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
         at: where the fit ended.
     """
     layout = at.layout
-    if layout.estimator.fits_responses:
+    if layout.objective.fits_responses:
         return _of_responses(at)
-    if not layout.estimator.by_instrument:
+    if layout.noise_model != "spectrum":
         return {}
     lines = _lines(at)
     if not any(lines.direct):
@@ -147,7 +147,7 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
     if not direct.any():
         return {}
     # A method of the estimator: its module stands above this one in the order of imports.
-    E = np.asarray(layout.estimator.errors_in_windows(layout, data, noise, z))
+    E = np.asarray(layout.objective.errors_in_windows(layout, data, noise, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S = np.einsum("wka,wkb->kab", joint, np.conj(joint)) / len(joint)
     See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
@@ -185,7 +185,7 @@ def _held_poles(at: Solution) -> list[float]:
     """By flight |p| [rad/s] of the model's fastest unstable mode that the record would show, and
     does not: somebody holds it. 0 where there is none."""
     layout, data, *_, z = at
-    if not layout.estimator.by_instrument or layout.estimator.fits_responses:
+    if layout.noise_model != "spectrum" or layout.objective.fits_responses:
         return [0.0]
     with np.errstate(divide="ignore"):  # what a sample forgets altogether
         modes = np.log(np.linalg.eigvals(machine_of(layout, data, z).Ad).astype(complex))
@@ -258,9 +258,9 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
 
 def knows_no_gusts(problem: Problem) -> bool:
     """Whether a fit is one in time without gusts in its model."""
-    estimator = estimator_of(problem.method)
-    in_time = not (estimator.by_instrument or estimator.fits_responses)
-    return in_time and not estimator.process_noise
+    objective = objective_of(problem.method)
+    in_time = not (objective.noise_model == "spectrum" or objective.fits_responses)
+    return in_time and objective.noise_model != "disturbance"
 
 
 class _Lines(NamedTuple):
@@ -395,9 +395,9 @@ def weak_by_instrument(
         at: where the fit ended.
     """
     layout = at.layout
-    if not layout.estimator.by_instrument or not instruments_of(problem):
+    if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
-    if layout.estimator.fits_responses:
+    if layout.objective.fits_responses:
         shares = _shares_of_responses(problem, at)
         return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
     if at.data.flights[0].by_instrument is None:

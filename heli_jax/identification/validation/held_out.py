@@ -10,12 +10,11 @@ from jaxtyping import Array
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
-from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
@@ -48,8 +47,8 @@ def validate(
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
     # What no line of a spectrum knows, the initial states and biases, shows in time alone.
-    if not other.estimator.nuisances_in_rows:
-        other = replace(other, estimator=estimator_of("output-error"))
+    if other.objective.noise_model == "spectrum":
+        other = replace(other, objective=objective_of("output-error"))
     data = data_of(problem, held, other)
     # From any point a linear model's are found in one step, so zero, the middle of their weak
     # priors, will do.
@@ -59,7 +58,7 @@ def validate(
     full = jnp.concatenate([z[: layout.first_nuisance], begin])
     their_noise = _noise_of(problem, layout, noise, held)
     converged = True
-    if not layout.estimator.nuisances_in_rows:
+    if layout.noise_model == "spectrum":
         full = in_time(other, data, their_noise, full)
     elif other.size > layout.first_nuisance:
         adjust = _linear if problem.model.linear else _damped
@@ -79,9 +78,9 @@ def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight
     guess from their own records."""
     # A spectrum is that of flights with the same outputs, which those held out need not be; in time
     # it is not asked for.
-    in_rows = layout.estimator.nuisances_in_rows
+    in_rows = layout.noise_model != "spectrum"
     guess = first_noise(problem, held) if in_rows else first_noise_sizes(problem, held)
-    if not layout.estimator.shared_noise:
+    if layout.noise_model != "disturbance":
         return guess
     known = {n: s for flight in noise.sd for n, s in flight.items()}
     # An output that no fitted flight has keeps its guess.

@@ -31,8 +31,7 @@ from jaxtyping import Array, Complex, Float
 from heli_jax.analysis.response_agreement import expected_interval
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import deviations, named
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations, named
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_noise import (
@@ -109,8 +108,8 @@ def validate_in_frequency(
     Args:
         at: where the fit ended.
     """
-    estimator = at.layout.estimator
-    if not held or not estimator.noise_spectrum:
+    objective = at.layout.objective
+    if not held or objective.noise_model != "spectrum":
         return None
     q = len(at.layout.of_interest)
     J = np.asarray(e.J, float)[:, :q]
@@ -119,7 +118,7 @@ def validate_in_frequency(
     fitted = Fitted(J.T @ J, deviations(J), at.layout.of_interest, np.asarray(e.named))
     with np.errstate(all="ignore"):
         try:
-            judged = _by_responses if estimator.fits_responses else _by_lines
+            judged = _by_responses if objective.fits_responses else _by_lines
             found = judged(problem, at, fitted, held)
         except (ValueError, np.linalg.LinAlgError) as error:
             words = f"Held out: not judged in frequency: {error}"
@@ -394,17 +393,17 @@ def _responses_of(
         # What it was refused for.
         first_weights(problem, flights)
     z = _with_nuisances(problem, at, layout, data, noise)
-    z, noise = layout.estimator.relax(layout, data, None, noise, z)
+    z, noise = layout.objective.relax(layout, data, noise, z)
     count = 2 * noise.whitening.used.size
 
     def before(z: Array) -> Rows:
         return _rows(Solution(layout, data, noise, z), count)
 
     def rows(z: Array) -> Rows:
-        z, left = layout.estimator.relax(layout, data, None, noise, z)
+        z, left = layout.objective.relax(layout, data, noise, z)
         return _rows(Solution(layout, data, left, z), count)
 
-    agreement = layout.estimator.response_agreement(layout, data, noise, z, fitted=False)
+    agreement = layout.objective.response_agreement(layout, data, noise, z, fitted=False)
     assert agreement is not None
     added = explained_by_estimates(*before(z), fitted.information)
     chi = agreement.chi_squared - added / agreement.freedom

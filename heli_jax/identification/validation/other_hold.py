@@ -13,9 +13,13 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions, evaluate, pseudoinverse
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.estimation.evaluation import (
+    Evaluation,
+    directions,
+    evaluate,
+    pseudoinverse,
+)
+from heli_jax.identification.identifiability.profile import deviance_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 from heli_jax.numerics.jumps import split
@@ -90,9 +94,7 @@ def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> Likelie
     other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
     if not (_is_finite(e) and _is_finite(other)):
         return None
-    n = measured_count(at.data)
-    costs = [_least(one) / n for one in (e, other)]
-    gain = float(at.layout.estimator.deviance(at.layout, costs[0], costs[1], n))
+    gain = deviance_of(at, _least(other), _least(e))
     # Of residuals that are autocorrelated fewer samples are news.
     gain /= max(wider, 1.0) ** 2
     if not gain > _BEYOND_DOUBT:

@@ -29,8 +29,12 @@ from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.align import NotAligned, correlations, other_peak
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import is_low_passed
-from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import directions, evaluate, pseudoinverse
+from heli_jax.identification.estimation.evaluation import (
+    Evaluation,
+    directions,
+    evaluate,
+    pseudoinverse,
+)
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
@@ -493,7 +497,7 @@ def _is_logged(problem: Problem, name: str) -> bool:
 def _in_time(at: Solution) -> bool:
     """True if rows are samples in time that inputs move, and no free shift moves the inputs."""
     layout = at.layout
-    spectral = layout.estimator.noise_spectrum
+    spectral = layout.noise_model == "spectrum"
     return not (is_kinematic(layout.model) or layout.shift or spectral)
 
 

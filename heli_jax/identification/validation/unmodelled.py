@@ -21,14 +21,14 @@ from jaxtyping import Bool, Float
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.finding import HALF_INTERVAL
-from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import (
+    Evaluation,
     deviations,
     evaluate,
     pseudoinverse,
     simulated_outputs,
 )
-from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import signals
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.score_test import (
@@ -172,7 +172,7 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
         at: where the fit ended.
     """
     layout, data, noise, z = at
-    if layout.estimator is OUTPUT_ERROR:
+    if layout.objective is OUTPUT_ERROR:
         rows, J = {}, np.asarray(e.J)
         first = 0
         for i, n in signals(layout):

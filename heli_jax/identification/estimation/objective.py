@@ -1,0 +1,252 @@
+"""The objective that a method of estimation minimises, and what follows from it.
+
+A method is one class: its rows and what they are (tags), the noise and how it is relaxed, the
+likelihood, and the records that a bootstrap draws. The rest of the package asks only this: the
+optimiser squares and sums the rows, identifiability and intervals come from their Jacobian. The
+defaults are those of a simulation against samples with white noise. Methods are entered in
+`heli_jax.identification.methods`.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.analysis.response_agreement import ResponseAgreement
+from heli_jax.finding import Finding
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.residual import Residuals
+from heli_jax.identification.estimation.simulated_flights import (
+    least_noise,
+    measured_count,
+    signal_numbers,
+    signals,
+)
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
+
+NoiseModel = Literal["white", "disturbance", "spectrum"]
+
+
+class RowTags(NamedTuple):
+    """What each row of the measurements is, (n,) each; -1 where it is of no single one."""
+
+    flight: np.ndarray
+    signal: np.ndarray
+    """(flight, output), numbered as `signals` lists them"""
+    sample: np.ndarray
+    """of its flight"""
+    residual: np.ndarray
+    """True for a residual; False for what follows them: variances, defects"""
+
+
+def untagged(count: int) -> RowTags:
+    """Tags of rows that belong to no single flight."""
+    none = np.full(count, -1)
+    return RowTags(none, none, none, np.ones(count, bool))
+
+
+class Objective(abc.ABC):
+    """A method of estimation. It has no state: there is one object of each."""
+
+    noise_model: ClassVar[NoiseModel] = "white"
+    """what the likelihood takes the noise for. 'white': a simulation against samples, white noise
+    of each signal. 'disturbance': one-step predictions, with a disturbance that is estimated and
+    one white noise of each output. 'spectrum': numbers at frequencies, weighed by a spectrum that
+    is estimated; initial states and biases have no part in the rows"""
+    fits_responses: ClassVar[bool] = False
+    """True if frequency responses are fitted, as `Problem.frequency` states them"""
+
+    # What the method takes.
+
+    def refusal(self, problem: Problem) -> str | None:
+        """Return why the method cannot solve a problem and what can; None where it can."""
+        return None
+
+    def flight_facts(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
+        """Return what has to be known of each flight before anything is traced; hashable."""
+        return ()
+
+    def instrumented(
+        self, problem: Problem, flights: Sequence[Flight]
+    ) -> tuple[dict[str, np.ndarray], ...] | None:
+        """Return by flight and input the part that follows the instruments (N,), SI; None without
+        any."""
+        return None
+
+    def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
+        """Return the outputs whose noise is an unknown factor in z, and True if a common factor of
+        all noise is concentrated out of the likelihood instead."""
+        return (), False
+
+    # Its rows.
+
+    @abc.abstractmethod
+    def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
+        """Return the whitened rows of the measurements; traced, and differentiated forwards.
+
+        Args:
+            noise: the rows are divided by it.
+            u: the unknowns, in the units of the model.
+        """
+
+    def tags(self, layout: Layout, data: Data, count: int) -> RowTags:
+        """Return what the first `count` rows are: all that `residuals` returns."""
+        numbers = signal_numbers(layout, data)
+        flights = np.array([i for i, _ in signals(layout)])
+        begins = np.searchsorted(numbers, np.arange(flights.size))
+        tags = np.full((3, count), -1)
+        samples = np.arange(numbers.size) - begins[numbers]
+        tags[:, : numbers.size] = flights[numbers], numbers, samples
+        if layout.continuity is not None:
+            defects = [(windows - 1) * len(layout.states) for windows, _ in layout.windows]
+            tags[0, numbers.size :] = np.repeat(np.arange(len(defects)), defects)
+        return RowTags(tags[0], tags[1], tags[2], np.arange(count) < numbers.size)
+
+    # Its noise.
+
+    def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """Return the first guess of the noise as the method needs it.
+
+        Args:
+            noise: standard deviations by flight and output.
+            flights: those fitted, or those held out.
+        """
+        return noise
+
+    def noise_at_start(self, layout: Layout, data: Data, e: Evaluation, noise: Noise) -> Noise:
+        """Return the noise with what an evaluation at a start shows of it; the same object where
+        it shows nothing."""
+        return noise
+
+    def data_at_start(self, data: Data) -> Data:
+        """Return the data of the first search, where those measured would mislead it."""
+        return data
+
+    def noise_of_check(self, layout: Layout, data: Data, noise: Noise) -> Noise:
+        """Return the noise by which start values are judged before a fit; the same object unless
+        the fit ends with another."""
+        return noise
+
+    def relax(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> tuple[Float[Array, " q"], Noise]:
+        """Return z, and the noise that the residuals show there."""
+        n = measured_count(data)
+        # The unknowns fit part of the noise, which is missing in the residuals of every signal.
+        freedom = n / max(n - layout.determined, 1)
+        e = evaluate(layout, data, noise, z)
+        sd = [dict(by_output) for by_output in noise.sd]
+        for (i, name), errors in zip(signals(layout), errors_of(layout, e), strict=True):
+            y = np.asarray(data.flights[i].outputs[name])
+            size = max(self.scale(errors) * np.sqrt(freedom), least_noise(y))
+            sd[i][name] = np.asarray(size, y.dtype)
+        return z, Noise(tuple(sd), noise.log_variance_ratio)
+
+    def scale(self, errors: Float[np.ndarray, " n"]) -> float:
+        """Return the most likely scale of the noise of one signal."""
+        return float(np.sqrt(np.mean(np.square(errors))))
+
+    def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
+        """Return True if the optimum moves from one noise to another."""
+        return True
+
+    def finish(
+        self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+    ) -> Float[Array, " q"]:
+        """Return z at the end of a search, with the unknowns that have no part in the rows."""
+        return z
+
+    # Its likelihood.
+
+    def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
+        """Return the log-likelihood in SI units of the outputs, at the most likely noise where
+        that is estimated."""
+        total = 0.0
+        for v in errors_of(layout, e):
+            sd = self.scale(v)
+            total -= v.size * float(np.log(2.0 * np.pi * sd**2)) + float(np.sum((v / sd) ** 2))
+        return 0.5 * total
+
+    def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
+        """Return the log density of the rows but for a constant; traced. Scales that are estimated
+        are integrated out under Jeffreys' prior."""
+        # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2). Rows
+        # of missing samples are zero: they add nothing to S, and n leaves them out.
+        counts = [jnp.sum(jnp.isfinite(y)) for f in data.flights for y in f.outputs.values()]
+        n = jnp.stack(counts).astype(rows.dtype)
+        if self.noise_model == "white":
+            numbers = signal_numbers(layout, data)
+            S = jnp.zeros(n.size, rows.dtype).at[numbers].add(rows[: numbers.size] ** 2)
+            return -0.5 * jnp.sum(n * jnp.log(S))
+        S = jnp.sum(rows**2)
+        return -0.5 * (jnp.sum(n) * jnp.log(S) if layout.concentrated else S)
+
+    def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
+        """Return how many independent numbers the noise is estimated from."""
+        return measured_count(data)
+
+    # Records of its model, and how it is judged.
+
+    @abc.abstractmethod
+    def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
+        """Return by flight and output the signals without bias and noise: (N,), or (runs, N) where
+        a disturbance is drawn.
+
+        Args:
+            u: the unknowns at `reached`.
+            runs: how many records are drawn.
+            seed: of the draw.
+        """
+
+    def expected_error(
+        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
+    ) -> dict[str, float] | None:
+        """Return by output the power of the simulation's error over the power that disturbance and
+        noise explain; None where the simulation has to explain the record by itself."""
+        return None
+
+    def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
+        """Return True if the numbers at the optimum are rounding.
+
+        Args:
+            sd: of the measurement noise, SI, by 'flight/output'.
+        """
+        return False
+
+    def response_agreement(
+        self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
+    ) -> ResponseAgreement | None:
+        """Return how modelled and measured frequency responses agree, where these are fitted.
+
+        Args:
+            fitted: True if the unknowns were fitted to these flights.
+        """
+        return None
+
+    def findings(
+        self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
+    ) -> list[Finding]:
+        """Return what a reader should know of the method's own assumptions.
+
+        Args:
+            names: of the flights.
+            ill: True if the numbers are rounding.
+        """
+        return []
+
+
+def errors_of(layout: Layout, e: Evaluation) -> list[Float[np.ndarray, " n"]]:
+    """Return the errors of each signal, measured less simulated, SI, without missing samples."""
+    return [e.raw[i][name][np.isfinite(e.raw[i][name])] for i, name in signals(layout)]
+
+
+def noise_unknowns(layout: Layout) -> int:
+    """Return how many standard deviations of measurement noise are estimated beside z."""
+    # They count in AIC and BIC: models that need different noises differ in unknowns. A smooth
+    # spectrum is not counted, and each candidate model has its own.
+    return len(signals(layout)) if layout.noise_model == "white" else int(layout.concentrated)
