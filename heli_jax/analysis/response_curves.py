@@ -7,6 +7,7 @@ response rests on: the random errors of bins, or the parameters of a fit with th
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -261,24 +262,29 @@ def linear_responses(
         state: the model's initial state unless given.
         inputs: zeros unless given.
     """
+    slopes, (matrices, delays) = jax.device_get(
+        _with_slopes(model, params, tuple(names), state, inputs)
+    )
+    first = tuple(np.moveaxis(np.asarray(d), -1, 0) for d in slopes[0])
+    by_input = {n: (float(v), np.asarray(slopes[1][n])) for n, v in delays.items()}
+    return LinearResponses(model, tuple(np.asarray(M) for M in matrices), first, by_input)
+
+
+@eqx.filter_jit
+def _with_slopes(
+    model: Model, params: Any, names: tuple[str, ...], state: Any, inputs: Any
+) -> tuple[Any, Any]:
+    """Derivatives by the named parameters of matrices and delays, and both."""
     late = dict(model.delays)
 
     def of(values: Array) -> tuple[Any, Any]:
         here = naming.replace(params, **dict(zip(names, values, strict=True)))
-        matrices = tuple(jacobians(model, here, state, inputs))
         delays = {n: jnp.asarray(getattr(here, p), float) for n, p in late.items()}
-        return (matrices, delays), (matrices, delays)
+        both = tuple(jacobians(model, here, state, inputs)), delays
+        return both, both
 
-    values = jnp.stack([jnp.asarray(getattr(params, n), float) for n in names] or [jnp.zeros(())])
-    if names:
-        slopes, (matrices, delays) = jax.jacfwd(of, has_aux=True)(values)
-    else:
-        (matrices, delays), _ = of(values[:0])
-        slopes = jax.tree.map(lambda v: jnp.zeros((*v.shape, 0)), (matrices, delays))
-    matrices, delays, slopes = jax.device_get((matrices, delays, slopes))
-    first = tuple(np.moveaxis(np.asarray(d), -1, 0) for d in slopes[0])
-    by_input = {n: (float(v), np.asarray(slopes[1][n])) for n, v in delays.items()}
-    return LinearResponses(model, tuple(np.asarray(M) for M in matrices), first, by_input)
+    values = [jnp.asarray(getattr(params, n), float) for n in names]
+    return jax.jacfwd(of, has_aux=True)(jnp.stack(values) if values else jnp.zeros(0))
 
 
 class Acting(NamedTuple):

@@ -349,14 +349,15 @@ def _simulate(
     y: Float[np.ndarray, " N"],
 ) -> Float[np.ndarray, " N"]:
     """Hd driven by the whole input, started from the first measured outputs."""
-    from scipy.signal import lfilter, lfiltic
-
-    n = den.size - 1
     # The whole record and not one step ahead: where sampling is fast any model predicts the next
     # output well, since the last one is nearly the same.
-    begun = lfiltic(num, den, y[n - 1 :: -1], u[n - 1 :: -1])
+    n, simulated = den.size - 1, y.copy()
     with np.errstate(all="ignore"):  # an unstable Hd overflows
-        return np.concatenate([y[:n], lfilter(num, den, u[n:], zi=begun)[0]])
+        forced = np.convolve(u, num / den[0])
+        # A loop: importing scipy.signal takes longer than all of it.
+        for k in range(n, y.size):
+            simulated[k] = forced[k] - den[1:] @ simulated[k - n : k][::-1] / den[0]
+    return simulated
 
 
 def _continuous(
