@@ -154,7 +154,11 @@ _BEYOND_NOISE = (
 def _without_noise(run: FitRun) -> bool:
     """Whether filter error looked for noise to hold its innovations against, and found none."""
     searched = {*NOISES} & {*run.problem.free}
-    return run.fit.method == "filter-error" and bool(searched) and run.fit.status == "not-converged"
+    return (
+        run.problem.noise_model == "disturbance"
+        and bool(searched)
+        and run.fit.status == "not-converged"
+    )
 
 
 def _smooth(run: FitRun) -> bool:
@@ -217,7 +221,7 @@ def _drifting(run: FitRun) -> set[str]:
     """Outputs whose reconstruction drifts as far as noise that the gyros and accelerometers show
     makes it drift, each sample being foretold from those before."""
     fit = run.fit
-    if fit.method != "filter-error":
+    if run.problem.noise_model != "disturbance":
         return set()
     for n in {*NOISES} & {*fit.estimates}:
         # The search begins at what third differences show of the noise.

@@ -56,7 +56,7 @@ def problem(experiment: Experiment) -> Problem:
         for name, f in config.fit.free.items()
     }
     free, guess = _first_guesses(experiment, flights, free)
-    if config.fit.method == "filter-error":
+    if objective_of(config.fit.method).noise_model == "disturbance":
         _require_disturbance(experiment, "fit.method")
     of_method = _of_method(experiment, config.fit.method, flights, free)
     model = of_method["model"]
@@ -94,7 +94,8 @@ def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Probl
         InputError: filter error is asked for without a disturbance.
     """
     assert experiment.config.fit is not None
-    if "filter-error" in experiment.config.fit.also:
+    also = map(objective_of, experiment.config.fit.also)
+    if any(objective.noise_model == "disturbance" for objective in also):
         _require_disturbance(experiment, "fit.also")
     problems: dict[str, Problem | str] = {}
     for method in experiment.config.fit.also:
@@ -126,7 +127,7 @@ def _of_method(
     # Output error gets the bare model, whatever `disturbance` says: that section is then for
     # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
-    if method == "filter-error":
+    if objective_of(method).noise_model == "disturbance":
         model, params = disturbed(experiment)
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)

@@ -170,7 +170,11 @@ def choose(
     for name, problem in problems.items():
         method = objective_of(problem.method)
         # Responses by instrument have the likelihood of their errors.
-        if method.noise_model == "spectrum" and not method.fits_responses and instruments_of(problem):
+        if (
+            method.noise_model == "spectrum"
+            and not method.fits_responses
+            and instruments_of(problem)
+        ):
             raise ValueError(
                 f"{name}: an estimate by instrument has no likelihood to be compared by, expected "
                 "instrument=() or method='filter-error'"
