@@ -121,7 +121,9 @@ def fitted(folder, estimates, shares, status="converged", noise=0.005) -> Any:
     # Third differences show half the noise that was found, unless told otherwise.
     free = {"noise_gyro": SimpleNamespace(start=noise)}
     free["b_r"] = SimpleNamespace(prior=Prior(0.0, 0.05))
-    problem = SimpleNamespace(flights=config.read_flights(experiment), free=free, noise_model="disturbance")
+    problem = SimpleNamespace(
+        flights=config.read_flights(experiment), free=free, noise_model="disturbance"
+    )
     return SimpleNamespace(config=experiment, fit=fit, problem=problem)
 
 

@@ -54,7 +54,7 @@ __all__ = [
 
 
 def _with_likely_gusts(problem: Problem) -> FirstGuess:
-    """The first guess, with gusts of the greatest likelihood where nobody stated their size."""
+    """Return the first guess, with the most likely gusts where nobody stated their size."""
     guess = first_guess(problem)
     if not (unstated_gusts(problem) and guess.layout.disturbance):
         return guess
@@ -77,7 +77,7 @@ def _require_problem(problem: Any) -> None:
 
 
 def check(problem: Problem) -> Check:
-    """What the flights can determine at the start values, before any fit.
+    """Judge at the start values, before any fit, what the flights can determine.
 
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
@@ -99,14 +99,14 @@ def check(problem: Problem) -> Check:
 
 
 def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
-    """The problem at its start values, for diagnostics.
+    """Return the Context of a problem at its start values.
 
     Args:
         guess: of `first_guess`, where it is at hand already.
     """
     guess = guess or first_guess(problem)
-    # At the start values, since nothing else is known yet: where these are far off, what is
-    # determined there may differ from what is at the optimum, for which the fit asks again.
+    # Start values that are far off may determine other parameters than the optimum does. The fit
+    # analyses its optimum again.
     at = Solution(*guess[:4])
     second = second_solutions(problem, at, guess.e, optimum=False)
     around = Around(second=second, valley=Valley(problem, at, guess.e))
@@ -115,12 +115,12 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
 
 
 def rates(problem: Problem) -> tuple[Finding, ...]:
-    """Of the findings those on logging rates alone, which need no simulation."""
+    """Return the findings on logging rates, which need no simulation."""
     return tuple(of_rates(problem, first_noise(problem, problem.training).sd))
 
 
 def windows(problem: Problem, length: float | None = None) -> Ranking:
-    """What each window of the flights says of the free parameters, at the start values.
+    """Rank windows of the flights by their information on the free parameters at the start values.
 
     Args:
         length: of a window [s]; unless given a twelfth of the longest flight, between 2 and 20 s.
@@ -130,14 +130,14 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
             finite at the start values.
     """
     if problem.noise_model == "spectrum":
-        # Which part says most is asked of the simulation, whatever the fit goes by.
+        # Windows are ranked by the simulation, whatever the fit uses.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
     guess = _with_likely_gusts(problem)
     at = Solution(*guess[:4])
     ranking = rank_windows(problem, at, guess.e, length)
     c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = (*ranking.notes, *gusts_guessed(c))
-    # Of a record at rest for the most part nothing follows, and a window of it may say much.
+    # A record may be at rest for most of its time and still have a good window.
     asked = (rates_enough, nothing_follows, excited_bands, inputs_together)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
@@ -181,12 +181,12 @@ def fit(
     report = progress or (lambda _: None)
     with stage("first guess"):
         guess = first_guess(problem)
-    # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
+    # If the optimiser does not converge, this is all that is known of identifiability.
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"
     report(words)
-    # A model that is unstable where the search passes overflows, in time as in its powers; that is
-    # told by what is not finite, and no warning of NumPy's says it better.
+    # Simulations of an unstable model overflow on the way. The search handles numbers that are not
+    # finite, so NumPy need not warn.
     with stage(words), np.errstate(over="ignore", invalid="ignore"):
         ended = search(problem, guess, starts, seed, max_steps, report)
     timing = {"fit": time.perf_counter() - began}
@@ -198,7 +198,7 @@ def fit(
 def _where_ended(
     problem: Problem, guess: FirstGuess, before: Verdict, ended: SearchResult
 ) -> Context:
-    """What is known where the search ended."""
+    """Return the Context at the end of the search."""
     layout, data, optimum = ended.search.layout, ended.search.data, ended.optimum
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
     optimum = unless_stuck(layout, optimum, e, problem.free)
@@ -209,18 +209,18 @@ def _where_ended(
 
     c = context()
     if c.rounding:
-        # Of rounding no likelihood can be asked, by whatever asks further on.
+        # No diagnostic may use a likelihood that is rounding.
         optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
         c = context()
     return c
 
 
 def _result(c: Context, starts: tuple[StartRow, ...], seed: int, timing: dict[str, float]) -> Fit:
-    """All that a fit says."""
+    """Put the Fit together."""
     layout, data, noise, _ = c.at
     assert c.optimum is not None
-    # AIC and BIC count all that was estimated, and no disturbances that do not show: with sigma_w =
-    # 0 the correlation time has no meaning either.
+    # AIC and BIC count all that was estimated, but no disturbance that vanished: with sigma_w = 0
+    # the correlation time has no meaning either.
     unknowns = layout.determined + noise_unknowns(layout) - len(c.absent)
     findings = diagnose(c)
     estimates = {n: c.estimates[n] for n in layout.free}

@@ -32,13 +32,11 @@ from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
 
 _FIRST_STEPS = 40
-"""of filter error, until it is known that there is a disturbance to find"""
+"""of filter error, before the search knows that there is a disturbance"""
 
 
 def first_guess(problem: Problem) -> FirstGuess:
     """The problem at its start values, with a first guess of the noise."""
-    # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
-    # with both can a coarse search compare starts.
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
@@ -48,7 +46,7 @@ def first_guess(problem: Problem) -> FirstGuess:
     level = layout.objective.noise_at_start(layout, data, e, noise)
     if not any(np.ptp(u) > 0 for f in problem.training for u in f.inputs.values()):
         z, e = _in_free_motion(layout, data, noise, z, e)
-    # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
+    # The same object if the method keeps the noise: then nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
@@ -58,7 +56,7 @@ def first_guess(problem: Problem) -> FirstGuess:
 def _in_free_motion(
     layout: Layout, data: Data, noise: Noise, z: Array, e: Evaluation
 ) -> tuple[Array, Evaluation]:
-    """Unknowns whose initial states and biases come from the record, in which nothing else moves:
+    """Return unknowns with initial states and biases from the record, for records without input:
     from rest at zero no parameter would have any effect."""
     own = slice(layout.first_nuisance, layout.size)
     if not (layout.initial_state and np.isfinite(e.J).all()):
@@ -70,7 +68,7 @@ def _in_free_motion(
 
 
 class SearchResult(NamedTuple):
-    """Where a search ended and how it came there."""
+    """The end of a search, and its runs."""
 
     search: Search
     """with its layout and data"""
@@ -102,8 +100,8 @@ def search(
     else:
         points = draw(layout, problem, guess.z, starts, seed)
 
-    # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
-    # and goes on only where there is one.
+    # Without a disturbance in the record filter error does not converge: its first run is short,
+    # and goes on only if a disturbance is found.
     first_steps = min(max_steps, _FIRST_STEPS) if layout.sigmas else max_steps
     over = Search(problem, layout, data, first_steps)
     # Residuals at the first start are those of the first guess.
@@ -138,19 +136,16 @@ def search(
 
 
 _BETTER = 0.1
-"""log-posterior by which an optimum is better than another"""
+"""gain in log-posterior from which on an optimum is better"""
 
 
 def is_better(
     problem: Problem, over: Search, optimum: RelaxedOptimum, other: RelaxedOptimum
 ) -> bool:
-    """True if an optimum is to be chosen before another.
+    """True if an optimum is to be chosen instead of another.
 
-    It has converged and the other has not; or both have, and it alone is stable where the start
-    was; or it has the higher log-posterior.
-
-    Args:
-        other: the other, which stays where there is no difference.
+    One that converged wins, then one that is stable if the start was, then the higher
+    log-posterior. `other` stays if there is no difference.
     """
 
     def passes(o: RelaxedOptimum) -> tuple[bool, bool]:
@@ -163,12 +158,8 @@ def is_better(
 
 
 def log_posterior(over: Search, optimum: RelaxedOptimum) -> float:
-    """The log-likelihood less what priors hold against the free parameters, but for a constant;
-    -inf where it is not finite.
-
-    Args:
-        optimum: where it ended.
-    """
+    """Return log-likelihood plus log-prior of the free parameters, without its constant; -inf if it
+    is not finite."""
     values = named_values(over.layout, over.data, optimum.best.z)
     priors = {n: f.prior for n, f in over.problem.free.items() if f.prior is not None}
     against = sum(((values[n] - prior.mean) / prior.sd) ** 2 for n, prior in priors.items())

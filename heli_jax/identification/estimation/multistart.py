@@ -1,4 +1,4 @@
-"""Where the optimiser starts and how it is run: a first guess, several starts, bounds."""
+"""Runs of the optimiser from one or several starts, within bounds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,7 +22,7 @@ Progress = Callable[[str], None]
 
 
 class StartRow(NamedTuple):
-    """Where one run of the optimiser led."""
+    """Start and end of one run of the optimiser."""
 
     start: dict[str, float]
     end: dict[str, float]
@@ -32,9 +32,9 @@ class StartRow(NamedTuple):
     optimum: int
     """1 for the best optimum of that reason, 2 for the next, ...; 0 where it did not converge"""
     reason: str = "start"
-    """why it was made: 'start', 'starts' of several, or the name of a restart"""
+    """'start', 'starts' of several, or the name of a restart"""
     chosen: bool = False
-    """whether the fit is the end of this run"""
+    """True if the fit is the end of this run"""
 
 
 class Run(NamedTuple):
@@ -47,7 +47,7 @@ class Run(NamedTuple):
 
 
 _GOOD = 10.0
-"""cost up to which a run explains something whatever there is to explain"""
+"""cost below which a run counts as a fit, whatever the size of the outputs"""
 
 
 class Search:
@@ -76,17 +76,14 @@ class Search:
             progress: called with a sentence after each of several starts.
             known: residuals and Jacobian at the first start, where they are at hand.
         """
-        # One of them is taken out of NumPy's arrays in no time.
         points = np.asarray(points)
         runs = self._run(self.layout, noise, points, progress, known)
-        # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
-        # good a place is.
+        # An optimiser can converge where the model explains nothing: its gradient is zero there.
         runs = [self._better_than_nothing(run, noise) for run in runs]
-        # Where one stayed its end may be the start itself, of NumPy.
         runs = [run._replace(z=jnp.asarray(run.z)) for run in runs]
         if self.bounded.kinds == self.layout.kinds:
             return runs
-        # What left its bounds begins anew from its start, in coordinates that cannot leave them.
+        # A run that left its bounds starts again in coordinates that cannot leave them.
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
             starts = np.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
@@ -125,16 +122,16 @@ class Search:
 
     @property
     def _held(self) -> np.ndarray | None:
-        """What the optimiser leaves where it is."""
+        """Mask of the unknowns that the optimiser keeps; None if it moves all."""
         layout = self.layout
-        # Their weak priors alone would lead the initial states to zero: for a machine that is not
-        # linear, with a rotor that stands still, a place from which no search in time comes back.
+        # Rows without initial states would leave these to their weak priors, which lead to zero:
+        # a rotor that stands still, from where no search in time comes back.
         if layout.model.linear or layout.noise_model != "spectrum":
             return None
         return np.arange(layout.size) >= layout.first_nuisance
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
-        """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        """Mark a run that ends worse than no model at all as not converged."""
         if run.cost <= _GOOD:
             return run
         # The cost is a mean over the measured numbers, so this is one too.
@@ -142,7 +139,7 @@ class Search:
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + _GOOD))
 
     def misfit_of_nothing(self, noise: Noise) -> float:
-        """Sum of squares that a model without any response leaves."""
+        """Return the sum of squares of a model without any response."""
         power = [
             float(np.nansum(np.square(np.asarray(y) / np.asarray(s[n]))))
             for flight, s in zip(self.data.flights, noise.sd, strict=True)
@@ -151,7 +148,7 @@ class Search:
         return sum(power)
 
     def variation(self, noise: Noise) -> float:
-        """Sum of squares that the outputs' means leave."""
+        """Return the sum of squares about the outputs' means."""
         return sum(
             float(np.nansum(np.square((y - np.nanmean(y)) / np.asarray(s[n]))))
             for flight, s in zip(self.data.flights, noise.sd, strict=True)
@@ -183,8 +180,8 @@ class Search:
 
 
 def gauss_newton_gain(r: Array | np.ndarray, J: Array | np.ndarray) -> float:
-    """By how much a Gauss-Newton step lowers the sum of squares of residuals r (n,) with the
-    Jacobian J (n, q), as the linear model of them has it; NaN where either is not finite."""
+    """Return the fall of the sum of squares of r (n,) that the linear model J (n, q) predicts for a
+    Gauss-Newton step; NaN if either is not finite."""
     r, J = np.asarray(r, np.float64), np.asarray(J, np.float64)
     if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return float("nan")
@@ -234,7 +231,7 @@ def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[Sta
 
 
 def rank(run: Optimum) -> tuple[bool, float]:
-    """Sorts runs: those that converged first, then by cost."""
+    """Sort key of runs: those that converged first, then by cost."""
     # False sorts before True.
     return not bool(run.converged), _cost(run)
 
@@ -245,11 +242,8 @@ def _cost(run: Optimum) -> float:
     return cost if np.isfinite(cost) else float("inf")
 
 
-# The search from the start values, by what takes least time to search with.
-
-
 class FirstGuess(NamedTuple):
-    """A problem at its first guess."""
+    """A problem at its start values, with a first guess of the noise."""
 
     layout: Layout
     data: Data
@@ -257,4 +251,4 @@ class FirstGuess(NamedTuple):
     z: Float[Array, " q"]
     e: Evaluation
     begun: Data
-    """what the first search goes by"""
+    """data of the first search"""

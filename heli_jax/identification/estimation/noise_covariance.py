@@ -1,4 +1,4 @@
-"""How large the measurement noise is: guessed first, then relaxed with the optimum."""
+"""Measurement noise: a first guess, then relaxation with the optimum."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -114,7 +114,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
 
 
 def _changed(noise: Noise, new: Noise) -> float:
-    """By how much in its logarithms."""
+    """Return the largest change in the logarithms."""
     change = abs(float(noise.log_variance_ratio - new.log_variance_ratio)) + max(
         abs(float(np.log(sd[n] / before[n])))
         for sd, before in zip(new.sd, noise.sd, strict=True)

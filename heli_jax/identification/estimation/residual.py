@@ -1,4 +1,4 @@
-"""The one residual: fit, identifiability and uncertainty all differentiate this function.
+"""The residual vector that fit, identifiability and uncertainty differentiate.
 
 The rows of the measurements are the method's (`Objective.residuals`); those of the priors,
 (value - mean) / sd, follow, then those of the weak priors.
@@ -16,26 +16,26 @@ from heli_jax.identification.estimation.simulated_flights import Run, SimulatedO
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 from heli_jax.numerics.jitted import jitted
 
-# Derivatives of many windows at once: an initial state is felt by its own window alone, an input's
-# offset by its own flight.
-#
-# Unknowns that no row shares get one direction of differentiation together ("colouring": Curtis,
-# Powell and Reid, 1974); the columns are told apart afterwards by the rows that they can reach.
-
 
 class Residuals(NamedTuple):
-    """What a method makes small."""
+    """Rows of the measurements, and what was simulated or predicted for them."""
 
     rows: Float[Array, " n"]
-    """whitened; zero where nothing is measured. Those of the priors are added to them"""
+    """whitened; zero where nothing is measured"""
     runs: tuple[Run, ...] | None
-    """by flight the simulated `Run`s on whose way the rows came; None where none was simulated"""
+    """by flight; None where nothing was simulated"""
     innovations: tuple[Innovations, ...] = ()
-    """by flight, where predictions one step ahead are what is compared"""
+    """by flight, of methods that predict one step ahead"""
+
+
+# Derivatives of many windows at once. An initial state has an effect in its own window alone, an
+# input's offset in its own flight. Unknowns that share no row are differentiated along one common
+# direction ("colouring": Curtis, Powell and Reid, 1974), and their columns separated afterwards by
+# the rows that each can reach.
 
 
 class _Columns(NamedTuple):
-    """Of each unknown: its direction, and where it is felt (-1 where everywhere)."""
+    """Direction of each unknown, and where it has an effect (-1 everywhere)."""
 
     colour: np.ndarray
     window: np.ndarray
@@ -45,9 +45,9 @@ class _Columns(NamedTuple):
 
 
 def seeded(layout: Layout) -> np.ndarray | None:
-    """The directions (q, colours) in which to differentiate; None where each is one unknown's."""
-    # One window has no neighbour to share directions with. A filter's rows, through the scale that
-    # is concentrated out, feel every unknown.
+    """Return directions of differentiation (q, colours); None if each unknown has its own."""
+    # One window has no neighbour to share directions with. All rows of a filter hang on every
+    # unknown, through the scale that is concentrated out.
     if layout.noise_model != "white" or sum(count for count, _ in layout.windows) < 2:
         return None
     colour = _columns(layout).colour
@@ -59,20 +59,20 @@ def seeded(layout: Layout) -> np.ndarray | None:
 def _columns(layout: Layout) -> _Columns:
     states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
-    # What all flights share is felt by every row: each has a direction to itself.
+    # Parameters have an effect in every row: each has its own direction.
     colour = list(range(shared))
     window, bias, flight = [-1] * shared, [-1] * shared, [-1] * shared
     number, first_bias = 0, 0
     for f, ((count, _), names) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
         for k in range(count):
-            # A defect feels the window before it and the one after: two sets of directions.
+            # A defect hangs on the window before it and the one after: two sets of directions.
             side = k % 2 if layout.continuity is not None else 0
             colour += [shared + side * states + i for i in range(states)]
             window += [number] * states
             bias += [-1] * states
             flight += [-1] * states
             number += 1
-        # Another flight's windows and outputs use the same directions again: no row feels both.
+        # Windows and outputs of other flights share these directions: no row hangs on both.
         if layout.bias:
             colour += [shared + 2 * states + outputs.index(n) for n in names]
             window += [-1] * len(names)
@@ -84,23 +84,22 @@ def _columns(layout: Layout) -> _Columns:
         window += [-1] * offsets
         bias += [-1] * offsets
         flight += [f] * offsets
-    # Directions that nobody uses are left out.
     _, packed = np.unique(colour, return_inverse=True)
     return _Columns(packed, np.array(window), np.array(bias), np.array(flight))
 
 
 class _Reach(NamedTuple):
-    """Of each row of the measurements what it belongs to (-2 for a defect where it is none's)."""
+    """Window, signal and flight of each row of the measurements (-2 for none)."""
 
     window: np.ndarray
     next_window: np.ndarray
-    """of a defect the window after it, else -2"""
+    """the window after a defect, else -2"""
     signal: np.ndarray
     flight: np.ndarray
 
 
 def _reach(layout: Layout, data: Data) -> _Reach:
-    """In the order of `OutputError.residuals`: signal after signal, then the defects."""
+    """Return them in the order of `OutputError.residuals`: signal after signal, then defects."""
     window, signals, flights = [], [], []
     first, signal = 0, 0
     each = zip(data.flights, layout.windows, layout.outputs, strict=True)
@@ -119,7 +118,7 @@ def _reach(layout: Layout, data: Data) -> _Reach:
             defects = np.repeat(first + np.arange(count - 1), len(layout.states))
             window.append(defects)
             following.append(defects + 1)
-            # Biases are of outputs: no defect of the states feels them.
+            # No bias has an effect on a defect of the states.
             signals.append(np.full(defects.size, -2))
             flights.append(np.full(defects.size, f))
         first += count
@@ -127,9 +126,8 @@ def _reach(layout: Layout, data: Data) -> _Reach:
 
 
 def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[Array, "n q"]:
-    """The whole Jacobian from the derivatives along the colours."""
-    # A derivative along a direction is the sum over its unknowns. Since no row feels two of them,
-    # each row's sum is the derivative by the one that it does feel.
+    """Return the whole Jacobian from the derivatives along the colours."""
+    # A derivative along a direction is the sum over its unknowns, of which each row hangs on one.
     columns, reach = _columns(layout), _reach(layout, data)
     shared = (columns.window < 0) & (columns.bias < 0) & (columns.flight < 0)
     # Numbers below zero never meet: rows have -2 where unknowns have -1.
@@ -150,7 +148,7 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
-    """(value - mean) / sd of the parameters' priors; zero where there is none."""
+    """Return (value - mean) / sd of the parameters' priors; zero where there is none."""
     u = unpack(layout, data, z)
     values = jnp.stack(list(u.params.values()))
     # Without a prior the sd is infinite: a row for every parameter keeps the shapes the same.
@@ -158,20 +156,19 @@ def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array
 
 
 def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
-    """Weak priors of initial states, biases, offsets: coordinates are in units of its sd."""
+    """Return the weak priors of initial states, biases and offsets: coordinates over their sd."""
     return z[layout.first_nuisance :]
 
 
 def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Residuals]:
-    """All rows: those of the measurements, then the priors'."""
-    # The measurements' rows first: what asks for them alone need not know how many priors follow.
+    """Return the rows of the measurements, then the priors'."""
     residuals = layout.objective.residuals(layout, data, noise, unpack(layout, data, z))
     rows = [residuals.rows, prior_rows(layout, data, z), weak_rows(layout, z)]
     return jnp.concatenate(rows), residuals
 
 
 def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Array:
-    """The rows whose squares are summed, without their derivative."""
+    """Return the rows whose squares the optimiser sums."""
     return _all_rows(layout, data, noise, z)[0]
 
 
