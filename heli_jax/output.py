@@ -83,12 +83,6 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
         _tell_table(responses)
-    for flight in held.flights if held is not None else ():
-        if (responses := report_tables.responses(flight.responses)) is not None:
-            # A single response has the errors of the estimates in it.
-            allowed = "in all together errors of the estimates are allowed for"
-            tell(f"Responses of {flight.flight}, held out ({allowed}):")
-            _tell_table(responses)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     tell(plain_words(f"acceptance card: {summary(card(problem, fit), _GATES)}"))

@@ -23,7 +23,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
-from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
+from heli_jax.identification.validation.held_out_frequency import HeldOutFrequency
 from heli_jax.identification.validation.metrics import diverges
 from heli_jax.numbers import (
     NOTHING,
@@ -302,11 +302,9 @@ def responses(agreement: ResponseAgreement | None) -> Table | None:
 
 
 def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
-    """By flight held out what it says in frequency; None where nothing was asked."""
+    """Estimates and explained shares of the flights held out; None where nothing was judged."""
     if held is None or not held.flights:
         return None
-    # Of responses no share is asked for, and a column of dashes says nothing.
-    shares = any(f.responses is None for f in held.flights)
     rows = []
     for f in held.flights:
         p = NOTHING
@@ -314,27 +312,8 @@ def held_out_flights(held: HeldOutFrequency | None) -> Table | None:
             words = f"{'differ' if f.differs else 'agree'} (p {p_value(f.estimates_p_value)})"
             p = page_sentence(words)
         parts = (f"{n} {explained_text(v)}" for n, v in f.explained.items())
-        between = f"{number(f.lower95, 3)} to {number(f.upper95, 3)}"
-        explained = (", ".join(parts) or NOTHING,) if shares else ()
-        rows.append((f.flight, number(f.chi_squared, 3), between, p, *explained))
-    head = ("flight, held out", "chi-squared", "expected", "its own estimates")
-    return Table((*head, "explained") if shares else head, rows)
-
-
-def held_out_bands(held: HeldOutFrequency | None) -> Table | None:
-    """By output and band the errors of the flights held out; None where there are none."""
-    if held is None or not held.bands:
-        return None
-    rows = [
-        (
-            b.output,
-            f"{number(b.low, 2)} to {number(b.high, 2)}",
-            number(b.chi_squared, 3),
-            f"{number(b.lower95, 3)} to {number(b.upper95, 3)}",
-        )
-        for b in held.bands
-    ]
-    return Table(("output, held out", "Hz", "chi-squared", "expected"), rows)
+        rows.append((f.flight, p, ", ".join(parts) or NOTHING))
+    return Table(("flight, held out", "its own estimates", "explained"), rows)
 
 
 def choice(selection: Choice) -> Table:

@@ -62,7 +62,7 @@ def lines_of_a_machine(A: jax.Array) -> tuple[jax.Array, jax.Array]:
     record = Record(0, 0, 40)
     m = Matrices(A, jnp.ones((n, 1)), jnp.eye(n)[:2], jnp.zeros((2, 1)))
     white = jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2))
-    at = resolved(m, record, white, jnp.asarray(1.0))
+    at = resolved(m, record, white)
     return at.H, states(at, 0, jnp.ones((1, record.lines, n), complex))
 
 

@@ -67,8 +67,10 @@ from heli_jax.identification.validation.excited_band import Excitation, excitati
 from heli_jax.identification.validation.feedback import feedback_of
 from heli_jax.identification.validation.follows_response import Feedback
 from heli_jax.identification.validation.held_out import validate
-from heli_jax.identification.validation.held_out_agreement import HeldOutFrequency
-from heli_jax.identification.validation.held_out_frequency import validate_in_frequency
+from heli_jax.identification.validation.held_out_frequency import (
+    HeldOutFrequency,
+    validate_in_frequency,
+)
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled
 from heli_jax.messages import sentence

@@ -134,7 +134,7 @@ class FrequencyError(Objective):
 
         Args:
         """
-        errors, machine, _ = jax.device_get(errors_of_lines(layout, data, noise, z))
+        errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         errors = [v * freedom**0.5 for v in errors]

@@ -488,15 +488,6 @@ def _times(M: Complex[Array, "k a b"], v: Complex[Array, "f k b"]) -> Complex[Ar
     return jnp.sum(M[None] * v[:, :, None, :], axis=3)
 
 
-class TakenByEnds(NamedTuple):
-    """What the projection of a record's ends took of its errors."""
-
-    numbers: Array
-    """real ones, of all lines and outputs"""
-    power: Array
-    """(K, p) of the errors' expected power, not whitened"""
-
-
 class LineErrors(NamedTuple):
     """Of all records."""
 
@@ -504,16 +495,12 @@ class LineErrors(NamedTuple):
     """by record, its ends taken off, not whitened"""
     machine: Machine
     """of the first flight"""
-    ends: list[TakenByEnds]
-    """by record; empty unless asked for"""
 
 
 @jitted
-def errors_of_lines(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"], *, ends: bool = False
-) -> LineErrors:
+def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> LineErrors:
     """The errors at the lines of every record."""
-    u, errors, taken, first = unpack(layout, data, z), {}, {}, None
+    u, errors, first = unpack(layout, data, z), {}, None
     for members in alike(layout, data):
         parts = parts_of_group(layout, noise, members)
         machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
@@ -526,35 +513,13 @@ def errors_of_lines(
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 e = errors_of_some(at, m, record, *some)
-                left = e.beyond - by_real(at.blocks.joined(e.X, axis=1), m.C.T)
-                same = jax.tree.map(
-                    lambda v, f=len(left): jnp.broadcast_to(v, (f, *v.shape)),
-                    _taken_by_ends(at) if ends else None,
-                )
-                made.append((left, same))
+                made.append(e.beyond - by_real(at.blocks.joined(e.X, axis=1), m.C.T))
             return made
 
         first = first_machine(machines.matrices) if first is None else first
         each = (machines.signals, y)
         made = by_flight(data, members, ready, of_some, machines.matrices, each)
         for k, i in enumerate(members):
-            errors[i] = [left[k] for left, _ in made]
-            taken[i] = [jax.tree.map(lambda v, k=k: v[k], same) for _, same in made if ends]
+            errors[i] = [left[k] for left in made]
     assert first is not None
-    errors, taken = ([v for i in range(len(data.flights)) for v in of[i]] for of in (errors, taken))
-    return LineErrors(errors, first, taken)
-
-
-def _taken_by_ends(at: Resolved) -> TakenByEnds:
-    def more(b: Any, power: Array) -> Array:
-        # Lines that are not used have a whitening of zero.
-        used = jnp.any(at.W[b] != 0, axis=(1, 2))[:, None, None]
-        W = jnp.where(used, at.W[b], jnp.eye(at.W.shape[2], dtype=at.W.dtype))
-        H = jnp.linalg.solve(W, at.H[b])
-        ends = (H[:, :, None, :] * at.ends[b][:, None, :, None]).reshape(*H.shape[:2], -1)
-        # Of a complex number of power 1 the real and the imaginary part have a half each.
-        made = ends @ at.S.astype(ends.dtype)
-        return power.at[b].set(0.5 * jnp.sum(jnp.real(made * jnp.conj(made)), axis=2))
-
-    power = at.blocks.over(more, jnp.zeros(at.H.shape[:3], at.S.dtype))
-    return TakenByEnds(jnp.sum(jnp.any(at.S != 0, axis=0)), at.blocks.joined(power))
+    return LineErrors([v for i in range(len(data.flights)) for v in errors[i]], first)

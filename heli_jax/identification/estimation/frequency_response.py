@@ -500,7 +500,7 @@ class FrequencyResponse(Objective):
         return errors_in_windows(layout, data, noise.whitening, z)
 
     def response_agreement(
-        self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
+        self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
         """Chi-squared and Tischler's J of every response."""
         weights = back(noise.whitening)
@@ -512,7 +512,7 @@ class FrequencyResponse(Objective):
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
         # What the ends of the records add takes its part.
         ends = 0 if all(weights.simulated) else len(data.flights) * len(layout.states)
-        taken = len(layout.of_interest) if fitted else 0
+        taken = len(layout.of_interest)
         freedom = max(2.0 * weights.numbers - taken - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(

@@ -219,13 +219,9 @@ class Objective(abc.ABC):
         return False
 
     def response_agreement(
-        self, layout: Layout, data: Data, noise: Noise, z: Array, *, fitted: bool = True
+        self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
-        """Return how modelled and measured frequency responses agree, where these are fitted.
-
-        Args:
-            fitted: True if the unknowns were fitted to these flights.
-        """
+        """Return how modelled and measured frequency responses agree, where these are fitted."""
         return None
 
     def findings(

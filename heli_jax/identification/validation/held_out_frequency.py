@@ -1,418 +1,243 @@
-r"""Flights held out, judged in frequency: nothing is simulated, so that it holds for unstable
-machines, and in gusts.
+"""Flights held out, judged in frequency: nothing is simulated, so that unstable models can be
+judged too, and gusts raise the noise and not the doubt.
 
-Three questions are asked of a flight that no estimate has seen. Are its errors as large as the
-noise of the fitted flights lets expect? Their squares, whitened by the spectrum that was estimated
-there, are compared with Fisher's F; with $J$ their derivative and $I$ the information of the fit,
+Each flight gets a spectrum of its own residual and is asked two questions. Would it, by itself,
+give other estimates? One step of Gauss and Newton from the fit's, in the flight's own noise, is
+compared with the errors of both (Chow's test). And does the model explain what follows the
+excitation, as is asked of the fitted flights?
 
-$$\chi^2 = r^T r - r^T J\,(I + J^T J)^{-1} J^T r$$
-
-allows for the errors of the estimates. What would the flight's own estimates be? Those of one step
-of Gauss and Newton are compared with the fit's by the difference of the two forms of that sum, in
-the flight's own noise (Chow's test). And of what follows the excitation, how much does the
-model explain? That knows nothing of how strong the gusts were.
-
-Of a fit of frequency responses the flights' responses are compared in place of their lines, and
-their noise is their own.
-
-Sources: Chow (1960); Pintelon and Schoukens (2012), chapters 9 and 11; Brillinger (1981), chapter
-8, for noise that is estimated.
+Source: Chow (1960).
 """
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+import scipy.special
+from jaxtyping import Float
 
-from heli_jax.analysis.response_agreement import expected_interval
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.evaluation import Evaluation, deviations, named
+from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_noise import (
-    GUST_LEAST,
-    GUST_PART,
-    averages,
-    inverse_roots,
-    whitening_by,
-)
-from heli_jax.identification.estimation.frequency_records import Record, parts_of, records_of
+from heli_jax.identification.estimation.frequency_records import parts_of
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise
-from heli_jax.identification.estimation.response_weights import first_weights
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.unknowns.layout import Solution, layout_of
 from heli_jax.identification.validation.excitation_test import (
     LEVEL,
-    Followed,
     errors_against_excitation,
 )
 from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
-from heli_jax.identification.validation.held_out_agreement import (
-    HeldOutBand,
-    HeldOutFlight,
-    HeldOutFrequency,
-)
-from heli_jax.identification.validation.own_estimates import (
-    Fitted,
-    Rows,
-    explained_by_estimates,
-    own_estimates,
-)
+from heli_jax.numbers import p_value, percent, plain_words
 
-# Bands of frequencies that a page shows.
-
-
-_FEWEST = 12
-"""lines of a band at least"""
-
-
-def band_edges(hz: Float[np.ndarray, " K"]) -> list[tuple[float, float]]:
-    """Bands between the lowest and the highest of some frequencies, at 1, 3, 10, 30 ... Hz, each
-    with some lines.
-    """
-    low, high = float(np.min(hz)), float(np.max(hz))
-    decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
-    grid = np.sort(np.concatenate([10.0**decades, 3.0 * 10.0**decades]))
-    edges = [low]
-    for edge in grid[(grid > low) & (grid < high)]:
-        above = np.sum(hz > edge) >= _FEWEST
-        if above and np.sum((hz >= edges[-1]) & (hz <= edge)) >= _FEWEST:
-            edges.append(float(edge))
-    return list(zip(edges, [*edges[1:], high], strict=True))
-
-
-_NO_SPECTRUM = "its errors have no spectrum: two of its outputs are one, or there is no noise"
-_SAME_RATE = 1e-6
-"""relative difference of sample times that are one"""
+_ROUNDS = 3
+"""of the flight's noise"""
+_NO_EFFECT = 1e-10
+"""part of the largest size below which a direction has no effect"""
 _SURE = 0.05
-"""standard deviation of what is explained by chance, above which it is not said"""
-_MISFIT = 2.0
-"""squared errors of a response over their variance, from which on chance alone makes none"""
+"""sd of the explained share by chance, above which it is not reported"""
+
+
+class Furthest(NamedTuple):
+    """The parameter whose estimate from a flight is the furthest from the fit's."""
+
+    parameter: str
+    own: float
+    """from the flight by itself, after one step [SI]"""
+    fitted: float
+    sds: float
+    """joint standard deviations between the two"""
+
+
+class HeldOutFlight(NamedTuple):
+    """A flight held out."""
+
+    flight: str
+    estimates_p_value: float | None
+    """the chance that errors alone make the flight's own estimates as far from the fit's; null
+    where the flight says nothing of them"""
+    furthest: Furthest | None
+    explained: dict[str, float]
+    """by output the part that the model explains of the power that follows the excitation; below 0
+    it is worse than no model; only where gusts leave at most 0.05 of it to chance"""
+    worse: tuple[str, ...]
+    """the outputs that a model without any response would explain better"""
+
+    @property
+    def differs(self) -> bool:
+        """True if the flight gives other estimates."""
+        return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """The estimates and what is explained, in a line."""
+        known = []
+        if self.estimates_p_value is not None:
+            verb = "differ" if self.differs else "agree"
+            known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
+        shares = [
+            f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
+            for n, v in self.explained.items()
+        ]
+        if shares:
+            known.append(f"explained of what follows the excitation: {', '.join(shares)}")
+        return "; ".join(known) or "says nothing of the model"
+
+    @property
+    def findings(self) -> Iterator[Finding]:
+        """What contradicts the fit."""
+        if self.worse:
+            yield found(
+                "held-out.worse-than-none", "doubt", self.flight, *self.worse, denies=True,
+                flight=self.flight, names=self.worse,
+            )  # fmt: skip
+        if self.differs and self.furthest is not None:
+            f = self.furthest
+            yield found(
+                "held-out.other-estimates", "doubt", self.flight, value=self.estimates_p_value,
+                shifts={f.parameter: f.own - f.fitted}, limit=LEVEL, flight=self.flight,
+                **f._asdict(),
+            )  # fmt: skip
+
+
+class HeldOutFrequency(NamedTuple):
+    """The flights held out of a fit in frequency."""
+
+    flights: tuple[HeldOutFlight, ...]
+    notes: tuple[Finding, ...]
+    """why a flight is not judged"""
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What they contradict, and which of them are not judged."""
+        return [*self.notes, *(finding for f in self.flights for finding in f.findings)]
+
+
+class _Fitted(NamedTuple):
+    """The estimates of a fit, and what it knows of them."""
+
+    information: Float[np.ndarray, "q q"]
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " q"]
+    slopes: Float[np.ndarray, " q"]
 
 
 def validate_in_frequency(
     problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight], *, feedback: bool
 ) -> HeldOutFrequency | None:
-    """The flights held out against a fit in frequency; None of a fit in time.
-
-    Nothing is raised where that fails: the notes say so.
+    """Judge the flights held out of a fit in frequency; None of a fit in time.
 
     Args:
         at: where the fit ended.
+        feedback: True if inputs follow the outputs and no instrument is used.
     """
-    objective = at.layout.objective
-    if not held or objective.noise_model != "spectrum":
-        return None
     q = len(at.layout.of_interest)
     J = np.asarray(e.J, float)[:, :q]
-    if not np.isfinite(J).all():
+    if not held or at.layout.noise_model != "spectrum" or not np.isfinite(J).all():
         return None
-    fitted = Fitted(J.T @ J, deviations(J), at.layout.of_interest, np.asarray(e.named))
-    with np.errstate(all="ignore"):
-        try:
-            judged = _by_responses if objective.fits_responses else _by_lines
-            found = judged(problem, at, fitted, held)
-        except (ValueError, np.linalg.LinAlgError) as error:
-            words = f"Held out: not judged in frequency: {error}"
-            return HeldOutFrequency((), (), (words,))
-    # What feedback makes of estimates is another thing in every flight, and no news of the machine.
-    return _without_estimates(found) if feedback and found.flights else found
-
-
-def _without_estimates(found: HeldOutFrequency) -> HeldOutFrequency:
-    left = {"estimates_p_value": None, "furthest": None, "explained": {}, "worse": ()}
-    words = (
-        "Held out: inputs follow the outputs, and no instrument is used: what the flights say of "
-        "the parameters, and what follows their inputs, is not asked, since feedback biases both."
-    )
-    flights = tuple(f._replace(**left) for f in found.flights)
-    return found._replace(flights=flights, notes=(*found.notes, words))
-
-
-def _by_lines(
-    problem: Problem, at: Solution, fitted: Fitted, held: Sequence[Flight]
-) -> HeldOutFrequency:
-    """At the lines of each flight, against the spectrum of the fitted ones."""
-    found, lines, notes = [], [], []
+    fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
+    flights, notes = [], []
     for label, flight in zip(labels(tuple(held)), held, strict=True):
-        sound, why = _comparable(at, flight)
-        if sound is None:
-            notes.append(f"{label}, held out: not judged in frequency: {why}.")
-            continue
-        notes += [f"{label}, held out: {why}."] if why else []
-        try:
-            made = _flight_by_lines(problem, at, fitted, (label, sound))
-        except np.linalg.LinAlgError:
-            # What one flight lacks takes nothing off the others.
-            notes.append(f"{label}, held out: not judged in frequency: {_NO_SPECTRUM}.")
-            continue
-        found.append(made[0])
-        lines += made[1]
-    return HeldOutFrequency(tuple(found), _bands(at, lines), tuple(notes))
+        part, why = _comparable(problem, at, flight, feedback=feedback)
+        judged = None
+        if part is not None:
+            with np.errstate(all="ignore"):
+                judged = _judged(problem, at, fitted, label, part)
+            why = why if judged is not None else "its errors have no spectrum"
+        flights += [judged] if judged is not None else []
+        if why:
+            notes.append(found("held-out.not-judged", "note", label, flight=label, why=why))
+    return HeldOutFrequency(tuple(flights), tuple(notes))
 
 
-def _comparable(at: Solution, flight: Flight) -> tuple[Flight | None, str]:
-    """The flight with the outputs whose spectrum is known, or None and why; what else to say."""
-    names = at.layout.outputs[0]
-    common = [n for n in flight.outputs if n in names]
-    if not any(abs(float(f.dt) / flight.dt - 1.0) < _SAME_RATE for f in at.data.flights):
-        return None, "no fitted flight has its sample time, and so none its noise"
+def _comparable(
+    problem: Problem, at: Solution, flight: Flight, *, feedback: bool
+) -> tuple[Flight | None, str]:
+    """The flight with the outputs that can be judged, or None; what is left out, and why."""
+    if feedback:
+        return None, "inputs follow the outputs, and no instrument is used"
+    by = instruments_of(problem)
+    if by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by):
+        return None, "none of its instruments moves"
+    common = [n for n in flight.outputs if n in at.layout.outputs[0]]
     if not common:
-        return None, f"it has none of the outputs that were fitted ({', '.join(names)})"
+        return None, f"it has none of the fitted outputs ({', '.join(at.layout.outputs[0])})"
     sound, still = moving_outputs(with_outputs(flight, common))
-    if sound is None:
-        return None, still
-    if not parts_of(sound):
-        return None, "no part of it has all of its outputs, which a Fourier transform needs"
-    by = at.data.flights[0].by_instrument is not None
-    missing = by and not flight.instruments
-    said = [still] if still else []
-    said += ["it holds no instrument, and only the size of its errors is judged"] if missing else []
-    return sound, "; ".join(said)
+    if sound is not None and not parts_of(sound):
+        return None, "no part of it has all of its outputs"
+    return sound, still
 
 
-class _Line(NamedTuple):
-    """The lines of a record of a flight held out, by output."""
-
-    hz: Float[np.ndarray, " K"]
-    outputs: tuple[str, ...]
-    squares: Float[np.ndarray, "K p"]
-    """of the errors over the noise's power"""
-    expected: Float[np.ndarray, "K p"]
-    """of these, without what the ends took"""
-
-
-def _flight_by_lines(
-    problem: Problem,
-    at: Solution,
-    fit: Fitted,
-    of: tuple[str, Flight],
-) -> tuple[HeldOutFlight, list[_Line]]:
-    """One flight, with its label."""
-    label, flight = of
+def _judged(
+    problem: Problem, at: Solution, fit: _Fitted, label: str, flight: Flight
+) -> HeldOutFlight | None:
+    """One flight; None if its errors have no spectrum."""
+    # At the lines of the whole flight, also after a fit of responses.
+    problem = replace(problem, method="frequency-error")
     layout = layout_of(problem, (flight,))
-    data = data_of(problem, (flight,), layout)
-    records, (names,) = records_of(layout), layout.outputs
-    whitening = tuple(_whitening(at, flight.dt, record, names) for record in records)
-    sd = {n: at.noise.sd[0][n] for n in names}
-    # By the inputs themselves: by instrument there is no sum of squares.
-    direct = Noise((sd,), np.zeros(()), whitening, np.zeros(()), np.ones(()))
-    z = _with_nuisances(problem, at, layout, data, direct)
-    errors, _, taken = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
-    squares = sum(
-        float(np.sum(np.abs(np.einsum("kij,kj->ki", np.asarray(W), e)) ** 2))
-        for W, e in zip(whitening, errors, strict=True)
-    )
-    freedom = float(sum(2 * e.size - t.numbers for e, t in zip(errors, taken, strict=True)))
-    # A row for each unknown of interest, and one for what is left of the errors.
-    count = len(at.layout.of_interest) + 1
-    r, J = _rows(Solution(layout, data, direct, z), count)
-    allowed = 2.0 * squares - explained_by_estimates(r, J, fit.information)
-    chi = allowed / freedom
-    of_noise = float(sum(2 * r.lines * len(names) for r in records_of(at.layout)))
-    by_instrument = data.flights[0].by_instrument is not None
-    own, followed = (None, None), {}
-    # Of a flight without its instrument neither is asked: feedback may move the inputs.
-    if by_instrument or at.data.flights[0].by_instrument is None:
-        there, by = Solution(layout, data, direct, z), instruments_of(problem)
-        followed = errors_against_excitation((flight,), there, errors, by if by_instrument else ())
-        # In its own noise: stronger gusts would pass for another machine.
-        itself = direct._replace(by_instrument=np.asarray(float(by_instrument)))
-
-        def rows(z: Array) -> Rows:
-            # By the program that there is already, though nobody asks for the ends here.
-            made = jax.device_get(errors_of_lines(layout, data, direct, z, ends=True))
-            noise = itself._replace(whitening=whitening_by(made.machine, made.errors))
-            return _rows(Solution(layout, data, noise, z), count)
-
-        def before(z: Array) -> Rows:
-            return _rows(Solution(layout, data, itself, z), count)
-
-        own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fit)
-    low, high = expected_interval(freedom, of_noise)
-    lines = []
-    for record, W, e, t in zip(records, whitening, errors, taken, strict=True):
-        size = np.sum(np.abs(np.linalg.inv(W)) ** 2, axis=2)
-        expected = np.maximum(1.0 - t.power / size, 0.0)
-        lines.append(_Line(_hz(record, flight.dt), names, np.abs(e) ** 2 / size, expected))
-    return (
-        HeldOutFlight(label, chi, low, high, freedom, *own, *_explained(followed), None),
-        lines,
-    )
-
-
-def _rows(there: Solution, count: int) -> Rows:
-    """So many rows, in units in which noise has variance 1, and their derivative by what is of
-    interest."""
-    made = residual_and_jacobian(*there)
-    # Behind them stand the priors, which are none of this flight's news.
-    q = len(there.layout.of_interest)
-    return Rows(np.asarray(made.r)[:count], np.asarray(made.J)[:count, :q])
-
-
-def _with_nuisances(
-    problem: Problem, at: Solution, layout: Layout, data: Data, noise: Noise
-) -> Array:
-    """The estimates, with the nuisances of another layout."""
-    # Rows of a linear model do not hang on these; others are linearised where they put it.
-    first = layout.first_nuisance
+    data, noise = data_of(problem, (flight,), layout), first_noise(problem, (flight,))
+    first, q = layout.first_nuisance, len(layout.of_interest)
     z = jnp.zeros(layout.size, at.z.dtype).at[:first].set(at.z[:first])
-    if layout.model.linear:
-        return z
-    z = z.at[first:].set(start_vector(layout, data, problem)[first:])
-    return in_time(layout, data, noise, z)
-
-
-def _whitening(
-    at: Solution, dt: float, record: Record, names: Sequence[str]
-) -> Complex[np.ndarray, "K p p"]:
-    """What makes white, at the lines of a record, the noise of the fitted flights."""
-    alike = [
-        (fitted, np.asarray(W))
-        for fitted, W in zip(records_of(at.layout), at.noise.whitening, strict=True)
-        if abs(float(at.data.flights[fitted.flight].dt) / dt - 1.0) < _SAME_RATE
-    ]
-    fitted, W = max(alike, key=lambda v: v[0].lines)
-    counts = tuple(Counter(r.lines for r in records_of(at.layout)).items())
-    p = W.shape[1]
-    n = np.maximum(averages(fitted.lines, counts, GUST_PART, GUST_LEAST), p + 1.0)
-    # The fit's own weights allow twice for a spectrum that is estimated: for what it makes of
-    # errors that it was not estimated from, as here, and for the estimates'.
-    W = W * np.sqrt(n / (n - p))[:, None, None]
-    known = [at.layout.outputs[0].index(name) for name in names]
-    if len(known) < p:
-        L = np.linalg.inv(W)[:, known]
-        W = inverse_roots(L @ np.conj(np.swapaxes(L, 1, 2)))
-    f = np.arange(1, record.lines + 1) / record.samples
-    at_f = np.arange(1, fitted.lines + 1) / fitted.samples
-    flat = W.reshape(len(W), -1)
-    flat = [np.interp(f, at_f, v.real) + 1j * np.interp(f, at_f, v.imag) for v in flat.T]
-    made = np.stack(flat, axis=1).reshape(len(f), *W.shape[1:])
-    # Below what the fitted flights show noise may grow as that of a random walk.
-    return made * np.minimum(f / at_f[0], 1.0)[:, None, None]
-
-
-def _explained(followed: dict[str, Followed]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """By output what is explained, where that is known, and the outputs where the model is worse
-    than none."""
+    if not layout.model.linear:
+        # Such a model is linearised where the nuisances put it.
+        z = z.at[first:].set(start_vector(layout, data, problem)[first:])
+        z = in_time(layout, data, noise, z)
+    for _ in range(_ROUNDS):
+        z, noise = layout.objective.relax(layout, data, noise, z)
+    if not np.isfinite(float(noise.log_variance_ratio)):
+        return None
+    there = Solution(layout, data, noise, z)
+    made = residual_and_jacobian(*there)
+    # A row for each parameter and one for the rest of the errors; the priors are no news.
+    r, J = np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q]
+    by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
+    errors = jax.device_get(errors_of_lines(*there).errors)
+    followed = errors_against_excitation((flight,), there, errors, by)
     level = LEVEL / max(len(followed), 1)
     worse = [n for n, f in followed.items() if f.p_value < level and not f.explained >= 0.0]
-    # Of an output that hardly follows the excitation any share would be one of noise. What chance
-    # takes off may be more than is left.
     known = [n for n, f in followed.items() if f.by_chance < _SURE or n in worse]
-    return {n: min(followed[n].explained, 1.0) for n in known}, tuple(worse)
+    explained = {n: min(followed[n].explained, 1.0) for n in known}
+    return HeldOutFlight(label, *_own_estimates(r, J, fit), explained, tuple(worse))
 
 
-def _hz(record: Record, dt: float) -> Float[np.ndarray, " K"]:
-    """The lines of a record."""
-    return np.arange(1, record.lines + 1) / (record.samples * dt)
+def _own_estimates(
+    r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], fit: _Fitted
+) -> tuple[float | None, Furthest | None]:
+    """The chance that the flight's own estimates lie as far from the fit's, and the furthest; None
+    where the two have no direction in common.
 
-
-def _bands(at: Solution, lines: Sequence[_Line]) -> tuple[HeldOutBand, ...]:
-    """By output and band, over all flights."""
-    flights = at.data.flights
-    fitted = [_hz(r, float(flights[r.flight].dt)) for r in records_of(at.layout)]
-    fitted, found = np.concatenate(fitted), []
-    for name in dict.fromkeys(n for line in lines for n in line.outputs):
-        own = [(v, v.outputs.index(name)) for v in lines if name in v.outputs]
-        hz = np.concatenate([v.hz for v, _ in own])
-        squares = np.concatenate([v.squares[:, j] for v, j in own])
-        expected = np.concatenate([v.expected[:, j] for v, j in own])
-        for low, high in band_edges(hz):
-            within, of_noise = ((v >= low) & (v <= high) for v in (hz, fitted))
-            numbers = float(np.sum(expected[within]))
-            if not numbers > 0:
-                continue
-            ends = expected_interval(2.0 * numbers, 2.0 * float(np.sum(of_noise)))
-            chi = float(np.sum(squares[within])) / numbers
-            found.append(HeldOutBand(name, low, high, chi, *ends))
-    return tuple(found)
-
-
-def _by_responses(
-    problem: Problem, at: Solution, fitted: Fitted, held: Sequence[Flight]
-) -> HeldOutFrequency:
-    """By the responses of each flight; of those that are too short by themselves, together."""
-    found, short, notes = [], {}, []
-    by = instruments_of(problem)
-    for label, flight in zip(labels(tuple(held)), held, strict=True):
-        # Those of the inputs themselves may be what feedback makes of them, whatever the model.
-        if lacks := _without_instrument(flight, by):
-            words = f"no instrument of {', '.join(lacks)} moves in it, and the fit is by instrument"
-            notes.append(f"{label}, held out: not judged in frequency: {words}.")
-            continue
-        sound, said = moving_outputs(flight)
-        if sound is None:
-            said = f"not judged in frequency: {said}"
-        notes += [f"{label}, held out: {said}."] if said else []
-        if sound is None:
-            continue
-        try:
-            found.append(_responses_of(problem, at, fitted, (label, (sound,))))
-        except ValueError as error:
-            short[label] = (sound, str(error))
-    if len(short) > 1:
-        flights = tuple(flight for flight, _ in short.values())
-        try:
-            found.append(_responses_of(problem, at, fitted, (", ".join(short), flights)))
-            short = {}
-        except ValueError:
-            pass
-    notes += [f"{n}, held out: not judged in frequency: {why}." for n, (_, why) in short.items()]
-    return HeldOutFrequency(tuple(found), (), tuple(notes))
-
-
-def _without_instrument(flight: Flight, by: Sequence[str]) -> list[str]:
-    """Those of some inputs whose instrument a flight lacks; all where none of its own moves."""
-    if not any(np.ptp(flight.instruments[n]) > 0 for n in by if n in flight.instruments):
-        return list(by)
-    return [n for n in by if n not in flight.instruments]
-
-
-def _responses_of(
-    problem: Problem, at: Solution, fitted: Fitted, of: tuple[str, tuple[Flight, ...]]
-) -> HeldOutFlight:
-    """Of some flights together, with their label, in windows as long as those of the fitted ones.
-
-    Raises:
-        ValueError: they leave nothing to compare.
+    Args:
+        r: the flight's errors, in units of its own noise.
     """
-    label, flights = of
-    layout = layout_of(problem, flights)
-    data = data_of(problem, flights, layout)
-    noise = first_noise(problem, flights)
-    if noise.whitening == ():
-        # What it was refused for.
-        first_weights(problem, flights)
-    z = _with_nuisances(problem, at, layout, data, noise)
-    z, noise = layout.objective.relax(layout, data, noise, z)
-    count = 2 * noise.whitening.used.size
-
-    def before(z: Array) -> Rows:
-        return _rows(Solution(layout, data, noise, z), count)
-
-    def rows(z: Array) -> Rows:
-        z, left = layout.objective.relax(layout, data, noise, z)
-        return _rows(Solution(layout, data, left, z), count)
-
-    agreement = layout.objective.response_agreement(layout, data, noise, z, fitted=False)
-    assert agreement is not None
-    added = explained_by_estimates(*before(z), fitted.information)
-    chi = agreement.chi_squared - added / agreement.freedom
-    agreement = agreement._replace(chi_squared=chi)
-    own = own_estimates(rows, before, lambda z: named(layout, data, z), z, fitted)
-    ends = agreement.lower95, agreement.upper95, agreement.freedom
-    worse = {
-        p.output: None
-        for p in agreement.pairs
-        if chi > agreement.upper95 and p.chi_squared > max(p.of_none, _MISFIT)
-    }
-    return HeldOutFlight(label, chi, *ends, *own, {}, tuple(worse), agreement)
+    own, known = J.T @ J, fit.information
+    if not (np.isfinite(own).all() and np.isfinite(r).all()):
+        return None, None
+    sizes = np.sqrt(np.diag(own + known))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    b, (own, known) = J.T @ r / sizes, (v / np.outer(sizes, sizes) for v in (own, known))
+    values, vectors = np.linalg.eigh(own + known)
+    kept = values > _NO_EFFECT * values[-1]
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    shares, turned = np.linalg.eigh(root.T @ own @ root)
+    # A direction that only one of the two determines cannot be compared.
+    both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
+    if not both.any():
+        return None, None
+    directions, shares = root @ turned[:, both], shares[both]
+    along = directions.T @ b
+    p = scipy.special.chdtrc(int(both.sum()), np.sum(along**2 * (1.0 / shares - 1.0)))
+    moved = -(directions @ (along / shares)) / sizes * fit.slopes
+    sd = np.sqrt(np.sum(directions**2 / (shares * (1.0 - shares)), axis=1)) / sizes
+    sds = np.abs(moved) / np.maximum(sd * np.abs(fit.slopes), 1e-300)
+    k = int(np.argmax(sds))
+    own_value = float(fit.values[k] + moved[k])
+    return float(p), Furthest(fit.names[k], own_value, float(fit.values[k]), float(sds[k]))
