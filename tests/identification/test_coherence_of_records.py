@@ -50,7 +50,7 @@ def test_no_coherence_is_no_tick():
     sparse = np.full(4000, np.nan)
     sparse[::5] = f.outputs["phi"][::5]
     for record in (replace(f, outputs={"phi": sparse}), flight(n=150)):
-        assert severities(record) == ["doubt"]
+        assert severities(record) == ["note"]
     # Beside an output that is seen.
     assert severities(replace(f, outputs={"phi": sparse, "p": f.outputs["phi"]})) == ["ok"]
 
@@ -69,7 +69,7 @@ def test_a_line_of_vibration_is_no_band():
 def test_feedback_that_was_not_tested_is_said():
     short = problem(replace(swept(150), sd={"phi": 0.01}))
     [found] = feedback_tested(context_of(short))
-    assert (found.code, found.severity) == ("loop.not-tested", "doubt")
+    assert (found.code, found.severity) == ("loop.not-tested", "note")
     jumps = problem(flight(0))
     [found] = feedback_tested(context_of(jumps))
     assert (found.code, found.severity) == ("loop.not-tested", "note")

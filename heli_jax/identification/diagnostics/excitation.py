@@ -58,7 +58,7 @@ def excited_bands(c: Context) -> Iterator[Finding]:
         best = c.excitation.followed.get(name)
         code, severity = "excitation.excited-band", "ok"
         if not c.excitation.followed:
-            code, severity = "excitation.coherence-unknown", "doubt"
+            code, severity = "excitation.coherence-unknown", "note"
         elif best is None:
             # No pass: this input alone moves nothing, though several together may.
             code, severity = "excitation.input-alone", "note"

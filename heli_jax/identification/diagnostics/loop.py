@@ -24,12 +24,10 @@ _HELD = 1.0
 
 
 def feedback_tested(c: Context) -> Iterator[Finding]:
-    """Whether feedback was asked for, and of which outputs it was not."""
+    """Feedback that could not be tested, in all flights or of some outputs."""
     why = None if c.feedback or c.fitted else why_untested(c.problem)
     if why is not None:
-        # Steps that somebody commanded follow nothing; of the rest nothing is known.
-        severity = "note" if why.programmed else "doubt"
-        yield found("loop.not-tested", severity, reason=why.reason)
+        yield found("loop.not-tested", "note", reason=why.reason)
     for names, flights in untested(c.problem).items():
         yield found("loop.output-not-tested", "note", *names, flights=flights, missing=1.0 - SEEN)
 

@@ -448,8 +448,6 @@ class Untested(NamedTuple):
 
     reason: str
     """in words"""
-    programmed: bool = False
-    """whether no input moves freely: those that somebody commanded follow nothing"""
 
 
 def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
@@ -475,10 +473,8 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        return Untested(
-            "inputs move as programmed ones do (in jumps, between rests, or as foreseen)",
-            programmed=True,
-        )
+        why = "inputs move as programmed ones do (in jumps, between rests, or as foreseen)"
+        return Untested(why)
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
