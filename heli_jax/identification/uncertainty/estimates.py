@@ -24,9 +24,11 @@ from heli_jax.identification.result import Estimate
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
+    FlightUnknown,
     Layout,
     Noise,
     Solution,
+    flight_unknowns,
     unpack,
 )
 
@@ -226,17 +228,17 @@ def flight_nuisances(
     for name, relative in size_deviations(at, e).items():
         sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
     estimates = _disturbance(problem, at, sds, quantiles)
-    # In the order in which `unpack` takes them from z.
-    i = layout.first_nuisance
-    for k, label in enumerate(labels(problem.training)):
-        for name, scale, unit in _nuisances_of(problem, at, k):
-            value, sd = float(at.z[i] * scale), float(sds[i] * scale)
-            # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
-            share = min(1.0, float(whites[i]) ** 2)
-            reach = float(quantiles[i]) * sd
-            limits = (value - reach, value + reach)
-            estimates[f"{label}/{name}"] = Estimate(value, sd, *limits, unit, 0.0, share, False)
-            i += 1
+    called = labels(problem.training)
+    for i, u in enumerate(flight_unknowns(layout), layout.first_nuisance):
+        scale = u.scale(at.data)
+        value, sd = float(at.z[i] * scale), float(sds[i] * scale)
+        # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
+        share = min(1.0, float(whites[i]) ** 2)
+        reach = float(quantiles[i]) * sd
+        unit = _unit_of(problem, u) or ""
+        estimates[f"{called[u.flight]}/{u.name}"] = Estimate(
+            value, sd, value - reach, value + reach, unit, 0.0, share, False
+        )
     return estimates
 
 
@@ -261,31 +263,11 @@ def _disturbance(
     return estimates
 
 
-def _nuisances_of(problem: Problem, at: Solution, k: int) -> list[tuple[str, float, str]]:
-    """Name, scale and unit of the nuisance parameters of flight k."""
-    layout, flight, (count, _) = at.layout, at.data.flights[k], at.layout.windows[k]
-    State, Outputs = layout.model.State, layout.model.Outputs
-    parts = [
-        (
-            f"initial {n}" + (f" of window {w + 1}" if count > 1 else ""),
-            flight.state_scale[n],
-            naming.unit(State, n),
-        )
-        for w in range(count)
-        for n in layout.states
-    ]
-    if layout.bias:
-        parts += [
-            (f"bias {n}", flight.bias_scale[n], naming.unit(Outputs, n)) for n in layout.outputs[k]
-        ]
-    parts += [
-        (f"offset {n}", flight.offset_scale[n], _offset_unit(problem, n)) for n in layout.offsets
-    ]
-    return [(name, scale, unit or "") for name, scale, unit in parts]
-
-
-def _offset_unit(problem: Problem, name: str) -> str | None:
-    """Of an input's offset: the log's plain number where the estimated gain carries the unit."""
-    if problem.gain_units.get(name, "1") != "1":
-        return "1"
-    return naming.unit(problem.model.Inputs, name)
+def _unit_of(problem: Problem, u: FlightUnknown) -> str | None:
+    if u.kind == "initial_state":
+        return naming.unit(problem.model.State, u.of)
+    if u.kind == "bias":
+        return naming.unit(problem.model.Outputs, u.of)
+    # An offset is in the log's plain numbers where the estimated gain carries the unit.
+    plain = problem.gain_units.get(u.of, "1") != "1"
+    return "1" if plain else naming.unit(problem.model.Inputs, u.of)

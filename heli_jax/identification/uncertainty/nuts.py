@@ -11,11 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax import naming, stages
+from heli_jax import stages
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns, unpack
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    Solution,
+    Unknowns,
+    flight_unknowns,
+    unpack,
+)
 
 # Samples of all unknowns by the names that a fit gives them.
 
@@ -47,12 +55,9 @@ def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
     nuisance |= {name: u.noise[name] for name in layout.noises}
     nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
     fitted = [s.flight for s in fit.signals if not s.hold_out]
-    for i, label in enumerate(fitted):
-        # Only what is among the unknowns: a model's own initial state and a bias of zero are not.
-        nuisance |= _initial_states(layout, i, label, u.states[i])
-        biases = u.biases[i] if layout.bias else {}
-        nuisance |= {f"{label}/bias {n}": v for n, v in biases.items()}
-        nuisance |= {f"{label}/offset {n}": v for n, v in u.offsets[i].items()}
+    for i, one in enumerate(flight_unknowns(layout), layout.first_nuisance):
+        samples = np.asarray(z[..., i]).reshape(-1) * float(one.scale(data))
+        nuisance[f"{fitted[one.flight]}/{one.name}"] = samples
 
     def shaped(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {name: np.asarray(v).reshape(shape) for name, v in samples.items()}
@@ -63,21 +68,6 @@ def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
 @functools.partial(jax.jit, static_argnums=0)
 def _unpacked(layout: Layout, data: Data, z: Float[Array, "n q"]) -> Unknowns:
     return jax.vmap(lambda z: unpack(layout, data, z))(z)
-
-
-# Any: a State, which is a class of the user's.
-def _initial_states(layout: Layout, i: int, label: str, state: Any) -> dict[str, np.ndarray]:
-    """Of the i-th flight, each (samples,)."""
-    if state is None:
-        return {}
-    count, values = layout.windows[i][0], naming.asdict(state)
-    if count == 1:
-        return {f"{label}/initial {n}": values[n] for n in layout.states}
-    return {
-        f"{label}/initial {n} of window {w + 1}": values[n][:, w]
-        for w in range(count)
-        for n in layout.states
-    }
 
 
 RHAT = 1.01

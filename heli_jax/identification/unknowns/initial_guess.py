@@ -14,7 +14,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Data, FlightData, Layout
+from heli_jax.identification.unknowns.layout import Data, FlightData, Layout, flight_unknowns
 
 # What the nuisance unknowns are called: initial states, biases, input offsets of every flight.
 
@@ -31,34 +31,13 @@ class WeakUnknown(NamedTuple):
 
 
 def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
-    """The unknowns from `layout.first_nuisance` on, in their order."""
-    unknowns = []
-    for i, label in enumerate(labels(problem.training)):
-        unknowns += _of_flight(label, layout, i)
-    size = layout.size - layout.first_nuisance
-    # One that is not listed here is left without a name, not taken for another.
-    if len(unknowns) != size:
-        unknowns = [WeakUnknown(f"nuisance {i + 1}", "", "a nuisance") for i in range(size)]
-    return tuple(unknowns)
-
-
-def _of_flight(label: str, layout: Layout, i: int) -> list[WeakUnknown]:
-    """Those of the i-th flight, in the order in which `layout.unpack` reads them."""
-    unknowns, count = [], layout.windows[i][0]
-    for k in range(count):
-        ending = f" of window {k + 1}" if count > 1 else ""
-        unknowns += [
-            WeakUnknown(f"{label}/initial {n}{ending}", "initial_state", f"the initial {n}")
-            for n in layout.states
-        ]
-    if layout.bias:
-        unknowns += [
-            WeakUnknown(f"{label}/bias {n}", "bias", f"the bias of {n}") for n in layout.outputs[i]
-        ]
-    return unknowns + [
-        WeakUnknown(f"{label}/offset {n}", "input_offset", f"the offset of {n}")
-        for n in layout.offsets
-    ]
+    """Return the unknowns from `layout.first_nuisance` on, with their names."""
+    called, words = labels(problem.training), {"initial_state": "initial ", "bias": "bias of "}
+    words["input_offset"] = "offset of "
+    return tuple(
+        WeakUnknown(f"{called[u.flight]}/{u.name}", u.kind, f"the {words[u.kind]}{u.of}")
+        for u in flight_unknowns(layout)
+    )
 
 
 def can_be_off(problem: Problem, kind: str) -> bool:

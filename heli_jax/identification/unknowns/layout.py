@@ -187,6 +187,43 @@ class Layout(eqx.Module):
         return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
 
 
+class FlightUnknown(NamedTuple):
+    """An unknown of one flight, whose weak prior has an sd of ten times the signal."""
+
+    name: str
+    """without the flight: 'initial p of window 2', 'bias p', 'offset lat'"""
+    kind: str
+    """the switch in `Nuisance` that it belongs to"""
+    of: str
+    """the state, output or input"""
+    flight: int
+
+    def scale(self, data: "Data") -> Any:
+        """Return the sd of its prior, by which z is multiplied [SI]."""
+        flight = data.flights[self.flight]
+        scales = {
+            "initial_state": flight.state_scale,
+            "bias": flight.bias_scale,
+            "input_offset": flight.offset_scale,
+        }
+        return scales[self.kind][self.of]
+
+
+def flight_unknowns(layout: Layout) -> list[FlightUnknown]:
+    """Return the unknowns from `layout.first_nuisance` on, in the order of z."""
+    unknowns = []
+    for i, ((count, _), outputs) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
+        for k in range(count):
+            ending = f" of window {k + 1}" if count > 1 else ""
+            unknowns += [
+                FlightUnknown(f"initial {n}{ending}", "initial_state", n, i) for n in layout.states
+            ]
+        biased = outputs if layout.bias else ()
+        unknowns += [FlightUnknown(f"bias {n}", "bias", n, i) for n in biased]
+        unknowns += [FlightUnknown(f"offset {n}", "input_offset", n, i) for n in layout.offsets]
+    return unknowns
+
+
 class Noise(NamedTuple):
     """What the residuals are measured by."""
 
