@@ -10,7 +10,7 @@ import pytest
 
 from heli_jax.identification.estimation.levenberg_marquardt import (
     ARRIVED,
-    LevenbergMarquardt,
+    REGION,
     gain_ahead,
     within_radius,
 )
@@ -65,19 +65,18 @@ def test_what_is_no_number_has_not_arrived():
     assert not arrived(at(np.full(12, np.nan)), jnp.asarray(1.0))
 
 
-SEARCH = LevenbergMarquardt(1e-9, jnp.asarray(1e-9), jnp.ones(4, bool)).search
 Y = np.array([1.0, 2.0, 3.0, 4.0])
 
 
 def begun():
-    return SEARCH.init(jnp.asarray(Y), None)
+    return REGION.init(jnp.asarray(Y), None)
 
 
 def judged(r, step, cost, region=None, first=False):
     """What the trust region says of a step to where half the sum of squares is `cost`."""
     reached = at(np.full(12, np.sqrt(cost / 6.0)))
     region = begun() if region is None else region
-    step_size, accept, _, new = SEARCH.step(
+    step_size, accept, _, new = REGION.step(
         jnp.asarray(first), jnp.asarray(Y), jnp.asarray(Y + step), at(r), reached, region
     )
     assert step_size == new.step_size

@@ -2,14 +2,14 @@
 
 Each step goes by a triangle of the residuals and their Jacobian, so that its program is the same
 for records of any length. Around optimistix's solver stand the units of the unknowns, a trust
-region that opens faster, and a test of convergence in standard deviations of the estimates
+region with a radius, and a test of convergence in standard deviations of the estimates
 (`experiments/benchmarks/optimiser.py` compares with the plain solver).
 """
 
 import functools
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -115,15 +115,12 @@ def awakened(unit: np.ndarray, J: np.ndarray, trusted: np.ndarray) -> np.ndarray
     return (unit == 0) & usable & np.isfinite(norms)
 
 
-# optimistix's Levenberg-Marquardt with a trust region that opens faster and knows rounding.
-
+# optimistix's Levenberg-Marquardt, with a radius for refused steps and an end of its own.
 
 # Annotated Any: what optimistix hands from step to step, records of its own without public names.
 
 _ROUNDING = 1e-12
-"""Part of the sum of squares below which a change is rounding."""
-
-
+"""part of the sum of squares below which a change is rounding"""
 _GROWTH = 3.0
 """times the change of the residuals by a step that did as predicted may the next one make"""
 ARRIVED = 1e-4
@@ -132,23 +129,20 @@ shrink by a fifth each take ten more to come to a thousandth"""
 
 
 class _Region(NamedTuple):
-    """How far to go next."""
+    """How far the next step may go."""
 
     step_size: Float[Array, ""]
     """one over the damping"""
     radius: Float[Array, ""]
-    """by how much the residuals may change; inf as long as no step was refused"""
+    """by how much the residuals may change; inf until a step is refused"""
 
 
 class _TrustRegion(optx.ClassicalTrustRegion):
-    """optimistix's trust region, but a step whose gain would drown in rounding is accepted, and
-    after one that is refused there is a radius as well as more damping.
+    """optimistix's trust region, with a radius beside the damping after a step that is refused.
 
-    Otherwise a step of negligible gain, which is the last, is rejected at random and the search
-    lingers. Damping alone does nothing until it comes to the size of what the data say: a search
-    that goes well has next to none, and tenfold of that would try a refused step again, time after
-    time. The radius is of the residuals' change, which directions that the data leave open do not
-    make.
+    A search that goes well has next to no damping, and tenfold of that would try a refused step
+    again, time after time. The radius limits the change of the residuals, which directions that the
+    data leave open do not make.
     """
 
     def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
@@ -167,86 +161,37 @@ class _TrustRegion(optx.ClassicalTrustRegion):
     ) -> Any:
         """As optimistix: next step size, whether the step counts, and two records of its own."""
         size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
-        cost = f_info.as_min()
-        gain = self.predict_reduction(y_eval - y, f_info)
+        cost, gain = f_info.as_min(), self.predict_reduction(y_eval - y, f_info)
         change = f_eval_info.as_min() - cost
-        # Both: a small predicted gain alone would also let a step pass that raises the cost.
-        negligible = (gain > -_ROUNDING * cost) & (change < _ROUNDING * cost)
-        accept |= negligible
+        # A step whose gain drowns in rounding, which is the last, would be refused at random.
+        accept |= (gain > -_ROUNDING * cost) & (change < _ROUNDING * cost)
         moved = f_info.jac.mv(y_eval - y)
         slope = jnp.sum(f_info.residual * moved)
         # Where the parabola by slope and cost is lowest, within a tenth and a half (More, 1978).
         part = -slope / (2.0 * (change - slope))
         part = jnp.where(jnp.isfinite(part), jnp.clip(part, 0.1, 0.5), 0.1)
-        grown = jnp.where(change < self.high_cutoff * gain, _GROWTH * _norm2(moved), 0.0)
+        as_predicted = change < self.high_cutoff * gain
+        grown = jnp.where(as_predicted, _GROWTH * _norm2(moved), 0.0)
         radius = jnp.where(accept, jnp.maximum(state.radius, grown), part * _norm2(moved))
         return size, accept, result, _Region(size, radius)
 
 
-class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """optimistix's Levenberg-Marquardt with a trust region that opens faster.
-
-    The default waits for an all but perfect model (ratio 0.99) before it lowers the damping.
-    """
-
-    rtol: float
-    atol: Float[Array, "..."]
-    norm: Callable[[Array], Array]
-    descent: optx.AbstractDescent
-    search: optx.AbstractSearch
-    verbose: Callable[..., None]
-
-    def __init__(
-        self, rtol: float, atol: Float[Array, "..."], convergence_mask: Bool[Array, " q"]
-    ) -> None:
-        """With the tolerances below whose sum a change is the last.
-
-        Args:
-            rtol: relative to the unknown, or to the size of the residuals.
-            atol: in the optimiser's units.
-        """
-        self.rtol, self.atol = rtol, atol
-        self.norm = _norm(convergence_mask)
-        # QR of the rows and not Cholesky of J'J, whose condition number is the square of theirs.
-        self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
-        # A hundred times the region where three quarters of the gain came that was predicted
-        # (optimistix: 3.5 times): the damping of 1 to begin with is gone within a few steps.
-        self.search = _TrustRegion(
-            high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
-        )
-        self.verbose = lambda **_: None
+# A hundred times the region where three quarters of the gain came that was predicted (optimistix:
+# 3.5 times): the damping of 1 to begin with is gone within a few steps.
+REGION = _TrustRegion(high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1)
 
 
-def within_reach(
-    state: Any, y: Float[Array, " q"], reach: Float[Array, " q"], unit: Float[Array, " q"]
-) -> Any:
-    """The solver's state, its next point no further from y than `reach` in each unknown by itself.
-
-    A bound on the whole step would let one unknown that runs away stop all others.
-
-    Args:
-        reach: by unknown, inf where there is no bound.
-        unit: of the unknowns y, in which reach is not given; 0 where one stays put.
-    """
-    reach = reach / jnp.where(unit > 0, unit, 1.0)
-    # In each unknown by itself: the others go as far as they wanted, and the direction is bent
-    # rather than shortened.
-    nearer = jnp.clip(state.y_eval, y - reach, y + reach)
-    return eqx.tree_at(lambda s: s.y_eval, state, nearer)
-
-
-def within_radius(state: Any, y: Float[Array, " q"], limited: Bool[Array, ""] | bool = True) -> Any:
-    """The solver's state, its next point no further from y than its radius.
-
-    Args:
-        limited: whether there is to be a radius at all.
-    """
+def within_radius(state: Any, y: Float[Array, " q"]) -> Any:
+    """The solver's state, its next point no further from y than its radius."""
     step = state.y_eval - y
-    size = _norm2(state.f_info.jac.mv(step))
-    radius = jnp.where(limited, state.search_state.radius, jnp.inf)
+    size, radius = _norm2(state.f_info.jac.mv(step)), state.search_state.radius
     nearer = y + step * jnp.minimum(1.0, radius / jnp.where(size > 0, size, 1.0))
-    # Where there is no radius the point is the solver's own, to the last digit.
+    # Without a radius the point is the solver's own, to the last digit.
     return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
+
+
+def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(jnp.square(v)))
 
 
 def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]:
@@ -271,46 +216,11 @@ def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]
     return gain * residual_norm**2
 
 
-def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(jnp.square(v)))
-
-
-def _norm(convergence_mask: Bool[Array, " q"]) -> Callable[[Array], Array]:
-    def norm(x: Array) -> Array:
-        # optimistix asks once with the q unknowns and once with the 2 q + 1 rows; their shape
-        # tells which. Of the rows the first is the size of the residuals, see `_compressed`.
-        unknowns = x.shape == convergence_mask.shape
-        return optx.max_norm(jnp.where(convergence_mask, x, 0.0) if unknowns else x[0])
-
-    return norm
-
-
-_TIKHONOV_SD = 100.0
-"""sd, in the coordinates of the free parameters (logarithms), of the Tikhonov regularisation that
-ties them to the start: a factor of e^100 is no prior, but it tells one end of a valley from the
-other"""
-
-_TIKHONOV_SDS_LINEAR = 1e6
-"""the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
-that the data would give it at the start if all else were known"""
-
-_REACH = 3.0
-"""of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
-
-
 class Constants(NamedTuple):
     """What stays the same throughout one run."""
 
     z0: Float[Array, " q"]
     scaling: Scaling
-    tikhonov: Float[Array, " q"]
-    """one over the sd of the tie to the start, 0 without"""
-    convergence_mask: Bool[Array, " q"]
-    """the unknowns whose steps say whether the optimiser has arrived"""
-    reach: Float[Array, " q"]
-    """how far one step may go, by unknown"""
-    with_radius: Bool[Array, ""]
-    """whether a refused step shortens the next ones, beside what damping does"""
 
 
 class _Rows(NamedTuple):
@@ -341,12 +251,14 @@ _OPTIONS: dict[str, Any] = {"jac": "bwd"}
 """a Jacobian of numbers, which can be handed from step to step"""
 
 
-def _solver(constants: Constants) -> LevenbergMarquardt:
+def _solver(constants: Constants) -> optx.LevenbergMarquardt:
     # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
     # and smaller gains drown in the rounding of the sum of squares. In the optimiser's units a
     # standard deviation is 1 / (column norm * residual norm).
     atol = 1e-3 / (COLUMN * constants.scaling.residual_norm)
-    return LevenbergMarquardt(1e-9, atol, constants.convergence_mask)
+    # QR of the rows: Cholesky of J'J would square their condition number.
+    solver = optx.LevenbergMarquardt(1e-9, cast(float, atol), linear_solver=lx.QR())
+    return eqx.tree_at(lambda s: s.search, solver, REGION)
 
 
 def compressed(
@@ -362,20 +274,15 @@ def compressed(
     return R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
 
 
-def _rows(constants: Constants, R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
-    # Where the data leave a direction of the parameters open, the weakest of regularisations keeps
-    # them from drifting along it.
-    (unit, norm), tikhonov = constants.scaling, constants.tikhonov
-    tie = -unit * xi * tikhonov / norm
-    pull = -jnp.diag(tikhonov * unit) / norm
-    return _Rows(xi, jnp.concatenate([R[:, 0], tie]), jnp.concatenate([R[:, 1:], pull]))
+def _rows(R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
+    return _Rows(xi, R[:, 0], R[:, 1:])
 
 
 def begin(constants: Constants) -> State:
     q = constants.z0.shape[0]
     xi = jnp.zeros_like(constants.z0)
     # The first step accepts whatever is at z0, so that of these rows only the shapes count.
-    rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
+    rows = _rows(jnp.zeros((q + 1, q + 1), xi.dtype), xi)
     shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
     solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
     return State(xi, solver, jnp.asarray(False), jnp.asarray(False))
@@ -383,10 +290,9 @@ def begin(constants: Constants) -> State:
 
 def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
-    rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
+    rows, solver = _rows(R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
-    new = within_radius(new, xi, constants.with_radius)
-    new = within_reach(new, xi, constants.reach, constants.scaling.unit)
+    new = within_radius(new, xi)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     fine = result == optx.RESULTS.successful
     gain = gain_ahead(new.f_info, constants.scaling.residual_norm)
@@ -413,48 +319,6 @@ class Compiled(NamedTuple):
 _ARITHMETIC = (compressed, begin, advance, point)
 SINGLE = Compiled(*(jax.jit(f) for f in _ARITHMETIC))
 BATCHED = Compiled(*(jax.jit(jax.vmap(f)) for f in _ARITHMETIC))
-
-
-class _Kinds(NamedTuple):
-    """What the optimiser has to know of each unknown, (q,)."""
-
-    tikhonov: Float[np.ndarray, " q"]
-    """one over the sd of the tie to the start, where a coordinate has a size of its own"""
-    linear: Bool[np.ndarray, " q"]
-    """those without one"""
-    mask: Bool[np.ndarray, " q"]
-    """as `Constants.convergence_mask`"""
-    reach: Float[np.ndarray, " q"]
-
-
-def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
-    return _constants(z0, units, _kinds_of(layout, z0.dtype))
-
-
-@jax.jit
-def _constants(z0: Array, units: Scaling, kinds: _Kinds) -> Constants:
-    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
-    usable = units.unit > 0
-    # The norms of the columns at the start, that is one over the sd of each unknown alone.
-    norms = COLUMN * units.residual_norm / jnp.where(usable, units.unit, 1.0)
-    ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
-    tikhonov = jnp.where(kinds.linear, ties, kinds.tikhonov)
-    mask, reach = jnp.asarray(kinds.mask), jnp.asarray(kinds.reach)
-    return Constants(z0, units, tikhonov, mask, reach, jnp.asarray(True))
-
-
-def _kinds_of(layout: Layout, dtype: np.dtype) -> _Kinds:
-    at = np.arange(layout.size)
-    # Nuisances have weak priors of their own; time shift and disturbance have limits.
-    logarithmic = np.where(at < len(layout.free), 1.0 / _TIKHONOV_SD, 0.0)
-    # Not the noise's: a disturbance that is hardly there may wander on where it changes nothing
-    # else, since no likelihood has a maximum there.
-    mask = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
-    # Of several noises one may vanish, where its logarithm runs off: each by itself.
-    last = layout.first_nuisance - (0 if layout.filtered else len(layout.scaled))
-    noises = (at >= len(layout.of_interest)) & (at < last)
-    reach = np.where(noises & (len(layout.sizes) > 1), _REACH, np.inf)
-    return _Kinds(logarithmic.astype(dtype), without_size(layout), mask, reach.astype(dtype))
 
 
 # A whole run.
@@ -563,14 +427,14 @@ def _optimise_in_one_program(
 
     def step(now: _Loop) -> _Loop:
         k, units, state = now.standing
-        tried = point(constants_of(layout, z0, units), state.solver.y_eval)
+        tried = point(Constants(z0, units), state.solver.y_eval)
         e = differentiate(layout, data, noise, tried)
         units = jax.tree.map(
             lambda new, old: jnp.where(k == 0, new, old), scaling(e.r, e.J, trusted), units
         )
 
         def advanced() -> State:
-            constants = constants_of(layout, z0, units)
+            constants = Constants(z0, units)
             return advance(constants, state, compressed(constants, e.r, e.J))
 
         # Where nobody steps the triangle of J, which takes longer than J, is not needed.
@@ -578,7 +442,7 @@ def _optimise_in_one_program(
         return _Loop(_Standing(k + 1, units, state), e)
 
     end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0, begun))
-    constants = constants_of(layout, z0, end.standing.scaling)
+    constants = Constants(z0, end.standing.scaling)
     return _End(point(constants, end.standing.state.xi), end.standing, end.last)
 
 
@@ -588,7 +452,7 @@ def _before_the_loop(
     # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere. Evaluated
     # before the loop it would be compiled twice, the residuals being most of the program.
     units = Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
-    fresh = _Standing(jnp.asarray(0), units, begin(constants_of(layout, z0, units)))
+    fresh = _Standing(jnp.asarray(0), units, begin(Constants(z0, units)))
     standing = jax.tree.map(lambda new, old: jnp.where(begun.k == 0, new, old), fresh, begun)
     shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
     last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
@@ -604,9 +468,8 @@ def _not_begun(q: int, dtype: np.dtype) -> _Standing:
 
     def shapes() -> _Standing:
         zeros = jnp.zeros(q, dtype)
-        units, none = Scaling(zeros, jnp.ones((), dtype)), jnp.zeros(q, bool)
-        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True))
-        return _Standing(jnp.asarray(0), units, begin(constants))
+        units = Scaling(zeros, jnp.ones((), dtype))
+        return _Standing(jnp.asarray(0), units, begin(Constants(zeros, units)))
 
     # Of NumPy: nothing is compiled for it.
     return jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), jax.eval_shape(shapes))
@@ -762,9 +625,5 @@ def _run(
     if held is not None:
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
-    constants = constants_of(layout, z0, scaling(r0, J0, trusted))
-    if held is not None:
-        # Initial states alone, from far off: steps that are shortened end in the next valley (a
-        # pendulum near the top of its swing).
-        constants = constants._replace(with_radius=jnp.asarray(False))
+    constants = Constants(jnp.asarray(z0), scaling(r0, J0, trusted))
     return descend(evaluate, constants, first, count, max_steps, SINGLE)

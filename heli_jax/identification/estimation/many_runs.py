@@ -17,9 +17,9 @@ from heli_jax.fused.sensitivities import Products, Sensitive, full
 from heli_jax.fused.traced import Traced, traced
 from heli_jax.identification.estimation.levenberg_marquardt import (
     BATCHED,
+    Constants,
     Optimum,
     Scaling,
-    constants_of,
     descend,
     residual_and_jacobian,
     scaling,
@@ -391,7 +391,7 @@ def optimise_many(
         chosen = np.minimum(np.arange(i, i + batch), k - 1)
         z0 = starts[chosen]
         numbers = jax.vmap(data)(jax.tree.map(lambda v, chosen=chosen: v[chosen], each))
-        constants = jax.vmap(lambda z: constants_of(layout, z, units))(z0)
+        constants = jax.vmap(lambda z: Constants(z, units))(z0)
 
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)
