@@ -12,7 +12,6 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import initial_sd_of
 from heli_jax.identification.estimation.kalman import innovations
-from heli_jax.identification.identifiability.through_inputs import _of_columns
 from heli_jax.naming import asdict
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.inputs import random_steps
@@ -163,12 +162,3 @@ def test_noise_of_the_models_own_is_kept_and_fitted():
     for name, true in {"Lp": -5.0, "gust": 0.5}.items():
         estimate = found.estimates[name]
         assert abs(estimate.value - true) < 3.5 * estimate.sd
-
-
-def test_two_that_cannot_be_told_apart_are_named_together():
-    rng = np.random.default_rng(0)
-    rows = 10.0 * rng.standard_normal((40, 3))
-    assert _of_columns(["a", "b", "c"], rows, np.linalg.norm(rows, axis=0)) == []
-    rows[:, 1] = -2.0 * rows[:, 0]
-    [note] = _of_columns(["a", "b", "c"], rows, np.linalg.norm(rows, axis=0))
-    assert (note.code, note.subjects) == ("identifiability.disturbances-exchangeable", ("a", "b"))

@@ -46,7 +46,6 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     noise.residuals_white,
     noise.residuals_correlated,
     noise.disturbance_shows,
-    noise.disturbances_determined,
     noise.noise_as_stated,
     search.search_told,
     search.prior_contradicted,

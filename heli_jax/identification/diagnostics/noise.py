@@ -9,7 +9,6 @@ from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.diagnostics.context import Context, no_disturbance
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
-from heli_jax.identification.identifiability.through_inputs import of_disturbances
 from heli_jax.identification.unknowns.layout import disturbance_limits
 
 COLOURED, TOO_NARROW = "noise.residuals-coloured", "noise.intervals-too-narrow"
@@ -76,11 +75,6 @@ def _at_ends(c: Context) -> Iterator[Finding]:
         unit = naming.unit(layout.model.Params, name) or ""
         value = f"{np.exp(min(max(at, low), high)):.3g} {unit}".rstrip()
         yield found("noise.disturbance-open", "note", name, ran_to=value, like=meaning)
-
-
-def disturbances_determined(c: Context) -> Iterator[Finding]:
-    """Parameters of several disturbances that the data do not tell apart."""
-    return iter(of_disturbances(c.at.layout, c.e, c.absent))
 
 
 def noise_as_stated(c: Context) -> Iterator[Finding]:
