@@ -20,7 +20,7 @@ from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
 from heli_jax.dynamics.onboard.delays import with_delays
-from heli_jax.identification.validation.feedback import feedback
+from heli_jax.identification.validation.follows_response import feedback
 from heli_jax.naming import Scalar, asdict
 from heli_jax.simulation.inputs import random_steps
 

@@ -14,7 +14,7 @@ from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.finding import note
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.validation.advice import OutputAdequacy
+from heli_jax.identification.validation.adequacy import OutputAdequacy
 
 RATE, DURATION = 25.0, 16.0
 BIAS, SCALE, LATE = 1.5, 0.08, 0.04

@@ -21,7 +21,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
-from heli_jax.identification.validation.advice import is_unstable
+from heli_jax.identification.validation.adequacy import is_unstable
 
 
 class SearchState(NamedTuple):

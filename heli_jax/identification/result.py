@@ -15,7 +15,7 @@ from heli_jax.identification.methods import METHODS, objective_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.held_out_frequency import HeldOutFrequency
+from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:

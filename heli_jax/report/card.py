@@ -17,7 +17,7 @@ from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
-from heli_jax.identification.validation.held_out_frequency import LEVEL
+from heli_jax.identification.validation.held_out import LEVEL
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import number, p_value, percent, vaf_percent
 from heli_jax.report import frequency

@@ -38,10 +38,14 @@ from heli_jax.identification.model_selection import Candidate, Nested
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status
 from heli_jax.identification.uncertainty.nuts import Convergence
-from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
-from heli_jax.identification.validation.advice import OutputAdequacy
+from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
+    EXPLAINED,
+    NEARLY_WHITE,
+    OutputAdequacy,
+)
 from heli_jax.identification.validation.follows_response import LEVEL, Feedback
-from heli_jax.identification.validation.held_out_frequency import HeldOutFrequency
+from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
 from heli_jax.report.statements import whiteness_note

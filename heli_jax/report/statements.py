@@ -8,8 +8,12 @@ from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
-from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
-from heli_jax.identification.validation.advice import FAR_FROM_WHITE
+from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
+    EXPLAINED,
+    FAR_FROM_WHITE,
+    NEARLY_WHITE,
+)
 from heli_jax.numbers import percent
 from heli_jax.vehicle import of_helicopter
 

@@ -23,7 +23,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
-from heli_jax.identification.validation.held_out_frequency import HeldOutFrequency
+from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import diverges
 from heli_jax.numbers import (
     NOTHING,

@@ -12,7 +12,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.analysis.operating_point import operating_point
 from heli_jax.identification.result import Signals
-from heli_jax.identification.validation.aliases import fast_modes
+from heli_jax.identification.validation.logging_rate import fast_modes
 from heli_jax.report import frequency
 from heli_jax.report.frequency import FittedFlight
 from tests.dynamics import whole_helicopter as oracle

@@ -8,10 +8,9 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem
 from heli_jax.finding import Distrust, Finding, distrusted, exit_code, weighed
-from heli_jax.identification.diagnostics import adequacy, held_out
+from heli_jax.identification.diagnostics import adequacy
 from heli_jax.identification.diagnostics.context import HeldOut
-from heli_jax.identification.validation.adequacy import Evidence, assess, predicts_nothing
-from heli_jax.identification.validation.advice import Record
+from heli_jax.identification.validation.adequacy import Evidence, Record, assess, predicts_nothing
 from heli_jax.identification.validation.metrics import metrics, whiteness
 from tests.identification.lag import LAG, Params, response
 
@@ -182,6 +181,6 @@ def test_a_misfit_takes_away_the_intervals_that_it_moves_by_more_than_half():
 def test_flights_held_out_are_held_against_their_mean(monkeypatch, vaf, worse):
     at = SimpleNamespace(layout=SimpleNamespace(noise_model="white"))
     fitted = SimpleNamespace(at=at, held_out=HeldOut())
-    monkeypatch.setattr(held_out, "pooled_metrics", lambda _: {"p": SimpleNamespace(vaf=vaf)})
-    found = list(held_out.held_out_predicted(fitted))
+    monkeypatch.setattr(adequacy, "pooled_metrics", lambda _: {"p": SimpleNamespace(vaf=vaf)})
+    found = list(adequacy.held_out_predicted(fitted))
     assert [(f.subjects, f.denies) for f in found] == worse * [(("p",), True)]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from heli_jax import Free, Nuisance, Prior, Problem, fit
-from heli_jax.identification.validation.aliases import fast_modes
+from heli_jax.identification.validation.logging_rate import fast_modes
 from tests.identification.test_enough import DT, SWING, TRUTH, flight
 
 # The mode of the truth, seen one turn of the sampling further on.

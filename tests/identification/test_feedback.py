@@ -11,8 +11,7 @@ from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
-from heli_jax.identification.validation.feedback import feedback_of
-from heli_jax.identification.validation.follows_response import feedback
+from heli_jax.identification.validation.follows_response import feedback, feedback_of
 from heli_jax.naming import asdict
 from tests.identification.lag import LAG
 from tests.identification.lag import Params as LagParams

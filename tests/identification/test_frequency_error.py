@@ -25,12 +25,13 @@ from heli_jax.dynamics.jacobians import point
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
+    Record,
+    cut_notes,
     errors_of_lines,
     resolved,
     states,
 )
 from heli_jax.identification.estimation.frequency_noise import smoothed
-from heli_jax.identification.estimation.frequency_records import Record, cut_notes
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive

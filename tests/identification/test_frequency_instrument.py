@@ -23,7 +23,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
 from heli_jax.identification.fit import context_of
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.excitation_test import _in_bands
-from heli_jax.identification.validation.feedback import feedback_of
+from heli_jax.identification.validation.follows_response import feedback_of
 
 DT = 0.04
 LEANING = """

@@ -8,7 +8,7 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Problem, fit, linear_model, linearize, models
 from heli_jax.analysis.spectra import ResponseOptions
-from heli_jax.identification.validation.held_out_frequency import HeldOutFlight
+from heli_jax.identification.validation.held_out import HeldOutFlight
 from heli_jax.report.card import card
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, amplitude_for, record, vehicle

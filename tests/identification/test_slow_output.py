@@ -10,7 +10,7 @@ from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.flights.slower import Timed, at_nearest
 from heli_jax.identification.equation_error.records import segments
 from heli_jax.identification.equation_error.rls import baseline
-from heli_jax.identification.validation.feedback import untested
+from heli_jax.identification.validation.follows_response import untested
 from heli_jax.identification.validation.metrics import whiteness
 
 from .bench import BENCH, amplitude_for, denominators, steps, vehicle

@@ -8,8 +8,7 @@ import pytest
 
 from heli_jax import fit, stages
 from heli_jax.analysis.spectra import ResponseOptions
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines, in_time_of, lines_of
 from heli_jax.identification.uncertainty.bootstrap import _spectrum_records, bootstrap
 
 

@@ -10,8 +10,7 @@ import scipy.signal
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.signal_facts import facts_of_all
 from heli_jax.identification.diagnostics.quality import stuck_outputs
-from heli_jax.identification.validation.adequacy import Evidence, _of_noise
-from heli_jax.identification.validation.advice import OutputAdequacy, Record
+from heli_jax.identification.validation.adequacy import Evidence, OutputAdequacy, Record, _of_noise
 from heli_jax.identification.validation.shifts import led_by
 
 RNG = np.random.default_rng(0)

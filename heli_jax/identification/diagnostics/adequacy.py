@@ -5,9 +5,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from heli_jax.finding import Finding, found, note
+from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED
-from heli_jax.identification.validation.advice import GATE, OutputAdequacy, advice_for
+from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
+    EXPLAINED,
+    GATE,
+    WORSE,
+    OutputAdequacy,
+    advice_for,
+)
 from heli_jax.identification.validation.excitation_test import LEVEL
 
 
@@ -162,3 +169,23 @@ def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
         p_values=list(c.unrelated.values()),
         level=LEVEL / len(c.unrelated),
     )
+
+
+# Do the estimates predict flights that they were not fitted to?
+
+
+def held_out_predicted(c: Context) -> Iterator[Finding]:
+    """Flights held out that the model does not predict."""
+    yield from c.held_out.notes
+    if c.held_out.in_frequency is not None:
+        yield from c.held_out.in_frequency.findings
+        return
+    # With gusts in the model, or no simulation in the fit, a simulation says little.
+    if c.at.layout.noise_model != "white":
+        return
+    for name, m in pooled_metrics(c.held_out.signals).items():
+        # By more than chance makes of an output that does not respond.
+        if not m.vaf >= WORSE:
+            yield found(
+                "held-out.worse-than-mean", "doubt", name, value=m.vaf, denies=True, limit=WORSE
+            )

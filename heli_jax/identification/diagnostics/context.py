@@ -39,17 +39,12 @@ from heli_jax.identification.validation.adequacy import (
     EXPLAINED,
     Adequacy,
     Evidence,
+    Record,
     assess,
     inputs_explain_nothing,
+    is_unstable,
     joined_metrics,
     misses,
-)
-from heli_jax.identification.validation.advice import Record, is_unstable
-from heli_jax.identification.validation.aliases import (
-    FastMode,
-    as_good_as_aliases,
-    fast_modes,
-    measurement_noise,
 )
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
@@ -64,12 +59,17 @@ from heli_jax.identification.validation.excitation_test import (
     residual_against_excitation,
 )
 from heli_jax.identification.validation.excited_band import Excitation, excitation_of
-from heli_jax.identification.validation.feedback import feedback_of
-from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.held_out import validate
-from heli_jax.identification.validation.held_out_frequency import (
+from heli_jax.identification.validation.follows_response import Feedback, feedback_of
+from heli_jax.identification.validation.held_out import (
     HeldOutFrequency,
+    validate,
     validate_in_frequency,
+)
+from heli_jax.identification.validation.logging_rate import (
+    FastMode,
+    as_good_as_aliases,
+    fast_modes,
+    measurement_noise,
 )
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.unmodelled import Unmodelled, unmodelled

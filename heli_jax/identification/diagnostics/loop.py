@@ -8,15 +8,20 @@ from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.estimation.frequency_instrument import STRONG
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.validation.advice import is_unstable
+from heli_jax.identification.validation.adequacy import is_unstable
 from heli_jax.identification.validation.closed_loop_trust import (
     MAY_BE,
     knows_no_gusts,
     untrusted,
     weak_by_instrument,
 )
-from heli_jax.identification.validation.feedback import untested, why_untested
-from heli_jax.identification.validation.follows_response import LEVEL, SEEN, Feedback
+from heli_jax.identification.validation.follows_response import (
+    LEVEL,
+    SEEN,
+    Feedback,
+    untested,
+    why_untested,
+)
 
 FEEDBACK = "loop.feedback"
 _HELD = 1.0

@@ -8,10 +8,10 @@ from heli_jax.finding import Finding, Severity, found
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels
-from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.logging_rate import (
     RATE,
     Rate,
+    measurement_noise,
     power_between_samples,
     rates_against_modes,
 )

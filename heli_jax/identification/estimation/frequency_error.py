@@ -32,24 +32,23 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrument_notes,
     instrumented_inputs,
 )
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_noise import (
-    log_determinants,
-    whitening_alone,
-    whitening_by,
-    whitening_without_model,
-)
-from heli_jax.identification.estimation.frequency_records import (
+from heli_jax.identification.estimation.frequency_lines import (
     FlightFacts,
     cut_notes,
+    errors_of_lines,
     lines_of,
     other_outputs,
     parts_of,
     records_of,
     without_parts,
 )
+from heli_jax.identification.estimation.frequency_noise import (
+    log_determinants,
+    whitening_alone,
+    whitening_by,
+    whitening_without_model,
+)
 from heli_jax.identification.estimation.frequency_slopes import rows_of_lines
-from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
     condition_of,
@@ -57,6 +56,7 @@ from heli_jax.identification.estimation.linearised_flights import (
 )
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
+from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (

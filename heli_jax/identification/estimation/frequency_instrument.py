@@ -19,8 +19,8 @@ from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations
+from heli_jax.identification.estimation.frequency_lines import in_time_of, lines_of
 from heli_jax.identification.estimation.frequency_noise import AVERAGES, smoothed, smoothed_with
-from heli_jax.identification.estimation.frequency_records import in_time_of, lines_of
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution

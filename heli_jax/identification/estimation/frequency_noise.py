@@ -14,9 +14,10 @@ from heli_jax.identification.estimation.frequency_lines import (
     Machine,
     alike,
     first_machine,
+    lines_of,
     machines_of,
+    records_of,
 )
-from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
 # Spectra of records at their own frequencies, smoothed over frequency and over records.

@@ -46,9 +46,9 @@ from heli_jax.identification.estimation.frequency_lines import (
     machines_of,
 )
 from heli_jax.identification.estimation.frequency_slopes import shared_of, with_shared
-from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
+from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.estimation.residual import Residuals
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,

@@ -17,6 +17,7 @@ from jaxtyping import Array, Complex, Float
 from heli_jax.identification.estimation.frequency_lines import (
     Errors,
     Matrices,
+    Record,
     Resolved,
     Signals,
     alike,
@@ -30,7 +31,6 @@ from heli_jax.identification.estimation.frequency_lines import (
     resolved,
     stacked,
 )
-from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 # The unknowns that all flights share, as a vector, and what hangs on them with its derivatives.

@@ -13,9 +13,9 @@ from heli_jax import naming, stages
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_error import OBJECTIVE as FREQUENCY_ERROR
 from heli_jax.identification.estimation.frequency_error import first_spectrum
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_records import (
+from heli_jax.identification.estimation.frequency_lines import (
     FlightFacts,
+    errors_of_lines,
     in_time_of,
     parts_of,
     records_of,

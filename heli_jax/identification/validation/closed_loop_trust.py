@@ -44,9 +44,8 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instruments_of,
     strengths,
 )
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines, lines_of, records_of
 from heli_jax.identification.estimation.frequency_noise import LEAST, machine_of, smoothed
-from heli_jax.identification.estimation.frequency_records import lines_of, records_of
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem

@@ -21,8 +21,7 @@ from jaxtyping import Complex, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines, records_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 

@@ -1,23 +1,34 @@
 """Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+import scipy.special
+from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
-from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.levenberg_marquardt import optimise
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines, parts_of
+from heli_jax.identification.estimation.levenberg_marquardt import optimise, residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise, first_noise_sizes
+from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.validation.excitation_test import (
+    LEVEL,
+    errors_against_excitation,
+)
+from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
+from heli_jax.numbers import p_value, percent, plain_words
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -133,3 +144,218 @@ def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Fin
     if astray:
         return [found("held-out.not-finite", "note", *astray)]
     return [] if converged else [found("held-out.nuisances-not-found", "note")]
+
+
+# Flights held out, judged in frequency: nothing is simulated, so that unstable models can be
+# judged too, and gusts raise the noise and not the doubt.
+#
+# Each flight gets a spectrum of its own residual and is asked two questions. Would it, by itself,
+# give other estimates? One step of Gauss and Newton from the fit's, in the flight's own noise, is
+# compared with the errors of both (Chow's test). And does the model explain what follows the
+# excitation, as is asked of the fitted flights?
+#
+# Source: Chow (1960).
+
+
+_ROUNDS = 3
+"""of the flight's noise"""
+_NO_EFFECT = 1e-10
+"""part of the largest size below which a direction has no effect"""
+_SURE = 0.05
+"""sd of the explained share by chance, above which it is not reported"""
+
+
+class Furthest(NamedTuple):
+    """The parameter whose estimate from a flight is the furthest from the fit's."""
+
+    parameter: str
+    own: float
+    """from the flight by itself, after one step [SI]"""
+    fitted: float
+    sds: float
+    """joint standard deviations between the two"""
+
+
+class HeldOutFlight(NamedTuple):
+    """A flight held out."""
+
+    flight: str
+    estimates_p_value: float | None
+    """the chance that errors alone make the flight's own estimates as far from the fit's; null
+    where the flight says nothing of them"""
+    furthest: Furthest | None
+    explained: dict[str, float]
+    """by output the part that the model explains of the power that follows the excitation; below 0
+    it is worse than no model; only where gusts leave at most 0.05 of it to chance"""
+    worse: tuple[str, ...]
+    """the outputs that a model without any response would explain better"""
+
+    @property
+    def differs(self) -> bool:
+        """True if the flight gives other estimates."""
+        return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
+
+    @property
+    def in_words(self) -> str:
+        """The estimates and what is explained, in a line."""
+        known = []
+        if self.estimates_p_value is not None:
+            verb = "differ" if self.differs else "agree"
+            known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
+        shares = [
+            f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
+            for n, v in self.explained.items()
+        ]
+        if shares:
+            known.append(f"explained of what follows the excitation: {', '.join(shares)}")
+        return "; ".join(known) or "says nothing of the model"
+
+    @property
+    def findings(self) -> Iterator[Finding]:
+        """What contradicts the fit."""
+        if self.worse:
+            yield found(
+                "held-out.worse-than-none", "doubt", self.flight, *self.worse, denies=True,
+                flight=self.flight, names=self.worse,
+            )  # fmt: skip
+        if self.differs and self.furthest is not None:
+            f = self.furthest
+            yield found(
+                "held-out.other-estimates", "doubt", self.flight, value=self.estimates_p_value,
+                shifts={f.parameter: f.own - f.fitted}, limit=LEVEL, flight=self.flight,
+                **f._asdict(),
+            )  # fmt: skip
+
+
+class HeldOutFrequency(NamedTuple):
+    """The flights held out of a fit in frequency."""
+
+    flights: tuple[HeldOutFlight, ...]
+    notes: tuple[Finding, ...]
+    """why a flight is not judged"""
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What they contradict, and which of them are not judged."""
+        return [*self.notes, *(finding for f in self.flights for finding in f.findings)]
+
+
+class _Fitted(NamedTuple):
+    """The estimates of a fit, and what it knows of them."""
+
+    information: Float[np.ndarray, "q q"]
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " q"]
+    slopes: Float[np.ndarray, " q"]
+
+
+def validate_in_frequency(
+    problem: Problem, at: Solution, e: Evaluation, held: Sequence[Flight], *, feedback: bool
+) -> HeldOutFrequency | None:
+    """Judge the flights held out of a fit in frequency; None of a fit in time.
+
+    Args:
+        at: where the fit ended.
+        feedback: True if inputs follow the outputs and no instrument is used.
+    """
+    q = len(at.layout.of_interest)
+    J = np.asarray(e.J, float)[:, :q]
+    if not held or at.layout.noise_model != "spectrum" or not np.isfinite(J).all():
+        return None
+    fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
+    flights, notes = [], []
+    for label, flight in zip(labels(tuple(held)), held, strict=True):
+        part, why = _comparable(problem, at, flight, feedback=feedback)
+        judged = None
+        if part is not None:
+            with np.errstate(all="ignore"):
+                judged = _judged(problem, at, fitted, label, part)
+            why = why if judged is not None else "its errors have no spectrum"
+        flights += [judged] if judged is not None else []
+        if why:
+            notes.append(found("held-out.not-judged", "note", label, flight=label, why=why))
+    return HeldOutFrequency(tuple(flights), tuple(notes))
+
+
+def _comparable(
+    problem: Problem, at: Solution, flight: Flight, *, feedback: bool
+) -> tuple[Flight | None, str]:
+    """The flight with the outputs that can be judged, or None; what is left out, and why."""
+    if feedback:
+        return None, "inputs follow the outputs, and no instrument is used"
+    by = instruments_of(problem)
+    if by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by):
+        return None, "none of its instruments moves"
+    common = [n for n in flight.outputs if n in at.layout.outputs[0]]
+    if not common:
+        return None, f"it has none of the fitted outputs ({', '.join(at.layout.outputs[0])})"
+    sound, still = moving_outputs(with_outputs(flight, common))
+    if sound is not None and not parts_of(sound):
+        return None, "no part of it has all of its outputs"
+    return sound, still
+
+
+def _judged(
+    problem: Problem, at: Solution, fit: _Fitted, label: str, flight: Flight
+) -> HeldOutFlight | None:
+    """One flight; None if its errors have no spectrum."""
+    # At the lines of the whole flight, also after a fit of responses.
+    problem = replace(problem, method="frequency-error")
+    layout = layout_of(problem, (flight,))
+    data, noise = data_of(problem, (flight,), layout), first_noise(problem, (flight,))
+    first, q = layout.first_nuisance, len(layout.of_interest)
+    z = jnp.zeros(layout.size, at.z.dtype).at[:first].set(at.z[:first])
+    if not layout.model.linear:
+        # Such a model is linearised where the nuisances put it.
+        z = z.at[first:].set(start_vector(layout, data, problem)[first:])
+        z = in_time(layout, data, noise, z)
+    for _ in range(_ROUNDS):
+        z, noise = layout.objective.relax(layout, data, noise, z)
+    if not np.isfinite(float(noise.log_variance_ratio)):
+        return None
+    there = Solution(layout, data, noise, z)
+    made = residual_and_jacobian(*there)
+    # A row for each parameter and one for the rest of the errors; the priors are no news.
+    r, J = np.asarray(made.r)[: q + 1], np.asarray(made.J)[: q + 1, :q]
+    by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
+    errors = jax.device_get(errors_of_lines(*there).errors)
+    followed = errors_against_excitation((flight,), there, errors, by)
+    level = LEVEL / max(len(followed), 1)
+    worse = [n for n, f in followed.items() if f.p_value < level and not f.explained >= 0.0]
+    known = [n for n, f in followed.items() if f.by_chance < _SURE or n in worse]
+    explained = {n: min(followed[n].explained, 1.0) for n in known}
+    return HeldOutFlight(label, *_own_estimates(r, J, fit), explained, tuple(worse))
+
+
+def _own_estimates(
+    r: Float[np.ndarray, " r"], J: Float[np.ndarray, "r q"], fit: _Fitted
+) -> tuple[float | None, Furthest | None]:
+    """The chance that the flight's own estimates lie as far from the fit's, and the furthest; None
+    where the two have no direction in common.
+
+    Args:
+        r: the flight's errors, in units of its own noise.
+    """
+    own, known = J.T @ J, fit.information
+    if not (np.isfinite(own).all() and np.isfinite(r).all()):
+        return None, None
+    sizes = np.sqrt(np.diag(own + known))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    b, (own, known) = J.T @ r / sizes, (v / np.outer(sizes, sizes) for v in (own, known))
+    values, vectors = np.linalg.eigh(own + known)
+    kept = values > _NO_EFFECT * values[-1]
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    shares, turned = np.linalg.eigh(root.T @ own @ root)
+    # A direction that only one of the two determines cannot be compared.
+    both = (shares > _NO_EFFECT) & (shares < 1.0 - _NO_EFFECT)
+    if not both.any():
+        return None, None
+    directions, shares = root @ turned[:, both], shares[both]
+    along = directions.T @ b
+    p = scipy.special.chdtrc(int(both.sum()), np.sum(along**2 * (1.0 / shares - 1.0)))
+    moved = -(directions @ (along / shares)) / sizes * fit.slopes
+    sd = np.sqrt(np.sum(directions**2 / (shares * (1.0 - shares)), axis=1)) / sizes
+    sds = np.abs(moved) / np.maximum(sd * np.abs(fit.slopes), 1e-300)
+    k = int(np.argmax(sds))
+    own_value = float(fit.values[k] + moved[k])
+    return float(p), Furthest(fit.names[k], own_value, float(fit.values[k]), float(sds[k]))
