@@ -52,7 +52,7 @@ ABLATIONS: tuple[Ablation, ...] = (
     Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
     Ablation(
         "likelier_hold",
-        f"{_IDENTIFICATION}.model_selection:with_likelier_hold",
+        f"{_IDENTIFICATION}.select:with_likelier_hold",
         lambda problem, fit, refit: (problem, fit),
     ),
     Ablation(

@@ -21,7 +21,7 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.model_selection import disturbed_sets
+from heli_jax.identification.select import disturbed_sets
 from heli_jax.simulation.inputs import random_steps
 
 DT, NOISE = 0.02, {"p": 0.01, "q": 0.01, "r": 0.01, "w": 0.03}

@@ -22,10 +22,15 @@ from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.rls import Baseline, baseline
 from heli_jax.identification.fit import check, fit, rates
-from heli_jax.identification.method_comparison import MethodComparison, compare_methods
-from heli_jax.identification.model_selection import Choice, choose, with_likelier_hold
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
+from heli_jax.identification.select import (
+    Choice,
+    MethodComparison,
+    choose,
+    compare_methods,
+    with_likelier_hold,
+)
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses

@@ -129,7 +129,7 @@ ROOMS = (
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
     "agreement", "diagnostics", "restarts", "search", "fit",
-    "frequency_start", "method_comparison", "model_selection",
+    "frequency_start", "select",
 )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
     from heli_jax.identification.equation_error.start import EquationErrorStart
-    from heli_jax.identification.model_selection import Alternatives
+    from heli_jax.identification.select import Alternatives
 
 
 def problem(experiment: Experiment) -> Problem:
@@ -222,7 +222,7 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         InputError: no axis of the model can be disturbed.
     """
     # Not before it is needed: it imports the optimiser, which takes a second.
-    from heli_jax.identification.model_selection import (
+    from heli_jax.identification.select import (
         alternatives,
         disturbed_sets,
         undisturbed_too,

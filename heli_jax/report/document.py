@@ -33,10 +33,9 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.profile import Profile
 from heli_jax.identification.identifiability.verdict import Combination, Pair
-from heli_jax.identification.method_comparison import MethodComparison
-from heli_jax.identification.model_selection import Candidate, Nested
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status
+from heli_jax.identification.select import Candidate, MethodComparison, Nested
 from heli_jax.identification.uncertainty.nuts import Convergence
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,

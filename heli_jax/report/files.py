@@ -10,10 +10,9 @@ from heli_jax.finding import Finding, as_data
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit, Signals
-from heli_jax.identification.method_comparison import MethodComparison
-from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check
+from heli_jax.identification.select import Choice, MethodComparison
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report.document import FitFile, VerdictContent, plain, written
 from heli_jax.report.fitted_responses import FittedResponses

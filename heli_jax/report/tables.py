@@ -17,10 +17,9 @@ from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Z95, Combination
-from heli_jax.identification.method_comparison import MethodComparison, MethodResult
-from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
+from heli_jax.identification.select import Choice, MethodComparison, MethodResult
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
 from heli_jax.identification.validation.held_out import HeldOutFrequency

@@ -8,7 +8,7 @@ import pytest
 
 from heli_jax import Flight, Free, Problem, fit, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.model_selection import Candidate, _test, alternatives, choose
+from heli_jax.identification.select import Candidate, _test, alternatives, choose
 from tests.identification.bench import steps
 from tests.identification.test_filter_error import FREE
 from tests.identification.test_noise_guesses import W

@@ -35,7 +35,7 @@ from heli_jax.identification.estimation.frequency_noise import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
-from heli_jax.identification.method_comparison import MethodComparison, MethodResult
+from heli_jax.identification.select import MethodComparison, MethodResult
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.report.document import MethodsCompared, written

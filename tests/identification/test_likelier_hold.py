@@ -9,7 +9,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, linear_model
 from heli_jax.flights.holds import decide
-from heli_jax.identification.model_selection import with_likelier_hold
+from heli_jax.identification.select import with_likelier_hold
 
 TRUTH = {"Lp": -5.0, "Lda": 30.0}
 RATE = """

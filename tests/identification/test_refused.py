@@ -8,7 +8,7 @@ import pytest
 from heli_jax import Flight, Free, Nuisance, Prior, Problem, models
 from heli_jax.analysis.spectra import PairOptions, ResponseOptions
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.model_selection import choose
+from heli_jax.identification.select import choose
 from tests.identification.bench import BENCH, record, vehicle
 
 N = 3000
