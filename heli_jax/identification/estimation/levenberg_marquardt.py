@@ -181,10 +181,11 @@ class _TrustRegion(optx.ClassicalTrustRegion):
 REGION = _TrustRegion(high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1)
 
 
-def within_radius(state: Any, y: Float[Array, " q"]) -> Any:
-    """The solver's state, its next point no further from y than its radius."""
+def within_radius(state: Any, y: Float[Array, " q"], limited: Bool[Array, ""] | bool = True) -> Any:
+    """The solver's state, its next point no further from y than its radius, if that is limited."""
     step = state.y_eval - y
-    size, radius = _norm2(state.f_info.jac.mv(step)), state.search_state.radius
+    size = _norm2(state.f_info.jac.mv(step))
+    radius = jnp.where(limited, state.search_state.radius, jnp.inf)
     nearer = y + step * jnp.minimum(1.0, radius / jnp.where(size > 0, size, 1.0))
     # Without a radius the point is the solver's own, to the last digit.
     return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
@@ -221,6 +222,10 @@ class Constants(NamedTuple):
 
     z0: Float[Array, " q"]
     scaling: Scaling
+    ties: Float[Array | np.ndarray, " q"]
+    """one over the sd that ties an unknown to its start; 0 without"""
+    with_radius: Bool[Array, ""] | bool = True
+    """True if a refused step shortens the next ones, beside what damping does"""
 
 
 class _Rows(NamedTuple):
@@ -274,15 +279,17 @@ def compressed(
     return R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
 
 
-def _rows(R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
-    return _Rows(xi, R[:, 0], R[:, 1:])
+def _rows(constants: Constants, R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
+    ties = constants.ties * constants.scaling.unit / constants.scaling.residual_norm
+    r, J = jnp.concatenate([R[:, 0], -ties * xi]), jnp.concatenate([R[:, 1:], -jnp.diag(ties)])
+    return _Rows(xi, r, J)
 
 
 def begin(constants: Constants) -> State:
     q = constants.z0.shape[0]
     xi = jnp.zeros_like(constants.z0)
     # The first step accepts whatever is at z0, so that of these rows only the shapes count.
-    rows = _rows(jnp.zeros((q + 1, q + 1), xi.dtype), xi)
+    rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
     shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
     solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
     return State(xi, solver, jnp.asarray(False), jnp.asarray(False))
@@ -290,9 +297,9 @@ def begin(constants: Constants) -> State:
 
 def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
-    rows, solver = _rows(R, state.solver.y_eval), _solver(constants)
+    rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
-    new = within_radius(new, xi)
+    new = within_radius(new, xi, constants.with_radius)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     fine = result == optx.RESULTS.successful
     gain = gain_ahead(new.f_info, constants.scaling.residual_norm)
@@ -304,6 +311,17 @@ def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State
 
 def point(constants: Constants, xi: Array) -> Array:
     return constants.z0 + constants.scaling.unit * xi
+
+
+_TIE_SD = 100.0
+"""sd, in logarithms or logits of the free parameters, of their tie to the start: a factor of e^100
+is no prior, but it gives an end to a parameter that runs to its bound or to zero"""
+
+
+def ties_of(layout: Layout) -> np.ndarray:
+    """(q,) for `Constants`; a coordinate that is no logarithm has no size of its own to tie it."""
+    free = np.arange(layout.size) < len(layout.free)
+    return np.where(free & ~without_size(layout), 1.0 / _TIE_SD, 0.0)
 
 
 class Compiled(NamedTuple):
@@ -427,14 +445,14 @@ def _optimise_in_one_program(
 
     def step(now: _Loop) -> _Loop:
         k, units, state = now.standing
-        tried = point(Constants(z0, units), state.solver.y_eval)
+        tried = point(Constants(z0, units, ties_of(layout)), state.solver.y_eval)
         e = differentiate(layout, data, noise, tried)
         units = jax.tree.map(
             lambda new, old: jnp.where(k == 0, new, old), scaling(e.r, e.J, trusted), units
         )
 
         def advanced() -> State:
-            constants = Constants(z0, units)
+            constants = Constants(z0, units, ties_of(layout))
             return advance(constants, state, compressed(constants, e.r, e.J))
 
         # Where nobody steps the triangle of J, which takes longer than J, is not needed.
@@ -442,7 +460,7 @@ def _optimise_in_one_program(
         return _Loop(_Standing(k + 1, units, state), e)
 
     end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0, begun))
-    constants = Constants(z0, end.standing.scaling)
+    constants = Constants(z0, end.standing.scaling, ties_of(layout))
     return _End(point(constants, end.standing.state.xi), end.standing, end.last)
 
 
@@ -452,7 +470,7 @@ def _before_the_loop(
     # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere. Evaluated
     # before the loop it would be compiled twice, the residuals being most of the program.
     units = Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
-    fresh = _Standing(jnp.asarray(0), units, begin(Constants(z0, units)))
+    fresh = _Standing(jnp.asarray(0), units, begin(Constants(z0, units, ties_of(layout))))
     standing = jax.tree.map(lambda new, old: jnp.where(begun.k == 0, new, old), fresh, begun)
     shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
     last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
@@ -469,7 +487,7 @@ def _not_begun(q: int, dtype: np.dtype) -> _Standing:
     def shapes() -> _Standing:
         zeros = jnp.zeros(q, dtype)
         units = Scaling(zeros, jnp.ones((), dtype))
-        return _Standing(jnp.asarray(0), units, begin(Constants(zeros, units)))
+        return _Standing(jnp.asarray(0), units, begin(Constants(zeros, units, zeros)))
 
     # Of NumPy: nothing is compiled for it.
     return jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), jax.eval_shape(shapes))
@@ -625,5 +643,8 @@ def _run(
     if held is not None:
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
-    constants = Constants(jnp.asarray(z0), scaling(r0, J0, trusted))
+    constants = Constants(jnp.asarray(z0), scaling(r0, J0, trusted), ties_of(layout))
+    # Initial states alone, from far off: shortened steps end in the next valley (as of a pendulum
+    # near the top of its swing).
+    constants = constants._replace(with_radius=jnp.asarray(held is None))
     return descend(evaluate, constants, first, count, max_steps, SINGLE)

@@ -23,6 +23,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     descend,
     residual_and_jacobian,
     scaling,
+    ties_of,
     trusted_columns,
 )
 from heli_jax.identification.estimation.output_error import OutputError
@@ -391,7 +392,9 @@ def optimise_many(
         chosen = np.minimum(np.arange(i, i + batch), k - 1)
         z0 = starts[chosen]
         numbers = jax.vmap(data)(jax.tree.map(lambda v, chosen=chosen: v[chosen], each))
-        constants = jax.vmap(lambda z: Constants(z, units))(z0)
+        constants = jax.vmap(
+            lambda z: Constants(z, units, jnp.asarray(ties_of(layout)), jnp.asarray(True))
+        )(z0)
 
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)
