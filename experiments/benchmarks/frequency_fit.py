@@ -28,7 +28,7 @@ import jax
 
 from heli_jax import Problem, fit
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.multistart import Search, first_optima
+from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import relax_noise_covariance
 from heli_jax.identification.search import first_guess
 
@@ -63,8 +63,10 @@ def search(problem: Problem) -> None:
     """Estimates with covariance, as `fit` finds them from one start, and nothing else."""
     guess = first_guess(problem)
     over = Search(problem, guess.layout, guess.data, 200)
-    first = first_optima(over, guess, lambda *_: guess.z[None])
-    found = relax_noise_covariance(over, first.noise, first.optima[0])
+    # Data of the first search are others by instrument, as in `fit`.
+    first = Search(problem, guess.layout, guess.begun, 200)
+    [begun] = first.run(guess.noise, guess.z[None])
+    found = relax_noise_covariance(over, guess.noise, begun)
     assert bool(found.best.converged)
     deviations(evaluate(guess.layout, guess.data, found.noise, found.best.z).J)
 
