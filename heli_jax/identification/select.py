@@ -1,6 +1,5 @@
 """Model selection: likelihood, information criteria and nested tests of candidates in a table."""
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,14 +12,12 @@ import scipy.special
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Model, axes_of
-from heli_jax.finding import found
 from heli_jax.identification.diagnostics.search import STOPPED
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS, objective_of
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.result import Estimate, Fit, Status
-from heli_jax.identification.validation.other_hold import likelier_hold
 from heli_jax.numbers import p_value
 
 
@@ -427,33 +424,6 @@ def disturbed_sets(
     nested = [("no disturbance", name) for name in (*smaller, everything, two)]
     nested += [(name, everything) for name in smaller]
     return Alternatives(problems, tuple(nested))
-
-
-# What an input does between samples, by the record where the log leaves it open.
-
-
-def with_likelier_hold(
-    problem: Problem, fit: Fit, refit: Callable[[Problem], Fit]
-) -> tuple[Problem, Fit]:
-    """The fit, and what was fitted, with inputs held of which the log left that open, where the
-    record bears it out.
-
-    An input that moves at every sample may be a stick that was sampled on its way or a command that
-    is computed at each sample and held. The log looks the same; the answer is half a sample later.
-    """
-    if fit.status == "not-converged":
-        return problem, fit
-    # By how much the colour of the residuals widens intervals: the record is worth so much less.
-    wider = [e.sd / e.sd_white for e in fit.estimates.values() if e.sd and e.sd_white]
-    held = likelier_hold(problem, fit.reached, max(wider, default=1.0))
-    if held is None:
-        return problem, fit
-    again = refit(held.problem)
-    if again.status == "not-converged" or not again.log_likelihood > fit.log_likelihood:
-        return problem, fit
-    late = 0.5 * max(f.dt for f in problem.training)  # a held input is, by half a sample
-    taken = found("timing.likelier-hold", "note", *held.inputs, value=held.gain, late=1e3 * late)
-    return held.problem, dataclasses.replace(again, findings=(taken, *again.findings))
 
 
 # One problem by several methods, their estimates side by side.
