@@ -204,7 +204,7 @@ def _fit_run(
 
 
 def _long_intervals(config: Experiment) -> bool:
-    """Whether intervals are asked for that take longer than the fit."""
+    """True if intervals are asked for that take longer than the fit."""
     options = config.config.fit
     assert options is not None
     methods = options.intervals
@@ -225,7 +225,7 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
-    """What a configuration's flights can determine, before any fit.
+    """Judge what a configuration's flights can determine, before any fit.
 
     Args:
         config: of `load_config`, or the path of a configuration.

@@ -1,4 +1,4 @@
-"""What may stand in a configuration: its sections, their keys and their bounds."""
+"""Schema of a configuration: its sections, their keys and their bounds."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -232,7 +232,7 @@ StartMethod = Literal["given", "equation-error", "frequency-error"]
 
 
 class StartMethodConfig(Section):
-    """Where the starts of the free parameters come from."""
+    """Source of the free parameters' start values."""
 
     method: StartMethod = "given"
     """equation-error: by regression of the records themselves, for linear models; frequency-error:
