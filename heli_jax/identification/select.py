@@ -70,7 +70,7 @@ def alternatives(
     *,
     without_stand: Model | None = None,
 ) -> Alternatives:
-    """No disturbance, one pole and two poles on `axis`, all by filter error.
+    """List candidates by filter error: no disturbance, one pole and two poles on `axis`.
 
     Args:
         model: the model without disturbance.
@@ -135,8 +135,8 @@ def _by_filter_error(problem: Problem, model: Model, *, silent: bool = False) ->
 
 
 def _stand_may_vanish(problem: Problem) -> bool:
-    """Whether a stand without stiffness and damping is among those that are fitted: each of the two
-    is free to go to zero, or zero already."""
+    """True if a stand without stiffness and damping is among those fitted: each of the two is free
+    to reach zero, or zero already."""
     values = naming.asdict(problem.vehicle)
     for name in ("kappa", "zeta"):
         if name in problem.free:
@@ -383,7 +383,8 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
 def disturbed_sets(
     problem: Problem, model: Model, names: Sequence[str], stated: Sequence[str] = ()
 ) -> Alternatives:
-    """No disturbance, each one left out, all, and all with two poles; by filter error.
+    """List candidates by filter error: no disturbance, each one left out, all, and all with two
+    poles.
 
     As many candidates as disturbances and three: of four there would be sixteen sets, of six 64.
 
@@ -434,7 +435,7 @@ APART = 2.0
 
 
 class MethodResult(NamedTuple):
-    """What one method makes of the problem."""
+    """Result of one method."""
 
     method: str
     fit: Fit | None
@@ -450,7 +451,7 @@ class MethodResult(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Its verdicts in short."""
+        """Verdicts in a few words."""
         if self.fit is None:
             return "refused"
         if self.fit.status == "not-converged":
@@ -470,8 +471,8 @@ class MethodComparison(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of what is compared: the free parameters, and the delay and the gains of inputs that
-        were free beside them."""
+        """Names compared: the free parameters, and the delay and the gains of inputs that were free
+        beside them."""
         main = self.results[0].fit
         if main is None:
             return ()
@@ -503,7 +504,7 @@ class MethodComparison(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What of the comparison has to be known."""
+        """Sentences on what agrees and what differs."""
         main, *others = self.results
         said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
         if main.fit is None:
