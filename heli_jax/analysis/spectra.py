@@ -164,6 +164,11 @@ def leakage(S: np.ndarray) -> np.ndarray:
     return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
 
 
+def is_own(S: np.ndarray) -> np.ndarray:
+    """True (k,) where a density is the signal's own, and not what sidelobes bring."""
+    return OWN * leakage(S) < S
+
+
 class CrossSpectra(NamedTuple):
     """Spectral densities of several signals with one another."""
 
@@ -171,9 +176,8 @@ class CrossSpectra(NamedTuple):
     """(k,) [rad/s]"""
     S: np.ndarray
     """(k, c, c) one-sided densities per Hz: S[:, a, b] is the mean of conj(X_a) X_b"""
-    averages: float | np.ndarray
-    """independent averages that each is made of, a number or (k,): overlapping segments count for
-    less than one"""
+    averages: float
+    """independent averages that each is made of: overlapping segments count for less than one"""
     seconds: float
     """length of a segment"""
     slopes: np.ndarray | None = None
@@ -345,34 +349,45 @@ class ResponseOptions(NamedTuple):
     """those that take part; all where none is named"""
 
 
-def require_window(window: float, longest: float) -> None:
-    """Refuse windows that no record holds.
+class Choice(NamedTuple):
+    """How flights are cut into windows, and what moves in them."""
+
+    dt: float
+    """[s]"""
+    window: float
+    """length [s]"""
+    inputs: tuple[str, ...]
+    """those that move"""
+
+
+def chosen(flights: Sequence[Flight], window: float | None) -> Choice:
+    """Return the windows that responses of some flights are taken from.
 
     Args:
-        window: length [s]
-        longest: of the flights [s]
+        window: length [s]; None: a fifth of the longest flight, 30 s at most.
 
     Raises:
-        ValueError: the window is longer.
-    """
-    if window > longest * (1.0 + 1e-9):
-        raise ValueError(
-            f"window: the longest flight is {longest:.4g} s, too short for a window of "
-            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
-        )
-
-
-def one_rate(flights: Sequence[Flight]) -> float:
-    """The sample time [s] of flights that share it.
-
-    Raises:
-        ValueError: they do not.
+        ValueError: rates differ, no flight holds a window, or no input moves.
     """
     rates = sorted({round(1.0 / f.dt, 6) for f in flights})
     if len(rates) > 1:
         listed = ", ".join(f"{r:g}" for r in rates)
         raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return float(flights[0].dt)
+    dt = float(flights[0].dt)
+    longest = max(f.duration for f in flights) + dt
+    window = window or min(longest / 5.0, LONGEST)
+    if window > longest * (1.0 + 1e-9):
+        raise ValueError(
+            f"window: the longest flight is {longest:.4g} s, too short for a window of "
+            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
+        )
+    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
+    if not inputs:
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
+    return Choice(dt, window, inputs)
 
 
 class Windowed(NamedTuple):
@@ -494,19 +509,10 @@ def windowed(
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has windows enough.
     """
-    dt = one_rate(flights)
-    longest = max(f.duration for f in flights) + dt
-    seconds = options.window or min(longest / 5.0, LONGEST)
-    require_window(seconds, longest)
+    dt, seconds, inputs = chosen(flights, options.window)
     # Even, so that half of it is a number of samples.
     length = 2 * round(0.5 * seconds / dt)
     lines = _lines(options, length, dt)
-    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
-    if not inputs:
-        raise ValueError(
-            "no input moves, and a response is one to an input; a free decay is fitted by "
-            "output-error or frequency-error"
-        )
     instruments = tuple(
         n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
     )
@@ -544,7 +550,7 @@ class _Cut(NamedTuple):
         ]
         whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
         power = np.mean(np.abs(whole) ** 2, axis=0).T
-        own = [(OWN * leakage(S) < S)[self.lines] for S in power]
+        own = [is_own(S)[self.lines] for S in power]
         return whole[:, self.lines], np.stack(own, axis=1)
 
 

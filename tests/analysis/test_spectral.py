@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.analysis.responses import TooFewAveragesError, combined, responses, weights_by_output
+from heli_jax.analysis.responses import TooFewAveragesError, responses
 from heli_jax.analysis.spectra import cross_spectra
 
 DT = 0.02
@@ -110,17 +110,6 @@ def test_sticks_that_move_as_one_have_no_response_each(noise):
     found = responses(cross_spectra([record], DT, BAND, 10.0), [0, 1], [2])
     assert np.isnan(found.H).all()
     assert np.isnan(found.coherence).all()
-
-
-def test_a_composite_has_low_frequencies_of_long_segments_and_high_ones_of_short(noise):
-    record = np.stack([noise[0], low_pass(noise[0]) + 0.3 * noise[1]])
-    omega = 2.0 * np.pi * np.geomspace(0.06, 10.0, 40)
-    several = [cross_spectra([record], DT, omega, s) for s in (5.0, 40.0)]
-    both = combined(several, weights_by_output(several, [0], [1])[:, :, 0])
-    np.testing.assert_allclose(both.S[0], several[1].S[0], rtol=1e-6)
-    assert both.averages[-1] > 0.8 * several[0].averages
-    with pytest.raises(ValueError, match="same frequencies"):
-        weights_by_output([several[0], cross_spectra([record], DT, omega[1:], 5.0)], [0], [1])
 
 
 @pytest.mark.parametrize("change", [{"seconds": 500.0}, {"omega": np.array([0.0, 1.0])}])

@@ -194,7 +194,7 @@ class FrequencyError(Objective):
         """
         return [
             *cut_notes(at.layout, at.data, names),
-            *linearisation_notes(at, e, names),
+            *linearisation_notes(at, e),
             *instrument_notes(at.data),
         ]
 
