@@ -342,10 +342,12 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     length = round(window / dt)
     power = 0.0
     for record in records:
-        lines, transforms = segment_transforms(record, dt, length)
-        power = power + np.sum(np.abs(transforms) ** 2, axis=1)
+        of_record = segment_transforms(record, dt, length)
+        power = power + np.sum(np.abs(of_record.X) ** 2, axis=1)
     own = np.stack([is_own(S) for S in np.transpose(power)])
-    return own[:, np.clip(np.round(omega / lines[1]).astype(int), 0, own.shape[1] - 1)]
+    return own[
+        :, np.clip(np.round(omega * dt * length / (2.0 * np.pi)).astype(int), 0, own.shape[1] - 1)
+    ]
 
 
 def steady_sd(

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.spectra import CrossSpectra, octave_mean
+from heli_jax.analysis.spectra import Spectra, octave_mean
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
@@ -56,7 +56,7 @@ class Responses(NamedTuple):
 
 
 def responses(
-    spectra: CrossSpectra,
+    spectra: Spectra,
     inputs: Sequence[int],
     outputs: Sequence[int],
     instruments: Sequence[int] | None = None,
@@ -76,7 +76,7 @@ def responses(
     """
     u, y = list(inputs), list(outputs)
     z = u if instruments is None else list(instruments)
-    m, S, n = len(u), spectra.S, spectra.averages
+    m, S, n = len(u), spectra.density, spectra.averages
     if len(z) != m:
         raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
     if n < m + 1:
@@ -103,7 +103,10 @@ def responses(
         sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m), half95)
         H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
-    ends = None if spectra.slopes is None else P @ spectra.slopes[:, z][:, :, u]
+    ends = None
+    if spectra.steep is not None:
+        Z = spectra.X[:, :, z]
+        ends = P @ (np.conj(np.swapaxes(Z, 1, 2)) @ spectra.steep[:, :, u]) / Z.shape[1]
     return Responses(spectra.omega, H, sd, coherence, multiple, noise, n, ends)
 
 

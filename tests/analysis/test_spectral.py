@@ -31,7 +31,9 @@ def test_spectra_and_coherence_are_those_of_scipy(noise):
     same = {"fs": 1 / DT, "nperseg": 1000, "noverlap": 500, "detrend": "constant"}
     for a, b in ((0, 0), (0, 1), (2, 1)):
         theirs = scipy.signal.csd(noise[a], noise[b], **same)[1][4:60]
-        np.testing.assert_allclose(spectra.S[:, a, b], theirs, atol=1e-12 * np.max(np.abs(theirs)))
+        np.testing.assert_allclose(
+            spectra.density[:, a, b], theirs, atol=1e-12 * np.max(np.abs(theirs))
+        )
     theirs = scipy.signal.coherence(noise[0], noise[1], **same)[1][4:60]
     np.testing.assert_allclose(responses(spectra, [0], [1]).coherence[:, 0, 0], theirs, atol=1e-10)
 
@@ -129,5 +131,6 @@ def test_records_of_any_length_are_averaged_by_their_segments(noise):
     long, short = noise[:, :4000], noise[:, 4000:5500]
     whole = cross_spectra([long, short, noise[:, 5900:]], DT, BAND, 20.0)
     parts = [cross_spectra([r], DT, BAND, 20.0) for r in (long, short)]
-    np.testing.assert_allclose(whole.S, (7 * parts[0].S + 2 * parts[1].S) / 9, rtol=1e-12)
+    expected = (7 * parts[0].density + 2 * parts[1].density) / 9
+    np.testing.assert_allclose(whole.density, expected, rtol=1e-12)
     assert whole.averages == pytest.approx(parts[0].averages + parts[1].averages)
