@@ -44,8 +44,9 @@ from heli_jax.identification.estimation.frequency_lines import (
     alike,
     by_flight,
     machines_of,
+    shared_of,
+    with_shared,
 )
-from heli_jax.identification.estimation.frequency_slopes import shared_of, with_shared
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
