@@ -19,15 +19,15 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
     """Unmodelled dynamics: a mode, a response that depends on amplitude, or one that changes."""
     for one in c.unmodelled[0]:
         yield found(
-            _CODES[one.kind],
+            _CODES[one.drive.kind],
             "doubt",
             one.output,
-            *one.of,
+            *one.drive.of,
             value=one.p_value,
             shifts=one.shifts,
             distrusts=one.far,
             output=one.output,
-            of=one.of,
+            of=one.drive.of,
             gain=one.gain,
             near=f"{one.frequency:.2g} rad/s" if one.frequency else "",
             lacks="a mode or a lag" if one.frequency else "dynamics",

@@ -94,7 +94,7 @@ def inputs_shifted(c: Context) -> Iterator[Finding]:
         return
     one = input_shift(c.problem, c.at, c.e)
     # A lag that is missing shows in the residual too, and more closely.
-    if one is None or (one.late < 0 and any(x.kind == "input" for x in c.unmodelled[0])):
+    if one is None or (one.late < 0 and any(x.drive.kind == "input" for x in c.unmodelled[0])):
         return
     yield found(
         "timing.late-input" if one.late > 0 else "timing.late-response",
