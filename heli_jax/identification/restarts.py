@@ -16,11 +16,11 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.starts import draw
-from heli_jax.identification.identifiability.equivalents import same_responses
+from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.unknowns.layout import Noise, Solution, layout_of
 from heli_jax.identification.validation.adequacy import is_unstable
 
 
@@ -196,10 +196,11 @@ def _has_one_disturbance(at: SearchState) -> bool:
 def _same_responses(at: SearchState) -> list[StartPoint]:
     """Other values with the same responses to the inputs."""
     search, best, layout = at.search, at.best, at.search.layout
-    here = named_values(layout, search.data, best.best.z)
+    here = Solution(layout, search.data, best.noise, best.best.z)
+    others = second_solutions(at.problem, here, evaluate(*here))
     points = []
-    for values in same_responses(at.problem, here)[:_OTHERS]:
-        z = _with_values(at, np.array(best.best.z), values)
+    for other in others[:_OTHERS]:
+        z = _with_values(at, np.array(best.best.z), other.values)
         # Initial states are those of the other values too: from zero they follow.
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))

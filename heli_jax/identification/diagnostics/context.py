@@ -26,13 +26,13 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
+    StandardErrors,
     estimates_of,
     flight_nuisances,
     noise_by_name,
-    with_limits,
+    standard_errors,
     without_disturbance,
 )
-from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
@@ -434,22 +434,16 @@ class Context:
         """Free parameters, gains of the inputs and the time shift; none before a fit."""
         if not self.fitted:
             return {}
-        errors = self.errors
-        by, quantiles = errors.by or self.e, errors.quantiles
-        found = estimates_of(
-            self.problem, self.at.layout, by, errors.verdict, quantiles, errors.wider
-        )
-        return self._bounded(with_limits(found, errors.limits))
+        return self._bounded(estimates_of(self.problem, self.at, self.e, self.errors))
 
     @cached_property
     def nuisance(self) -> dict[str, Estimate]:
         """All other unknowns: the disturbance, initial states, biases, offsets."""
-        layout, errors = self.at.layout, self.errors
+        layout = self.at.layout
         found = {k: v for k, v in self.estimates.items() if k not in layout.free}
         # A method that does not see initial states and biases has no interval of them.
         if layout.noise_model != "spectrum":
-            numbers = (errors.quantiles, errors.wider)
-            found |= self._bounded(flight_nuisances(self.problem, self.at, self.e, *numbers))
+            found |= self._bounded(flight_nuisances(self.problem, self.at, self.e, self.errors))
         gone = {n: without_disturbance(found[n], size=n in layout.sigmas) for n in self.absent}
         return found | gone
 
