@@ -31,7 +31,6 @@ from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     not_determined,
-    own_unknowns,
     sensitivity_at,
     together,
     triangle,
@@ -41,7 +40,15 @@ from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of, unpack
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    Solution,
+    flight_places,
+    layout_of,
+    unpack,
+)
 
 ENOUGH = 0.9
 """D-efficiency of the windows that are taken: the q-th root of the determinant of their information
@@ -435,12 +442,13 @@ def _on_record(
 ) -> list[float]:
     """The own unknowns of all windows: states from the whole record's simulation, biases and
     offsets those of the record."""
-    every, record, values = naming.names(layout.model.State), own_unknowns(at.layout, at.z), []
+    every, record, values = naming.names(layout.model.State), flight_places(at.layout), []
+    z = np.asarray(at.z)
     for cut, (count, m), flight in zip(cuts, layout.windows, data.flights, strict=True):
         for k in range(count):
             x = states[cut.flight][:, cut.first + k * m]
             values += [float(x[every.index(n)] / flight.state_scale[n]) for n in layout.states]
-        values += record[cut.flight][1].tolist()
+        values += z[record[cut.flight].constants].tolist()
     return values
 
 
@@ -459,12 +467,12 @@ def _prior_weights(
         shooting: True if the whole record has initial states at every window too.
     """
     weights: list[float] = []
-    for cut, (count, _), outputs in zip(cuts, layout.windows, layout.outputs, strict=True):
-        for k in range(count):
+    for cut, places in zip(cuts, flight_places(layout), strict=True):
+        for k, states in enumerate(places.states):
             # In the whole record the state has a prior at its beginning alone.
             stated = cut.first == 0 and (k == 0 or shooting)
-            weights += [1.0 if stated else FREE] * len(layout.states)
-        weights += [_share(samples, flights[cut.flight])] * layout.constants(outputs)
+            weights += [1.0 if stated else FREE] * states.size
+        weights += [_share(samples, flights[cut.flight])] * places.constants.size
     return np.array(weights)
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise, with_sensor_noise
@@ -169,10 +169,6 @@ class Layout(eqx.Module):
         of_flights = windows * len(self.states) + biases + flights * len(self.offsets)
         return self.first_nuisance + of_flights
 
-    def constants(self, outputs: tuple[str, ...]) -> int:
-        """The biases and input offsets of a flight with these outputs."""
-        return (len(outputs) if self.bias else 0) + len(self.offsets)
-
     def hold(self, i: int) -> dict[str, str]:
         """What the inputs of the i-th flight do between samples, by name."""
         return dict(zip(naming.names(self.model.Inputs), self.holds[i], strict=True))
@@ -207,6 +203,35 @@ class FlightUnknown(NamedTuple):
             "input_offset": flight.offset_scale,
         }
         return scales[self.kind][self.of]
+
+
+class FlightPlaces(NamedTuple):
+    """Where in z the unknowns of one flight stand."""
+
+    states: Int[np.ndarray, "windows k"]
+    biases: Int[np.ndarray, " p"]
+    offsets: Int[np.ndarray, " i"]
+
+    @property
+    def constants(self) -> Int[np.ndarray, " c"]:
+        """The biases and the offsets."""
+        return np.concatenate([self.biases, self.offsets])
+
+    @property
+    def every(self) -> Int[np.ndarray, " q"]:
+        """All of them, in the order of z."""
+        return np.concatenate([self.states.ravel(), self.constants])
+
+
+def flight_places(layout: Layout) -> list[FlightPlaces]:
+    """Return the places of each flight's unknowns in z."""
+    places, at, k = [], layout.first_nuisance, len(layout.states)
+    for (windows, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        sizes = windows * k, len(outputs) if layout.bias else 0, len(layout.offsets)
+        states, biases, offsets = np.split(at + np.arange(sum(sizes)), np.cumsum(sizes)[:2])
+        places.append(FlightPlaces(states.reshape(windows, k), biases, offsets))
+        at += sum(sizes)
+    return places
 
 
 def flight_unknowns(layout: Layout) -> list[FlightUnknown]:
@@ -417,11 +442,10 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     noise = {
         name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noises)
     }
-    at = layout.first_nuisance
-    flights = []
-    for i, flight in enumerate(data.flights):
+    at, flights = layout.first_nuisance, []
+    for i, (flight, places) in enumerate(zip(data.flights, flight_places(layout), strict=True)):
         flights.append(_of_flight(layout, i, flight, z, at))
-        at += layout.windows[i][0] * len(layout.states) + layout.constants(layout.outputs[i])
+        at += places.every.size
     states, biases, offsets = zip(*flights, strict=True)
     scales = scales_of(layout, z)
     return Unknowns(params, noise, scales, gains, shift, states, biases, offsets)

@@ -30,7 +30,7 @@ from heli_jax.identification.estimation.evaluation import (
 )
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import signals
-from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.unknowns.layout import Solution, flight_places
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -182,7 +182,7 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
         return rows
     # By differences of the simulation, whose program is there: a Jacobian would compile another.
     z = np.asarray(z)
-    blocks = _blocks(at)
+    blocks = [places.every for places in flight_places(layout)]
     common = [np.array([k]) for k in range(layout.first_nuisance)]
     longest = max((b.size for b in blocks), default=0)
     # Each flight's own unknowns move at once: none is felt by another flight.
@@ -199,16 +199,6 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
                 if k < layout.first_nuisance or k in blocks[i]:
                     slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
     return slopes
-
-
-def _blocks(at: Solution) -> list[np.ndarray]:
-    """By flight where in z its own unknowns stand."""
-    layout, first, out = at.layout, at.layout.first_nuisance, []
-    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        size = count * len(layout.states) + layout.constants(outputs)
-        out.append(np.arange(first, first + size))
-        first += size
-    return out
 
 
 # What may drive what a model lacks.
