@@ -342,8 +342,8 @@ def filtered_flights(
     together: dict[int, Innovations] = {}
     small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
-        # One record of a small model: written out in rows the exact filter takes as long, and two
-        # seconds less to compile.
+        # One record of a small model (5 states): written out in rows the exact filter takes four
+        # fifths of the time for a fit, with its compilation (4.9 s for 6.0) or without.
         if not (small and len(group) == 1):
             innovations = innovations_together(layout, data, noise, u, group)
             together |= dict(zip(group, innovations, strict=True))
