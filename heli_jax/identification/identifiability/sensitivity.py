@@ -11,8 +11,8 @@ from heli_jax.identification.identifiability.directions import WithoutWeakPriors
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import WeakUnknown, can_be_off, weak_unknowns
-from heli_jax.identification.unknowns.layout import Layout
+from heli_jax.identification.unknowns.initial_guess import labels
+from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
 _NEAR_ZERO = 1e-2
 """part of a parameter's size below which it takes no part in products of powers"""
@@ -123,7 +123,7 @@ def _with_weak_priors(rows: Rows, S: np.ndarray, N: np.ndarray) -> np.ndarray:
 
 
 def _without_weak_priors(
-    named: tuple[WeakUnknown, ...], S: np.ndarray, N: np.ndarray
+    named: tuple[FlightUnknown, ...], S: np.ndarray, N: np.ndarray
 ) -> WithoutWeakPriors:
     """What is left of that without the weak priors of the last columns of N, which are `named`."""
     seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
@@ -168,7 +168,7 @@ def verdict_of(
     R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
     S, N = R[:, :q], R[:, q:]
     sensitivity = _with_weak_priors(rows, S, N)
-    named = weak_unknowns(problem, layout)
+    named = flight_unknowns(layout, labels(problem.training))
     if reported is not None:
         to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
         reported = reported * np.outer(to_relative, to_relative)
@@ -177,7 +177,9 @@ def verdict_of(
     known = naming.names(problem.model.Params)
     remedies = {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
     # Initial states of a chance optimum may tell what no input does: at rest they would not.
-    kinds = {n.kind for n in named} if around.combined else ()
+    kinds = {n.kind for n in named} if around.combined else set()
+    # Windows need their initial states.
+    kinds -= {"initial_state"} if problem.window is not None else set()
     return analyse(
         sensitivity,
         unknowns,
@@ -185,5 +187,5 @@ def verdict_of(
         reported=reported,
         around=around,
         remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
-        switches=(kind for kind in kinds if can_be_off(problem, kind)),
+        switches=kinds,
     )

@@ -228,15 +228,15 @@ def flight_nuisances(
     for name, relative in size_deviations(at, e).items():
         sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
     estimates = _disturbance(problem, at, sds, quantiles)
-    called = labels(problem.training)
-    for i, u in enumerate(flight_unknowns(layout), layout.first_nuisance):
+    unknowns = flight_unknowns(layout, labels(problem.training))
+    for i, u in enumerate(unknowns, layout.first_nuisance):
         scale = u.scale(at.data)
         value, sd = float(at.z[i] * scale), float(sds[i] * scale)
         # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
         share = min(1.0, float(whites[i]) ** 2)
         reach = float(quantiles[i]) * sd
         unit = _unit_of(problem, u) or ""
-        estimates[f"{called[u.flight]}/{u.name}"] = Estimate(
+        estimates[u.label] = Estimate(
             value, sd, value - reach, value + reach, unit, 0.0, share, False
         )
     return estimates

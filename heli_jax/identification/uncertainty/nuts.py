@@ -55,9 +55,9 @@ def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
     nuisance |= {name: u.noise[name] for name in layout.noises}
     nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
     fitted = [s.flight for s in fit.signals if not s.hold_out]
-    for i, one in enumerate(flight_unknowns(layout), layout.first_nuisance):
+    for i, one in enumerate(flight_unknowns(layout, fitted), layout.first_nuisance):
         samples = np.asarray(z[..., i]).reshape(-1) * float(one.scale(data))
-        nuisance[f"{fitted[one.flight]}/{one.name}"] = samples
+        nuisance[one.label] = samples
 
     def shaped(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {name: np.asarray(v).reshape(shape) for name, v in samples.items()}
