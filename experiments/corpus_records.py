@@ -355,7 +355,7 @@ def written(rig: Rig, folder: Path) -> Path:
     return path
 
 
-def held(name: str, unit: str) -> dict[str, Any]:
+def stated_held(name: str, unit: str) -> dict[str, Any]:
     """Signals of a log whose one input is stated to be held between samples."""
     return {"inputs": {name: {"signal": name, "unit": unit, "hold": "zero-order"}}}
 
@@ -419,12 +419,12 @@ RIGS: dict[str, Rig] = {
     "heave in calm air": Rig(lambda: heave(0.0, 0.15), HEAVE, {"Zw": -0.6, "Zcol": -14.0}),
     # Sound records on which a search may go astray, or the reader.
     "computed command": Rig(computed, truth=TRUTH, ought=("likelier-hold",)),
-    "computed command, stated": Rig(computed, truth=TRUTH, signals=held("da", "rad")),
+    "computed command, stated": Rig(computed, truth=TRUTH, signals=stated_held("da", "rad")),
     "spring far from its start": Rig(
         spring,
         SPRING,
         {"k": 25.0, "d": 0.5, "b": 20.0},
-        signals=held("f", "1"),
+        signals=stated_held("f", "1"),
     ),
     "heave by frequency error": Rig(
         lambda: heave(1.0, 0.04), HEAVE, {"Zw": -0.6, "Zcol": -14.0}, FREQUENCY

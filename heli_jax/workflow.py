@@ -246,8 +246,7 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 def reading_notes(problem: Problem) -> list[Finding]:
     """Notes of the logs' readers, and on the origin of starts that were found."""
     guess = problem.first_guess
-    begun = guess.sentences if guess else ()
-    return once((*log_notes(problem), *(note("search.first-guess", words) for words in begun)))
+    return once((*log_notes(problem), *(guess.findings if guess else ())))
 
 
 def log_notes(problem: Problem) -> list[Finding]:

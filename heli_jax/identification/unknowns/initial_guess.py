@@ -1,6 +1,6 @@
-"""Initial states, biases and offsets: which there are, their names, and where z begins."""
+"""Where z begins, and what flights are called."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,36 +19,7 @@ from heli_jax.identification.unknowns.layout import (
     FlightData,
     Layout,
     flight_places,
-    flight_unknowns,
 )
-
-# What the nuisance unknowns are called: initial states, biases, input offsets of every flight.
-
-
-class WeakUnknown(NamedTuple):
-    """An unknown of one flight that has a weak prior of ten times the signal."""
-
-    label: str
-    """as the fit names it: 'flight 1/bias p'"""
-    kind: str
-    """the switch in `Nuisance` that it belongs to"""
-    words: str
-    """as a sentence names it, whichever flight it belongs to: 'the bias of p'"""
-
-
-def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
-    """Return the unknowns from `layout.first_nuisance` on, with their names."""
-    called, words = labels(problem.training), {"initial_state": "initial ", "bias": "bias of "}
-    words["input_offset"] = "offset of "
-    return tuple(
-        WeakUnknown(f"{called[u.flight]}/{u.name}", u.kind, f"the {words[u.kind]}{u.of}")
-        for u in flight_unknowns(layout)
-    )
-
-
-def can_be_off(problem: Problem, kind: str) -> bool:
-    """Whether the problem would be one without this kind of nuisance: windows need their states."""
-    return bool(kind) and not (kind == "initial_state" and problem.window is not None)
 
 
 def labels(flights: tuple[Flight, ...]) -> list[str]:
