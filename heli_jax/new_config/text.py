@@ -362,7 +362,7 @@ def _instruments(excitations: Mapping[str, str]) -> list[str]:
         return []
     return [
         "      # What an autopilot added to the stick, by the channel's name. With it,",
-        "      # method: frequency-error is right in closed loop too (docs/frequency.md).",
+        "      # method: frequency-error is right in closed loop too (docs/frequency-fits.md).",
         "      # instruments:",
         *(f"      #   {n}: {{signal: {_value(c)}}}   # GUESS" for n, c in excitations.items()),
     ]
