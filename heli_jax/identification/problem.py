@@ -302,9 +302,8 @@ def _check_method(problem: Problem) -> None:
 
 
 def _check_offsets(problem: Problem) -> None:
-    offsets = problem.nuisance.input_offset
-    known = naming.names(problem.model.Inputs)
-    for name in () if offsets is None or isinstance(offsets, bool) else offsets:
+    offsets, known = problem.nuisance.input_offset, naming.names(problem.model.Inputs)
+    for name in offsets if isinstance(offsets, tuple) else ():
         if name not in known:
             raise ValueError(
                 f"nuisance.input_offset: model {problem.model.name} has no input {name!r}"
@@ -313,16 +312,14 @@ def _check_offsets(problem: Problem) -> None:
 
 
 def _check_windows(problem: Problem) -> None:
-    if problem.window is None:
-        if problem.continuity is not None:
-            raise ValueError("continuity is for windows only: expected a window as well, got none")
+    window, continuity = problem.window, problem.continuity
+    if window is None and continuity is not None:
+        raise ValueError("continuity is for windows only: expected a window as well, got none")
+    for key, value in (("window", window), ("continuity", continuity)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{key} must be above zero, got {value:g}")
+    if window is None:
         return
-    if not (math.isfinite(problem.window) and problem.window > 0):
-        raise ValueError(f"window must be above zero, got {problem.window:g} s")
-    if problem.continuity is not None and not (
-        math.isfinite(problem.continuity) and problem.continuity > 0
-    ):
-        raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
     # A filter corrects its state at every sample, which is what windows are for.
     if problem.noise_model != "white":
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
@@ -330,11 +327,10 @@ def _check_windows(problem: Problem) -> None:
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     for flight in problem.flights:
-        samples = round(problem.window / flight.dt)
-        if samples < _FEWEST:
+        if (samples := round(window / flight.dt)) < _FEWEST:
             raise ValueError(
                 f"{_of(flight)}: a window must hold {_FEWEST} samples at least, got {samples} in "
-                f"{problem.window:g} s"
+                f"{window:g} s"
             )
 
 
@@ -375,20 +371,20 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         )
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
-    _check_measured(flight, problem, where)
-    _check_known(flight, problem, where)
-    count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
-    # What counts is what was measured, of the output of which most was.
-    measured = max((int(np.isfinite(y).sum()) for y in flight.outputs.values()), default=0)
-    if not flight.hold_out and measured < least:
-        raise ValueError(
-            f"{where}: expected at least {least} samples for {count} free parameters, got "
-            f"{measured}"
-        )
-
-
-def _check_known(flight: Flight, problem: Problem, where: str) -> None:
-    model = problem.model
+    for name, y in flight.outputs.items():
+        # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
+        # own, and so no noise.
+        if (seen := int(np.isfinite(y).sum())) < FEWEST_SEEN:
+            raise ValueError(
+                f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
+                f"{seen} of {y.size}"
+            )
+        # A flight held out is simulated, not weighed: it needs no noise.
+        if problem.noise_is_fixed and name not in flight.sd and not flight.hold_out:
+            raise ValueError(
+                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
+                "(sigma_y), got none"
+            )
     # What one flight knows cannot be estimated over all of them.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
@@ -403,44 +399,25 @@ def _check_known(flight: Flight, problem: Problem, where: str) -> None:
         wrong = impossible({name: value}) if of_helicopter(model.Params) else None
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
-
-
-def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
-    for name, y in flight.outputs.items():
-        # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
-        # own, and so no noise.
-        seen = int(np.isfinite(y).sum())
-        if seen < FEWEST_SEEN:
-            raise ValueError(
-                f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
-                f"{seen} of {y.size}"
-            )
-        # A flight held out is simulated, not weighed: it needs no noise.
-        stated = name in flight.sd or flight.hold_out
-        if problem.noise_is_fixed and not stated:
-            raise ValueError(
-                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
-                "(sigma_y), got none"
-            )
+    count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
+    # What counts is what was measured, of the output of which most was.
+    measured = max(int(np.isfinite(y).sum()) for y in flight.outputs.values())
+    if not flight.hold_out and measured < least:
+        raise ValueError(
+            f"{where}: expected at least {least} samples for {count} free parameters, got "
+            f"{measured}"
+        )
 
 
 def _check_model(problem: Problem) -> None:
-    params = problem.start_params()
-    # With what each flight knows: that alone may complete a vehicle.
+    params, model = problem.start_params(), problem.model
     for flight in problem.flights:
-        require_constants(problem.model, naming.replace(params, **flight.known))
-    if not problem.model.linear:
-        _check_start(problem, params)
-    require_linear(problem.model, params)
-
-
-def _check_start(problem: Problem, params: Any) -> None:
-    """Refuse a model that cannot begin at its initial state; one of ours begins anywhere."""
-    if of_helicopter(problem.model.Params):
-        return
-    for flight in problem.flights:
-        # Its first rates depend on the inputs that the flight begins with.
-        first = {n: float(u[0]) for n, u in flight.inputs.items()}
-        wrong = cannot_start(problem.model, naming.replace(params, **flight.known), first)
-        if wrong:
-            raise ValueError(wrong)
+        # With what each flight knows: that alone may complete a vehicle.
+        own = naming.replace(params, **flight.known)
+        require_constants(model, own)
+        # A helicopter of ours begins anywhere. First rates depend on the flight's first inputs.
+        if not model.linear and not of_helicopter(model.Params):
+            first = {n: float(u[0]) for n, u in flight.inputs.items()}
+            if wrong := cannot_start(model, own, first):
+                raise ValueError(wrong)
+    require_linear(model, params)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.finding import Finding, found
 from heli_jax.flights.cut import part
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     FREE,
@@ -34,7 +34,6 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,

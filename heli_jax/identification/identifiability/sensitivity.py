@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.analysis import NOTHING_ELSE, Around, analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
 _NEAR_ZERO = 1e-2

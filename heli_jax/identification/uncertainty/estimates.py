@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import sensor_noise
+from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import (
     Evaluation,
     combined_deviations,
@@ -22,7 +23,6 @@ from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     FlightUnknown,
     Layout,
