@@ -15,7 +15,7 @@ from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
 from heli_jax.dynamics.model import Model, require_constants, require_linear
 from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.defaults import filtered_noise, offset_inputs, push_scales
+from heli_jax.identification.defaults import filtered_noise, offset_inputs
 from heli_jax.identification.free import (
     Free,
     Prior,
@@ -158,7 +158,7 @@ class Problem:
         if self.noise_model != "disturbance":
             return {}
         # Of the size of the motion, and a second: a coarse search takes it from there.
-        sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
+        sizes = {d.sigma: self.motion for d in disturbances_of(self.model)}
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
             # What somebody stated goes before the guess. Zero is the default of a sigma and no
@@ -196,24 +196,6 @@ class Problem:
     def noise_is_fixed(self) -> bool:
         """Whether the measurement noise is taken as stated."""
         return self.noise_model == "disturbance" and "sigma_y" in self.fixed_noise
-
-    @functools.cached_property
-    def push_scales(self) -> dict[str, float]:
-        """By the name of its sigma how large each of several disturbances may be, SI; of a single
-        one it is the motion."""
-        disturbances = disturbances_of(self.model)
-        if len(disturbances) < 2:
-            return {}
-        # One flight for the matrices: a size to begin a search with needs no more, and the
-        # deviations are the largest of all flights.
-        flight = self.training[0]
-        sds = {
-            n: max(float(np.nanstd(f.outputs[n])) for f in self.training if n in f.outputs)
-            for n in sorted({n for f in self.training for n in f.outputs})
-        }
-        params = naming.replace(self.start_params(), **flight.known)
-        first = {n: float(flight.inputs[n][0]) for n in naming.names(self.model.Inputs)}
-        return push_scales(self.model, params, first, sds, disturbances)
 
     @functools.cached_property
     def offset_inputs(self) -> tuple[str, ...]:

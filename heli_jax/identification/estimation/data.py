@@ -59,7 +59,6 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         flights=tuple(
             _flight_data(problem, f, dtype, u) for f, u in zip(flights, follows, strict=True)
         ),
-        push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},
     )
     numbers = _placed(numbers)
     if not nuisance.initial_state:
@@ -239,7 +238,7 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray)
 
 # Any: the model's Params, whose class may be a user's own.
 def own_start(model: Model, params: Any) -> dict[str, float]:
-    """Return the model's initial state; what is zero in that of a whole helicopter is as in hover."""
+    """Return the model's initial state; zeros of a whole helicopter's are as in hover."""
     start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
     if not is_full_nonlinear(model):
         return start

@@ -201,13 +201,10 @@ def draw(
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
-    dtype = z0.dtype
     for i, (free, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
-        values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
-        sign = jnp.asarray(transforms.sign_or_scale(free), dtype)
-        low, high = (jnp.asarray(b, dtype) for b in transforms.limits(free))
-        rows[1:, i] = np.asarray(transforms.to_coordinate(kind, values, sign, low, high))
-    return jnp.asarray(rows, dtype)
+        values = _draw_values(free, rows.shape[0] - 1, rng)
+        rows[1:, i] = transforms.coordinates(free, kind, values)
+    return jnp.asarray(rows, z0.dtype)
 
 
 def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
@@ -314,8 +311,7 @@ def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[
             low, high = max(low, min(early, free.start)), min(high, max(_LATEST, 2.0 * free.start))
         values = np.unique([free.start, *_between(low, high, step)])
         values = values[[transforms.inside(free, float(v)) for v in values]]
-        limits = transforms.sign_or_scale(free), *transforms.limits(free)
-        grids[i] = np.asarray(transforms.to_coordinate(layout.kinds[i], values, *limits))
+        grids[i] = transforms.coordinates(free, layout.kinds[i], values)
     if layout.shift:
         i = len(layout.free) + len(layout.gains)
         ends = -_SHIFT_RANGE * MAX_TIME_SHIFT, _SHIFT_RANGE * MAX_TIME_SHIFT
