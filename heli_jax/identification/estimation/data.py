@@ -166,7 +166,7 @@ def _before_it_grows(
         simulated = with_biases(layout, runs)
         windows = [count for count, _ in layout.windows]
         far = any(
-            _grows(v) and not _rms(v) < _GROWN * _size(f.outputs[n][np.isfinite(f.outputs[n])])
+            runs_away(v, np.asarray(f.outputs[n]))
             for f, by_name in zip(data.flights, simulated, strict=True)
             for n, v in by_name.items()
         )
@@ -184,10 +184,16 @@ def _before_it_grows(
     return runs, simulated
 
 
-def _grows(values: np.ndarray) -> bool:
-    """Whether a run is ten times as large in its second half, which no wrong gain makes it."""
-    half = len(values) // 2
-    return not _rms(values[half:]) <= 10.0 * _rms(values[:half])
+def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
+    """True if a simulation grows, and far beyond what was measured, which no wrong gain makes it.
+
+    Args:
+        simulated: an output (N,).
+        measured: of it (M,), NaN where a sample is missing.
+    """
+    half = len(simulated) // 2
+    grows = not _rms(simulated[half:]) <= 10.0 * _rms(simulated[:half])
+    return grows and not _rms(simulated) < _GROWN * _size(measured[np.isfinite(measured)])
 
 
 # Where z begins.

@@ -119,7 +119,9 @@ def coarse_guess(
     linear least squares; what is not among the unknowns stays.
     """
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
-    if not (layout.shift or len(layout.gains) == 1):
+    # A machine that is held through its instruments leaves a simulation by its inputs.
+    by_inputs = data.flights[0].by_instrument is None
+    if not (by_inputs and (layout.shift or len(layout.gains) == 1)):
         return z0
     grid = (
         np.linspace(-_SHIFT_RANGE, _SHIFT_RANGE, _SHIFTS) * MAX_TIME_SHIFT
@@ -129,13 +131,7 @@ def coarse_guess(
     # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
     # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
     coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
-    if data.flights[0].by_instrument is not None and not layout.gains:
-        # By the rows: of a machine that somebody holds a simulation by its inputs drifts off.
-        points = np.tile(np.asarray(z0), (_SHIFTS, 1))
-        points[:, len(layout.free)] = coordinate
-        costs, gains = costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)), coordinate
-    else:
-        costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
+    costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
     costs = np.where(np.isfinite(costs), costs, np.inf)
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
