@@ -33,11 +33,11 @@ class Ablation(NamedTuple):
     """of the same arguments"""
 
 
-def _untied(valley: Any, null: Any, covariance: Any, unknowns: Any) -> Any:
+def _untied(valley: Any, null: Any, spread: Any, unknowns: Any) -> Any:
     """What slopes alone say, without a look far from the optimum."""
-    from heli_jax.identification.identifiability.combinations import combinations
+    from heli_jax.identification.identifiability.directions import combinations
 
-    return combinations(null, covariance, unknowns)
+    return combinations(null, spread, unknowns)
 
 
 ABLATIONS: tuple[Ablation, ...] = (
@@ -50,11 +50,6 @@ ABLATIONS: tuple[Ablation, ...] = (
         lambda problem, noise: noise,
     ),
     Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
-    Ablation(
-        "likelier_hold",
-        f"{_IDENTIFICATION}.select:with_likelier_hold",
-        lambda problem, fit, refit: (problem, fit),
-    ),
     Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",

@@ -30,7 +30,7 @@ def rank_log(
     length: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Ranking:
-    """What each window of a configuration's logs says of its free parameters.
+    """Rank the windows of a configuration's logs by their information on its free parameters.
 
     Args:
         experiment: the configuration; windows that it states for its flights are left out of
@@ -102,7 +102,7 @@ def print_ranking(ranking: Ranking) -> None:
 
 
 def cannot_be_fitted(ranking: Ranking) -> bool:
-    """Whether the log says nothing of what is asked, whichever part of it is taken."""
+    """True if no part of the log has any information on what is asked."""
     return any(f.severity == "refuse" for f in ranking.record)
 
 
@@ -113,7 +113,7 @@ def not_determined(ranking: Ranking) -> tuple[str, ...]:
 
 
 def _print_doubts(ranking: Ranking) -> None:
-    """What the numbers of a ranking rest on, and what speaks against the record."""
+    """Print the assumptions of a ranking, and the doubts about the record."""
     for finding in ranking.record:
         tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:

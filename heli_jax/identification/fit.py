@@ -27,9 +27,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import measured_coun
 from heli_jax.identification.estimation.multistart import FirstGuess, StartRow
 from heli_jax.identification.estimation.noise_covariance import first_noise, unless_stuck
 from heli_jax.identification.estimation.objective import noise_unknowns
-from heli_jax.identification.identifiability.analysis import Around
+from heli_jax.identification.identifiability.analysis import Around, verdict_of
 from heli_jax.identification.identifiability.equivalents import Valley, second_solutions
-from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
@@ -110,7 +109,7 @@ def context_of(problem: Problem, guess: FirstGuess | None = None) -> Context:
     at = Solution(*guess[:4])
     second = second_solutions(problem, at, guess.e, optimum=False)
     around = Around(second=second, valley=Valley(problem, at, guess.e))
-    verdict = verdict_of(problem, guess.layout, guess.e, around=around)
+    verdict = verdict_of(problem, guess.layout, guess.e, around)
     return Context(problem, at, guess.e, guess.e, verdict)
 
 

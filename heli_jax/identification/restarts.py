@@ -16,15 +16,15 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.starts import draw
-from heli_jax.identification.identifiability.equivalents import same_responses
+from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.unknowns.layout import Noise, Solution, layout_of
 from heli_jax.identification.validation.adequacy import is_unstable
 
 
 class SearchState(NamedTuple):
-    """How far a search has come."""
+    """State of a search."""
 
     problem: Problem
     search: Search
@@ -38,7 +38,7 @@ class SearchState(NamedTuple):
 
 
 class StartPoint(NamedTuple):
-    """Where a run of the optimiser begins."""
+    """Start of a run of the optimiser."""
 
     noise: Noise
     z: Float[Array, " q"]
@@ -83,7 +83,7 @@ def _diverges(at: SearchState) -> bool:
 
 
 def _by_windows(at: SearchState) -> list[StartPoint]:
-    """What the flights share, fitted to short windows."""
+    """Return the start that a fit to short windows gives, without the windows' initial states."""
     problem, guess = at.problem, at.guess
     dt = max(f.dt for f in problem.training)
     shortest = min(f.n_samples * f.dt for f in problem.training)
@@ -145,7 +145,7 @@ def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) ->
 
 
 def _further_starts(at: SearchState) -> list[StartPoint]:
-    """What equation error makes of the record, where it can, and values drawn about the start."""
+    """Return the estimate of equation error, if it has one, and values drawn about the start."""
     problem, guess, layout = at.problem, at.guess, at.guess.layout
     points = np.array(draw(layout, problem, guess.z, 1 + _DRAWN, at.seed))
     try:
@@ -195,10 +195,11 @@ def _has_one_disturbance(at: SearchState) -> bool:
 def _same_responses(at: SearchState) -> list[StartPoint]:
     """Other values with the same responses to the inputs."""
     search, best, layout = at.search, at.best, at.search.layout
-    here = named_values(layout, search.data, best.best.z)
+    here = Solution(layout, search.data, best.noise, best.best.z)
+    others = second_solutions(at.problem, here, evaluate(*here))
     points = []
-    for values in same_responses(at.problem, here)[:_OTHERS]:
-        z = _with_values(at, np.array(best.best.z), values)
+    for other in others[:_OTHERS]:
+        z = _with_values(at, np.array(best.best.z), other.values)
         # Initial states are those of the other values too: from zero they follow.
         z[layout.first_nuisance :] = 0.0
         z = with_noise_guess(search, best.noise, jnp.asarray(z, best.best.z.dtype))

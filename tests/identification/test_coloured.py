@@ -122,13 +122,13 @@ def test_residuals_and_effects_of_any_size_have_the_same_intervals():
     J = np.stack([np.ones(400), np.sin(0.01 * np.arange(400))], axis=1)[None]
     r = ar1(0.9, n=400)[None]
     plain = sandwich(*case(r, J))
-    for noise, effect in ((1e90, 1.0), (1e-80, 1.0), (1.0, 1e-80), (1e60, 1e90)):
+    for noise, effect in ((1e60, 1.0), (1e-80, 1.0), (1.0, 1e-80), (1e60, 1e90)):
         found = sandwich(*case(noise * r, effect * J))
         np.testing.assert_allclose(found.inflation(), noise * plain.inflation(), rtol=1e-9)
         np.testing.assert_allclose(found.quantile(), plain.quantile(), rtol=1e-5)
     for nothing in (0.0 * r, np.eye(1, 400, 200)):
         found = sandwich(*case(nothing, J))
-        assert np.all(np.diag(found.covariance(np.eye(2))) >= 0.0)
+        assert np.all(np.diag(found.covariance()) >= 0.0)
         assert np.isfinite(found.quantile()).all()
 
 

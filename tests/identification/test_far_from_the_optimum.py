@@ -8,9 +8,9 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
+from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.problem import MAX_TIME_SHIFT
-from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.estimates import with_limits
+from heli_jax.identification.uncertainty.estimates import StandardErrors, estimates_of
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
@@ -133,10 +133,18 @@ def test_a_parameter_at_its_bound_is_not_determined_and_no_failure():
 
 def test_no_interval_of_a_time_shift_is_wider_than_its_search():
     # The likelihood and the slopes are taken on past the last value that a shift can have.
-    end = 0.49999
-    shift = Estimate(end, 0.18, 0.1, 0.85, "s", 0.0, 0.0, at_bound=True)
-    found = with_limits({"time_shift": shift}, {"time_shift": (0.003, 1.26)})["time_shift"]
-    assert (found.lower95, found.upper95) == (0.003, MAX_TIME_SHIFT)
+    problem = Problem(
+        SUM, TRUTH, [FIRST], {"La": Free(-1.0)}, Nuisance(bias=False, time_shift=True)
+    )
+    found, ones = fit(problem), np.ones(8)
+    e = evaluate(*found.reached)
+    for wider, limits in ((1.0, {"time_shift": (0.003, 1.26)}), (1e4, {})):
+        errors = StandardErrors(found.verdict, wider * ones, 2.0 * ones, False, limits)
+        shift = estimates_of(problem, found.reached, e, errors)["time_shift"]
+        assert (shift.lower95, shift.upper95) == (
+            0.003 if limits else -MAX_TIME_SHIFT,
+            MAX_TIME_SHIFT,
+        )
 
 
 def test_a_fast_swing_is_no_white_noise():

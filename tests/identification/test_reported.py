@@ -6,8 +6,8 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
-from heli_jax.identification.identifiability.analysis import analyse
-from heli_jax.identification.identifiability.combinations import combinations
+from heli_jax.identification.identifiability.analysis import Around, analyse
+from heli_jax.identification.identifiability.directions import combinations
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
@@ -53,13 +53,13 @@ def test_reported_intervals_enter_the_verdict():
     sensitivity = np.diag([10.0, 10.0])
     assert analyse(sensitivity, unknowns).identifiable
     inside, outside = np.diag([0.01, 0.9 * limit**2]), np.diag([0.01, 1.1 * limit**2])
-    assert analyse(sensitivity, unknowns, reported=inside).identifiable
-    wide = analyse(sensitivity, unknowns, reported=outside)
+    assert analyse(sensitivity, unknowns, around=Around(reported=inside)).identifiable
+    wide = analyse(sensitivity, unknowns, around=Around(reported=outside))
     assert not wide.identifiable
     assert wide.undetermined == ("q",)
     # A parameter that may be zero has no factor.
     scaled = (unknowns[0], unknowns[1]._replace(logarithmic=False))
-    assert analyse(sensitivity, scaled, reported=outside).identifiable
+    assert analyse(sensitivity, scaled, around=Around(reported=outside)).identifiable
 
 
 def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
@@ -90,7 +90,7 @@ def test_a_product_from_nothing_to_anything_is_not_determined(sd, determined):
     unknowns = tuple(Unknown(n, v, True, 1.0, 0.0) for n, v in (("Ixx", 0.05), ("a", 6.0)))
     null = np.array([1.0, 1.0]) / np.sqrt(2.0)
     across = np.array([1.0, -1.0])
-    found = combinations([null], np.outer(across, across) * sd**2 / 4.0, unknowns)
+    found = combinations([null], lambda along: (abs(along @ across) * sd / 2.0, Z95), unknowns)
     assert [c.name for c in found] == determined * ["a/Ixx"]
     for c in found:
         assert c.upper95 / c.value == pytest.approx(np.exp(Z95 * sd), rel=1e-5)

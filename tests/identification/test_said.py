@@ -8,7 +8,7 @@ import pytest
 
 from heli_jax import Flight, Free, Nuisance, Prior, Problem, Signal, fit
 from heli_jax.flights.flight import Source
-from heli_jax.identification.identifiability.analysis import analyse
+from heli_jax.identification.identifiability.analysis import Around, analyse
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
@@ -93,7 +93,7 @@ def test_the_factor_of_ten_is_asked_of_the_others_too_where_one_has_no_effect():
 def test_the_reported_interval_is_asked_of_the_others_too():
     sensitivity = np.array([[100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     reported = np.diag([1e-4, 4.0, 0.0])
-    verdict = analyse(sensitivity, unknowns("L", "B", "D"), reported=reported)
+    verdict = analyse(sensitivity, unknowns("L", "B", "D"), around=Around(reported=reported))
     assert set(verdict.undetermined) == {"B", "D"}
 
 
@@ -132,7 +132,8 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     verdict = analyse(sensitivity, unknowns("L", "B"))
     assert verdict.identifiable
     assert verdict.roughly == ("B",)
-    verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), reported=np.diag([0.64, 1e-4]))
+    around = Around(reported=np.diag([0.64, 1e-4]))
+    verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), around=around)
     assert verdict.roughly == ("L",)
     # Of either sign the interval is -0.57 to 2.57 times the value: no factor.
     first, second = unknowns("L", "B")

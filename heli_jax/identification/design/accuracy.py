@@ -17,8 +17,8 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
+from heli_jax.identification.identifiability.analysis import relative_rows, verdict_of
 from heli_jax.identification.identifiability.directions import projected
-from heli_jax.identification.identifiability.sensitivity import relative_rows, verdict_of
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Layout

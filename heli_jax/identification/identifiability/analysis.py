@@ -5,19 +5,25 @@ scale for those that may be zero. Initial states and biases are projected out fi
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.identifiability.combinations import combinations, row_reduced
+from heli_jax import naming
+from heli_jax.flights.flight import labels
+from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.directions import (
     TAKES_NO_PART,
     TAKES_PART,
+    Spread,
     WithoutWeakPriors,
+    combinations,
     directions,
+    projected,
+    row_reduced,
     unit_vector,
     with_further,
     with_too_wide,
@@ -29,7 +35,6 @@ from heli_jax.identification.identifiability.verdict import (
     FACTOR,
     ROUGHLY,
     Z95,
-    Combination,
     Group,
     Pair,
     SecondSolution,
@@ -38,43 +43,196 @@ from heli_jax.identification.identifiability.verdict import (
     Weakest,
     connected,
 )
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
+
+# From the residual's Jacobian to relative coordinates.
+
+_NEAR_ZERO = 1e-2
+"""part of a parameter's size below which it takes no part in products of powers"""
+_AT_END = 1e-3
+"""part of the largest time shift within which one is at the end of its search"""
+_NO_EFFECT = 1e-6
+"""A nuisance whose whole effect is below this part of the noise, such as the memory of a
+disturbance that is not there, has no direction to be projected out."""
+
+
+def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
+    """Return the parameters of interest with their size and prior in relative coordinates."""
+    dt = problem.training[0].dt
+    unknowns = []
+    for name, value in zip(layout.of_interest, map(float, e.named), strict=True):
+        if name == "time_shift":
+            # A shift is known well where it is known to a sample, whatever its value. The search is
+            # through a tanh, which comes near to its end and never to it.
+            room = MAX_TIME_SHIFT - abs(value)
+            u = Unknown(name, value, False, 1.0, 0.0, is_parameter=False, reference=dt)
+            u = u._replace(at_bound=room < _AT_END * MAX_TIME_SHIFT, room=room / dt)
+        elif name in problem.free:
+            u = _parameter(problem, name, value)
+        else:
+            u = Unknown(name, value, True, 1.0, 0.0, is_parameter=False, reference=abs(value))
+        unknowns.append(u)
+    return tuple(unknowns)
+
+
+def _parameter(problem: Problem, name: str, value: float) -> Unknown:
+    """Return a free parameter of the model as an unknown."""
+    free, late = problem.free[name], name in problem.model.delay_parameters
+    low, high = free.lower, free.upper
+    # Zero is as good a value as any where the sign may change, and of every delay: one that is
+    # searched as a positive number may still be none at all, of which its logarithm says nothing.
+    symmetric = late or transforms.changes_sign(free)
+    reference, log = abs(value), True
+    # Between bounds of both signs neither a logarithm nor the start's size means anything.
+    if low is not None and high is not None and low < 0 < high:
+        reference, log = 0.5 * (high - low), False
+    elif symmetric:
+        # A value near zero is known as soon as it is known to be small beside the start; or beside
+        # a sample, however small a delay the search began with.
+        reference = max(abs(value), transforms.scale(free))
+        reference = max(reference, problem.training[0].dt) if late else reference
+        log = abs(value) > _NEAR_ZERO * reference
+    # What a parameter may plausibly do: by its prior, or half its interval.
+    prior, scale = reference / free.prior.sd if free.prior else 0.0, 1.0
+    if prior:
+        scale = 1.0 / prior
+    elif log and low and high:
+        # Bounds that nearly meet would make a scale of zero, and a null direction of it.
+        scale = max(0.5 * float(np.log(high / low)), 1e-3)
+    at_bound = transforms.at_bound(free, value)
+    return Unknown(name, value, log, scale, prior, True, reference, symmetric, at_bound=at_bound)
+
+
+class RelativeRows(NamedTuple):
+    """The Jacobian without the priors of the parameters, taken apart."""
+
+    sensitivity: np.ndarray
+    """(n, q) of the rows of data, parameters of interest in relative coordinates"""
+    nuisances: np.ndarray
+    """(n, k) of the same rows, all other unknowns"""
+    weak: np.ndarray
+    """(w, k) the weak priors' rows, which only nuisances have"""
+
+
+def relative_rows(
+    problem: Problem, layout: Layout, e: Evaluation
+) -> tuple[tuple[Unknown, ...], RelativeRows]:
+    """Return the parameters of interest, and the Jacobian's rows in relative coordinates."""
+    unknowns = unknowns_of(problem, layout, e)
+    # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
+    J = np.asarray(e.J, dtype=np.float64)
+    q, p = len(layout.of_interest), len(layout.free)
+    count = layout.size - layout.first_nuisance
+    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
+    # the parameters' own; the defects between windows count as data.
+    data = J[: J.shape[0] - count - p]
+    slopes = np.asarray(e.slopes, dtype=np.float64)
+    factor = np.divide(
+        [u.reference for u in unknowns], slopes, out=np.zeros_like(slopes), where=slopes != 0
+    )
+    # A parameter of negative sign falls as its logarithm rises; the size is what counts.
+    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * [u.sign for u in unknowns]
+    return unknowns, RelativeRows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
+
+
+# The verdict.
 
 ILL_CONDITIONED = 1e4
 """condition number above which the verdict warns: the data determine all, some of it hardly"""
 STRONG = 0.99
 """correlation beyond which the verdict names a pair; rank alone does not show it (a stand's damping
 and the flybar's have correlation 1.00000 and full rank)"""
+_WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
 
 
 class Around(NamedTuple):
-    """What is known of points other than the one whose slopes are asked."""
+    """What is known beside the slopes at a point."""
 
     aliased: Collection[str] = ()
     """the parameters that move a mode which the samples do not tell from its aliases"""
     second: tuple[SecondSolution, ...] = ()
     """other values that fit as well"""
     valley: Valley | None = None
-    """tells which combinations are the same far from the point; else its slopes are believed"""
+    """tells which combinations are the same far from the point; without it there are none"""
     null: tuple[np.ndarray, ...] = ()
     """directions (q,) in relative coordinates that are open at another point as likely"""
     one_sided: tuple[str, ...] = ()
     """the parameters that the likelihood does not bound within the factor of ten"""
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
     """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
-    combined: bool = True
-    """whether combinations have numbers at all"""
-
-    def tied(
-        self, null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
-    ) -> tuple[Combination, ...]:
-        """Return what is determined along null directions, as `combinations` has it."""
-        if not self.combined:
-            return ()
-        asked = self.valley.tied if self.valley is not None else combinations
-        return asked(null, covariance, unknowns)
+    reported: np.ndarray | None = None
+    """covariance (q, q) of the parameters of interest that the reported intervals have, where it is
+    not that of white residuals; in the optimiser's coordinates, for `analyse` in relative ones"""
+    widening: Spread = lambda along: (1.0, Z95)
+    """by a weighted sum (q,) in the same coordinates the factor on its sd by white residuals, and
+    how many sds its 95 % interval reaches"""
 
 
-NOTHING_ELSE = Around()
+def verdict_of(
+    problem: Problem, layout: Layout, e: Evaluation, around: Around = Around()
+) -> Verdict:
+    """Return what the data determine at one point.
+
+    Raises:
+        ValueError: the simulation is not finite there.
+    """
+    if not bool(np.all(np.isfinite(e.J))):
+        raise ValueError(
+            "the simulation is not finite at the given values: the model is unstable there over "
+            "the length of this record; start elsewhere or use a shorter window"
+        )
+    unknowns, rows = relative_rows(problem, layout, e)
+    unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
+    q = len(unknowns)
+    # All further work is on the triangle, which holds what the data say in as many rows as columns.
+    R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
+    S, N = R[:, :q], R[:, q:]
+    # With weak priors: what neither the data nor a prior of its own sees is no unknown, and none of
+    # the others depends on another.
+    held = np.vstack([N, rows.weak])
+    shown = np.linalg.norm(held, axis=0) > _NO_EFFECT
+    sensitivity = projected(np.vstack([S, np.zeros((len(rows.weak), q))]), held[:, shown])
+    named = flight_unknowns(layout, labels(problem.training))
+    to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
+    if around.reported is not None:
+        reported = around.reported * np.outer(to_relative, to_relative)
+        widening = around.widening
+        around = around._replace(
+            reported=reported, widening=lambda along: widening(along * to_relative)
+        )
+    # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
+    # A second run with a known inertia added sets the scale.
+    known = naming.names(problem.model.Params)
+    remedies = {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
+    # Initial states of a chance optimum may tell what no input does: at rest they would not.
+    kinds = {n.kind for n in named} if around.valley else set()
+    # Windows need their initial states.
+    kinds -= {"initial_state"} if problem.window is not None else set()
+    return analyse(
+        sensitivity,
+        unknowns,
+        without_weak=_without_weak_priors(named, S, N),
+        around=around,
+        remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
+        switches=kinds,
+    )
+
+
+def _without_weak_priors(
+    named: tuple[FlightUnknown, ...], S: np.ndarray, N: np.ndarray
+) -> WithoutWeakPriors:
+    """Return what the data (S by the unknowns, N by the nuisances) say without the weak priors of
+    the last columns of N, which are `named`."""
+    seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
+    # The weak priors' sds are the units of these columns, so the solution is in sds.
+    compensation = np.zeros((N.shape[1], S.shape[1]))
+    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=NULL)[0]
+    # Before those named stand the parameters of the disturbance and the noise's factors.
+    return WithoutWeakPriors(
+        projected(S, N[:, seen], NULL), compensation[N.shape[1] - len(named) :], named
+    )
 
 
 def analyse(
@@ -82,8 +240,7 @@ def analyse(
     unknowns: tuple[Unknown, ...],
     *,
     without_weak: WithoutWeakPriors | None = None,
-    reported: np.ndarray | None = None,
-    around: Around = NOTHING_ELSE,
+    around: Around = Around(),
     remedies: Mapping[str, str] = MappingProxyType({}),
     switches: Iterable[str] = (),
 ) -> Verdict:
@@ -92,12 +249,9 @@ def analyse(
     Args:
         sensitivity: (any, q) with the nuisances free but for their weak priors. Priors of the
             unknowns are no rows of it; they come with the unknowns.
-        unknowns: (q,) what the columns are.
         without_weak: the same without the weak priors, which count as data where it is not given.
-        reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
-            where it is not that of white residuals: these must not reach further than the factor
-            either.
         remedies: by name of an unknown, a further way out that the model offers.
+        switches: the kinds of nuisances that may be switched off.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
     scale, own = np.array([u.scale for u in unknowns]), np.array([u.prior for u in unknowns])
@@ -105,20 +259,23 @@ def analyse(
     # would lend one to each parameter that a bias or an initial state can take the place of.
     # A prior is a measurement of the parameter itself: a row with one over its sd.
     total, data = directions(np.vstack([bare, np.diag(own)]), scale), directions(bare, scale)
-    null, covariance = total.not_determined, total.covariance
-    if not null:
+    covariance = total.covariance
+    if not total.null:
         # All is determined: the intervals are those of the fit, which has the weak priors.
         covariance = directions(np.vstack([sensitivity, np.diag(own)]), scale, 0.0).covariance
-    null = _null(null, (total.covariance, covariance, reported), unknowns, around)
+    null = with_too_wide(total.null, total.covariance, unknowns)
+    null = with_further(null, _further(total.covariance, covariance, unknowns, around))
+    if around.reported is not None:
+        null = with_too_wide(null, around.reported, unknowns)
     # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
     # number that the prior has put there, and its combinations have no prior in them.
     resting = []
     if not null and own.any():
-        resting = with_too_wide(data.not_determined, data.covariance, unknowns)
+        resting = with_too_wide(data.null, data.covariance, unknowns)
     dead = without_effect(sensitivity, unknowns)
     of_rows = (sensitivity, without_weak)
-    groups = _groups(null, covariance, unknowns, of_rows, around, dead)
-    resting_groups = _groups(resting, data.covariance, unknowns, of_rows, around)
+    groups = _groups(null, _spread(covariance, around), unknowns, of_rows, around, dead)
+    resting_groups = _groups(resting, _spread(data.covariance, around), unknowns, of_rows, around)
     undetermined = tuple(
         u.name
         for i, u in enumerate(unknowns)
@@ -126,7 +283,7 @@ def analyse(
         or any(u.name in other.changed for other in around.second)
     )
     # A variance of nothing may be rounding of either sign.
-    variance = np.diag(covariance if reported is None else reported)
+    variance = np.diag(covariance if around.reported is None else around.reported)
     known = [
         (u, float(sd))
         for u, sd in zip(unknowns, np.sqrt(np.maximum(variance, 0.0)), strict=True)
@@ -144,8 +301,8 @@ def analyse(
     verdict = Verdict(
         unknowns=unknowns,
         identifiable=not (null or around.second),
-        rank=int(total.kept.sum()),
-        rank_without_priors=int(data.kept.sum()),
+        rank=total.rank,
+        rank_without_priors=data.rank,
         condition=condition,
         singular_values=singular,
         null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in null),
@@ -170,22 +327,15 @@ def analyse(
     return replace(verdict, sentences=sentences(verdict))
 
 
-def _null(
-    null: list[np.ndarray],
-    covariances: tuple[np.ndarray, np.ndarray, np.ndarray | None],
-    unknowns: tuple[Unknown, ...],
-    around: Around,
+def _further(
+    bare: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...], around: Around
 ) -> list[np.ndarray]:
-    """Return the directions that are not determined: those without effect, those whose interval
-    reaches too far, and those that other points leave open.
+    """Return directions that are not determined although their intervals are short.
 
     Args:
-        null: those without effect.
-        covariances: (q, q) each, without the weak priors, with them, and as it is reported.
-        unknowns: (q,) what the coordinates are.
+        bare: covariance (q, q) without the weak priors.
+        covariance: (q, q) with them.
     """
-    bare, covariance, reported = covariances
-    null = with_too_wide(null, bare, unknowns)
     # Those of one sign have the factor of ten. Of what may be zero weak priors alone hold one whose
     # sd without them is beyond its scale and ten times the one with them.
     weakly = [
@@ -199,13 +349,22 @@ def _null(
     open_ = np.array([u.name in around.one_sided for u in unknowns])
     sds = np.sqrt(np.where(open_, np.diag(covariance), 1.0))
     one_sided = [np.where(open_, covariance[:, i] / sds, 0.0) for i in np.flatnonzero(open_)]
-    null = with_further(null, [*weakly, *aliased, *around.null, *one_sided])
-    return null if reported is None else with_too_wide(null, reported, unknowns)
+    return [*weakly, *aliased, *around.null, *one_sided]
+
+
+def _spread(covariance: np.ndarray, around: Around) -> Spread:
+    """Return how far weighted sums of relative coordinates may be off."""
+
+    def spread(along: np.ndarray) -> tuple[float, float]:
+        wider, reach = around.widening(along)
+        return wider * math.sqrt(max(0.0, float(along @ covariance @ along))), reach
+
+    return spread
 
 
 def _groups(
     null: list[np.ndarray],
-    covariance: np.ndarray,
+    spread: Spread,
     unknowns: tuple[Unknown, ...],
     of_rows: tuple[np.ndarray, WithoutWeakPriors | None],
     around: Around,
@@ -214,8 +373,6 @@ def _groups(
     """Return the parameters in null directions, those apart that no direction ties together.
 
     Args:
-        covariance: (q, q) of what is determined.
-        unknowns: (q,) what the coordinates are.
         of_rows: the sensitivity with the weak priors and without them.
         dead: parameters without effect, which have a sentence of their own, and no combination.
     """
@@ -231,22 +388,18 @@ def _groups(
     groups = []
     for members in connected(parts):
         mine = [v for v, part in zip(rows, parts, strict=True) if part & members]
-        exchanged = []
+        tied, exchanged = (), []
+        if around.valley is not None:
+            tied = around.valley.tied(mine, spread, unknowns)
         if without_weak is not None:
             exchanged = [n for v in mine for n in without_weak.exchanged(v, sensitivity)]
-        groups.append(
-            Group(
-                tuple(unknowns[i].name for i in sorted(members)),
-                len(mine),
-                around.tied(mine, covariance, unknowns),
-                tuple(dict.fromkeys(exchanged)),
-            )
-        )
+        names = tuple(unknowns[i].name for i in sorted(members))
+        groups.append(Group(names, len(mine), tied, tuple(dict.fromkeys(exchanged))))
     return tuple(groups)
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
-    """(q, q) of a covariance; one that takes part in no determined direction has none."""
+    """Return (q, q); one that takes part in no determined direction has none."""
     sd = np.sqrt(np.diag(covariance))
     safe = np.where(sd > 0, sd, 1.0)
     correlation = covariance / np.outer(safe, safe)
@@ -257,7 +410,7 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 def _pairs(
     correlation: np.ndarray, names: list[str], undetermined: tuple[str, ...]
 ) -> tuple[Pair, ...]:
-    """Pairs beyond the limit; what is not determined has no correlation."""
+    """Return the pairs beyond the limit; what is not determined has no correlation."""
     pairs = [
         Pair(names[j], names[i], float(correlation[i, j]))
         for i in range(len(names))
@@ -282,16 +435,15 @@ def _shares(
     # Precisions add, so a prior's share is its precision times the variance that is left.
     ratio = variance / np.where(bare_variance > 0, bare_variance, 1.0)
     weak = np.where(bare_variance > 0, 1.0 - ratio, 0.0)
-    clipped = (np.clip(s, 0.0, 1.0) for s in (explained, variance * own**2, weak))
-    explained, by_own, by_weak = clipped
+    explained, by_own, by_weak = np.clip([explained, variance * own**2, weak], 0.0, 1.0)
     return explained, by_own, by_weak
 
 
 def _factors(
     known: list[tuple[Unknown, float]], limits: Mapping[str, tuple[float, float]]
 ) -> dict[str, float]:
-    """By unknown that is determined in a wide interval, the factor to its ends; infinite of one
-    whose interval holds zero, or reaches the end of its search."""
+    """Return by unknown that is determined in a wide interval the factor to its ends; infinite of
+    one whose interval holds zero, or reaches the end of its search."""
     factors = {}
     for u, sd in known:
         # A coordinate that is no logarithm has no factor.
@@ -318,20 +470,4 @@ def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> Weakest:
     parts = {
         u.name: float(v) for u, v in zip(unknowns, direction, strict=True) if abs(v) > TAKES_PART
     }
-    return Weakest(parts, combinations([direction], covariance, unknowns))
-
-
-def with_combinations(verdict: Verdict, change: Callable[[Combination], Combination]) -> Verdict:
-    """Return the verdict with other intervals of its combinations, without those that then
-    determine nothing.
-    """
-
-    def changed(groups: tuple[Group, ...]) -> tuple[Group, ...]:
-        each = (tuple(map(change, g.combinations)) for g in groups)
-        kept = (tuple(c for c in joint if c.is_bounded) for joint in each)
-        return tuple(g._replace(combinations=k) for g, k in zip(groups, kept, strict=True))
-
-    groups, resting = changed(verdict.groups), changed(verdict.resting_groups)
-    joint = tuple(c for group in (*groups, *resting) for c in group.combinations)
-    verdict = replace(verdict, combinations=joint, groups=groups, resting_groups=resting)
-    return replace(verdict, sentences=sentences(verdict))
+    return Weakest(parts, combinations([direction], _spread(covariance, Around()), unknowns))

@@ -8,8 +8,7 @@ parameter that the likelihood, a little further off, does not.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -18,13 +17,13 @@ import scipy.special
 
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, pseudoinverse
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.identifiability.analysis import Around, unknowns_of, verdict_of
 from heli_jax.identification.identifiability.equivalents import (
     Rows,
     descend,
     rows_at,
     squares_of,
 )
-from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
@@ -33,6 +32,8 @@ from heli_jax.identification.unknowns.layout import Solution, flight_places, val
 _REACHES = (3.0, 9.0)
 """standard deviations to either side of a profile that is asked for; the second only where the
 first holds no whole interval"""
+_POINTS = 13
+"""of such a profile; odd, so that the optimum is one of them"""
 _OUTWARDS = (0.35, 0.6, 1.0, 1.7, 2.9, 4.9, 8.4, 14.0, 24.0, 41.0)
 """the points of a search for an interval's end, over the end by the slopes"""
 _AS_EXPECTED = 1.15
@@ -46,8 +47,6 @@ _VALLEY = 0.9
 _INFLATED = 1.5
 """factor by which autocorrelated residuals may make intervals wider: beyond, a disturbance does,
 and the likelihood of white residuals means little"""
-_TOGETHER = 0.99
-"""correlation beyond which what is open of one parameter is open of the other"""
 _BY_CHANCE = 1e-3
 """probability that initial states which are those of rest gain as much of the likelihood"""
 _REST = 1e-6
@@ -66,19 +65,15 @@ class Profile(NamedTuple):
     """where the deviance passes 3.84; NaN where it does not within nine standard deviations"""
 
 
-def profile(at: Solution, name: str, points: int = 13) -> Profile:
-    """Return the profile of a free parameter; white residuals are taken for granted.
-
-    Args:
-        points: of the profile; odd, so that the optimum is one of them.
-    """
+def profile(at: Solution, name: str) -> Profile:
+    """Return the profile of a free parameter; white residuals are taken for granted."""
     i = at.layout.free.index(name)
     line = _line(at, rows_at(at, at.z), i)
     for reach in _REACHES:
-        t = np.linspace(-reach, reach, points) * line.sd
+        t = np.linspace(-reach, reach, _POINTS) * line.sd
         left = [root for _, root in line.roots(-1, -t[t < 0][::-1])][::-1]
         right = [root for _, root in line.roots(1, t[t > 0])]
-        root = np.array([-r for r in left] + [0.0] * (points % 2) + right)
+        root = np.array([-r for r in left] + [0.0] + right)
         root = np.where(np.isfinite(root), root, np.nan)
         z = [_crossing(root, t, side * Z95) for side in (-1, 1)]
         values = np.array([line.value(float(d)) for d in (*z, *t)])
@@ -90,14 +85,12 @@ def profile(at: Solution, name: str, points: int = 13) -> Profile:
 
 
 def _crossing(root: np.ndarray, t: np.ndarray, limit: float) -> float:
-    """Distance at which the signed root of the deviance, nearly a straight line, passes the
-    limit."""
+    """Return the distance at which the signed root of the deviance, nearly a straight line, passes
+    the limit."""
     seen = np.isfinite(root)
     root, t = root[seen], t[seen]
     order = np.argsort(root)
-    if not root.size or not root[order[0]] <= limit <= root[order[-1]]:
-        return math.nan
-    return float(np.interp(limit, root[order], t[order]))
+    return float(np.interp(limit, root[order], t[order], left=math.nan, right=math.nan))
 
 
 class _Line(NamedTuple):
@@ -113,40 +106,35 @@ class _Line(NamedTuple):
     """at the optimum"""
 
     def roots(self, side: int, distances: Iterable[float]) -> Iterator[tuple[float, float]]:
-        """Distances from the optimum to one side, each with the root of the deviance there.
+        """Yield distances from the optimum to one side, each with the root of the deviance there.
 
         Each point is sought from the one before, where the line through that and the optimum goes.
         """
         z0 = np.asarray(self.at.z, np.float64)
-        held, guess, tangent = np.arange(z0.size) == self.i, z0, self.tangent
+        moving, guess, tangent = np.arange(z0.size) != self.i, z0, self.tangent
         for t in distances:
             guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
-            guess, squares = follow(self.at, guess, held)
+            guess, squares = descend(lambda z: rows_at(self.at, z), guess, moving)
             if t > 0.0:
                 tangent = (guess - z0) / (guess[self.i] - z0[self.i])
             yield t, math.sqrt(deviance_of(self.at, self.squares, squares))
 
     def value(self, distance: float) -> float:
-        """The parameter, in its unit."""
+        """Return the parameter, in its unit."""
         z = jnp.asarray(float(self.at.z[self.i]) + distance)
         return float(value_of(self.at.layout, self.at.data, self.i, z))
 
 
-def _line(at: Solution, here: Rows, i: int, inverse: np.ndarray | None = None) -> _Line:
-    """The line along unknown i; `inverse` (q, k) a root of the covariance of all unknowns."""
-    inverse = pseudoinverse(here.J) if inverse is None else inverse
+def _line(at: Solution, here: Rows, i: int) -> _Line:
+    """Return the line along unknown i."""
+    inverse = pseudoinverse(here.J)
     along = inverse @ inverse[i]
     return _Line(at, i, along / along[i], math.sqrt(along[i]), squares_of(here.r))
 
 
-def follow(at: Solution, z: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point (q,) of the smallest sum of squares near z with the coordinates `held` (q,)
-    where they are, and that sum, infinite where nothing finite is found."""
-    return descend(lambda z: rows_at(at, z), z, ~held)
-
-
 def deviance_of(at: Solution, first: float, squares: float) -> float:
-    """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
+    """Return twice the log-likelihood between two sums of squares; none where the second is
+    smaller."""
     if not math.isfinite(squares):
         return math.inf
     # What a further step promises may be all there is.
@@ -160,29 +148,16 @@ def deviance_of(at: Solution, first: float, squares: float) -> float:
     return max(0.0, float(deviance))
 
 
-Limits = Mapping[str, tuple[float, float]]
-
-
-class BeyondSlopes(NamedTuple):
-    """What slopes at the optimum do not tell."""
-
-    limits: Limits = MappingProxyType({})
-    """by parameter the ends of its 95 % interval by the likelihood, in the parameter's unit, where
-    those by the slopes are others"""
-    one_sided: tuple[str, ...] = ()
-    """parameters that the likelihood does not bound within the factor of ten to either side"""
-    null: tuple[np.ndarray, ...] = ()
-    """directions (q,) in relative coordinates that are open with the initial states at rest, where
-    the data cannot tell them from that"""
-
-
-AS_SLOPES = BeyondSlopes()
-
-
 def beyond_slopes(
-    problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
-) -> BeyondSlopes:
-    """Ask the likelihood of the parameters whose intervals are wide.
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    verdict: Verdict,
+    reaches: np.ndarray,
+    around: Around,
+) -> Around:
+    """Ask the likelihood of the parameters whose intervals are wide; `around` itself where there
+    are none.
 
     Args:
         reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
@@ -190,13 +165,12 @@ def beyond_slopes(
     lacking = verdict.not_identifiable
     wide = _wide(problem, at, e, verdict, reaches)
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
-        return AS_SLOPES
+        return around
     null = _open_at_rest(problem, at, e, lacking, reaches)
     opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
     # What is open already goes along with anything, and tells nothing of where the others go.
     J = np.array(e.J, np.float64)
     J[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
-    inverse = pseudoinverse(J)
     # Several that go together along one valley have as many ways to fit the noise: their intervals
     # are those that hold for all of them at once.
     together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
@@ -204,7 +178,7 @@ def beyond_slopes(
     for i, u in wide:
         if u.name in opened:
             continue
-        line = _line(at, Rows(np.asarray(e.r), J), i, inverse)
+        line = _line(at, Rows(np.asarray(e.r), J), i)
         reach = together * float(reaches[i])
         ends = [_end(problem, line, e, u, side, reach) for side in (-1, 1)]
         bounded = [t for t in ends if t is not None]
@@ -213,32 +187,27 @@ def beyond_slopes(
         elif any(abs(t) != reach * line.sd for t in bounded):
             low, high = sorted(line.value(t) for t in bounded)
             limits[u.name] = (low, high)
-    return BeyondSlopes(limits, tuple(one_sided), tuple(null))
+    return around._replace(limits=limits, one_sided=tuple(one_sided), null=tuple(null))
 
 
 def _wide(
     problem: Problem, at: Solution, e: Evaluation, verdict: Verdict, reaches: np.ndarray
 ) -> list[tuple[int, Unknown]]:
     """Return the parameters that the likelihood is asked of, by their place among the unknowns."""
-    sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    reaches = reaches[: len(sd)]
-    related = np.abs(np.where(np.eye(len(sd)), 0.0, verdict.correlation)).max(1, initial=0.0)
-    asked = (reaches < _INFLATED * Z95) | (related > _TOGETHER)
+    sds = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    related = np.abs(np.where(np.eye(len(sds)), 0.0, verdict.correlation)).max(1, initial=0.0)
     least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
     wide = []
     for i, u in enumerate(unknowns_of(problem, at.layout, e)):
-        if (
-            u.name not in problem.free
-            or u.name in verdict.not_identifiable
-            or u.at_bound
-            or not asked[i]
-        ):
+        if u.name not in problem.free or u.name in verdict.not_identifiable or u.at_bound:
             continue
         low, high = transforms.limits(problem.free[u.name])
+        reach = float(sds[i] * reaches[i])
         # What acts through a parameter that may be zero may act not at all: slopes beside zero
         # bound what the likelihood there does not.
-        may_vanish = u.symmetric and low < 0.0 < high and sd[i] * reaches[i] >= u.distance
-        if (u.logarithmic or u.symmetric) and (sd[i] * reaches[i] > Z95 * least[i] or may_vanish):
+        may_vanish = u.symmetric and low < 0.0 < high and reach >= u.distance
+        far = (u.logarithmic or u.symmetric) and (reach > Z95 * least[i] or may_vanish)
+        if far and reaches[i] < _INFLATED * Z95:
             wide.append((i, u))
     return wide
 
@@ -283,7 +252,7 @@ def _end(
 
 
 def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: int) -> float:
-    """Distance in the coordinate to a factor of ten, or to a bound."""
+    """Return the distance in the coordinate to a factor of ten, or to a bound."""
     free, value = problem.free[u.name], u.value
     size = abs(value) / u.distance if u.distance else abs(value)
     up = (float(e.slopes[line.i]) > 0) == (side > 0)
@@ -304,7 +273,8 @@ def _furthest(problem: Problem, line: _Line, e: Evaluation, u: Unknown, side: in
 def _open_at_rest(
     problem: Problem, at: Solution, e: Evaluation, lacking: frozenset[str], reaches: np.ndarray
 ) -> list[np.ndarray]:
-    """Return directions that nothing but initial states of chance determine.
+    """Return directions that nothing but initial states of chance determine: open with the initial
+    states at rest, where the data cannot tell them from that.
 
     A transient is as large as the initial states that the fit has found, and so is what it tells
     of the parameters. Where the data do not tell these states from rest, it may as well be none.
@@ -318,7 +288,7 @@ def _open_at_rest(
     z = np.asarray(at.z, np.float64)
     if not (np.abs(z[held]) > _REST).any():
         return []
-    rest, squares = follow(at, np.where(held, 0.0, z), held)
+    rest, squares = descend(lambda z: rows_at(at, z), np.where(held, 0.0, z), ~held)
     deviance = deviance_of(at, squares_of(e.r), squares)
     # Autocorrelated residuals let chance gain more.
     wider = max(1.0, float(np.median(reaches[held])) / Z95)

@@ -32,10 +32,6 @@ _LONGEST = 0.5
 """of the window, as a part of the record"""
 _RESOLVED = 1e-3
 """singular value over the largest below which finite differences tell no curvature"""
-_NO_EFFECT = 1e-100
-"""of the largest column of J: a smaller one is rounding of no effect"""
-_ENDLESS = 1e140
-"""standard deviation of an unknown of no effect, whose square is still a number"""
 _LARGEST_STEP = 0.1
 """of a coordinate, most of them logarithms, for differences of the slopes"""
 _FLATTEST = 0.05
@@ -43,10 +39,13 @@ _FLATTEST = 0.05
 
 
 class Sandwich(NamedTuple):
-    """The covariance of all unknowns z (q,) with autocorrelated residuals, in parts."""
+    """The covariance of all unknowns z (q,) with autocorrelated residuals, in parts.
+
+    All arrays are of unknowns that are scaled to columns of J of length one.
+    """
 
     norms: Float[np.ndarray, " q"]
-    """of the columns of J, by which all else is scaled"""
+    """lengths of the columns of J"""
     white: Float[np.ndarray, "q q"]
     """inverse of J'J"""
     bread: Float[np.ndarray, "q q"]
@@ -54,49 +53,42 @@ class Sandwich(NamedTuple):
     parts: tuple["_Part", ...]
     """by flight"""
     rest: Float[np.ndarray, "q q"]
-    """J'J of the rows that are no measurements (priors), whose variance is known, over size^2"""
-    size: float
-    """largest residual, by which those in `parts` are divided"""
+    """J'J of the rows that are no measurements (priors), whose variance is known"""
 
     def inflation(self, along: np.ndarray | None = None) -> np.ndarray:
-        """How much wider than white noise says the standard deviations of the combinations
-        `along` (k, q) of unknowns are, or without it of every unknown; (k,) or (q,)."""
-        along, _ = self._scaled(along)
+        """Return the sd of combinations `along` (k, q) of unknowns, or of every unknown, over that
+        by white noise; (k,) or (q,)."""
+        along = self._scaled(along)
         by_white = np.sum(along @ self.white * along, axis=1)
         variance, _ = self._variance(along)
-        ratio = variance / np.where(by_white > 0, by_white, 1.0)
-        return self.size * np.sqrt(np.maximum(ratio, 0.0))
+        return np.sqrt(np.maximum(variance / np.where(by_white > 0, by_white, 1.0), 0.0))
 
     def quantile(self, along: np.ndarray | None = None) -> np.ndarray:
-        """Student's 97.5 % quantile of each combination, as `inflation` has them."""
-        _, freedom = self._variance(self._scaled(along)[0])
+        """Return Student's 97.5 % quantile of each combination, as `inflation` has them."""
+        _, freedom = self._variance(self._scaled(along))
         # Below one degree of freedom the quantile has no use: 12.7 standard deviations are enough.
         return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
-    def covariance(self, along: np.ndarray) -> np.ndarray:
-        """(k, k) of combinations, with the variances that `inflation` has."""
-        along, sizes = self._scaled(along)
-        D = along @ self.bread
-        whole = D @ (self.rest + sum(p.meat for p in self.parts)) @ D.T
-        variance, _ = self._variance(along)
+    def covariance(self) -> np.ndarray:
+        """Return the covariance (q, q), with the variances that `inflation` has."""
+        meat = self.rest + sum(p.meat for p in self.parts)
+        whole = self.bread @ meat @ self.bread
+        variance, _ = self._variance(np.eye(self.norms.size))
         plain = np.diag(whole)
         # `_variance` allows on each variance for what the fit took; the correlations stay.
         factor = np.sqrt(np.divide(variance, plain, out=np.zeros_like(plain), where=plain > 0))
         whole *= np.outer(factor, factor)
         # Where there is none, rounding has left a little of either sign.
         np.fill_diagonal(whole, variance)
-        sizes = np.minimum(self.size * sizes, _ENDLESS)
-        return whole * np.outer(sizes, sizes)
+        return whole / np.outer(self.norms, self.norms)
 
-    def _scaled(self, along: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """The combinations (k, q) by unknowns of unit columns, and their sizes (k,), by which they
-        are divided: squares of variances would not hold those of an unknown of hardly any
-        effect."""
-        along = np.eye(self.norms.size) if along is None else along
+    def _scaled(self, along: np.ndarray | None) -> np.ndarray:
+        """The combinations (k, q) by unknowns of unit columns, their largest parts one: the size of
+        a combination changes neither inflation nor quantile."""
+        if along is None:
+            return np.eye(self.norms.size)
         along = along / self.norms
-        sizes = np.max(np.abs(along), axis=1)
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        return along / sizes[:, None], sizes
+        return along / np.maximum(np.max(np.abs(along), axis=1, keepdims=True), 1e-300)
 
     def _variance(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(k,) of combinations, and the degrees of freedom with which they are known."""
@@ -155,22 +147,18 @@ class _Part(NamedTuple):
 def sandwich(
     layout: Layout, data: Data, e: Evaluation, curvature: Float[np.ndarray, "q q"] | None = None
 ) -> Sandwich:
-    """The covariance of the unknowns at an optimum of output error.
+    """Return the covariance of the unknowns at an optimum of output error.
 
     Several outputs of a flight enter with their cross-covariances, flights are independent.
 
     Args:
-        layout: of the unknowns z (q,).
-        data: says which samples are missing.
         curvature: (q, q) what the residuals add to J'J in the Hessian (`residual_curvature`);
             nothing unless given.
     """
     J, r = np.asarray(e.J, np.float64), np.asarray(e.r, np.float64)
-    norms = _norms(J)
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
     J = J / norms
-    # Their spectrum is squared, and squared again for the degrees of freedom.
-    size = max(float(np.max(np.abs(r))), 1.0)
-    r = r / size
     # The singular values of J are those of its triangle, which is (q, q) however long the record.
     _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
     kept = singular > NULL * max(singular[0], 1e-300)
@@ -181,35 +169,21 @@ def sandwich(
     # Rows stand flight after flight, output after output; those of the priors come last.
     at, parts = 0, []
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):
-        measured = np.stack([np.asarray(flight.outputs[n]) for n in outputs])
-        k, n = measured.shape
-        rows = slice(at, at + k * n)
-        parts.append(
-            _part(J[rows].reshape(k, n, -1), r[rows].reshape(k, n), ~np.isnan(measured), T)
-        )
-        at += k * n
-    rest = J[at:] / size
-    return Sandwich(norms, white, bread, tuple(parts), rest.T @ rest, size)
-
-
-def _norms(J: Float[np.ndarray, "n q"]) -> Float[np.ndarray, " q"]:
-    """Of the columns, without squares that overflow; 1 where one has next to no effect."""
-    most = np.max(np.abs(J), axis=0)
-    norms = most * np.linalg.norm(J / np.where(most > 0, most, 1.0), axis=0)
-    return np.where(norms > _NO_EFFECT * max(norms.max(), 1e-300), norms, 1.0)
+        seen = ~np.isnan(np.stack([np.asarray(flight.outputs[n]) for n in outputs]))
+        rows = slice(at, at + seen.size)
+        parts.append(_part(J[rows].reshape(*seen.shape, -1), r[rows].reshape(seen.shape), seen, T))
+        at = rows.stop
+    return Sandwich(norms, white, bread, tuple(parts), J[at:].T @ J[at:])
 
 
 def residual_curvature(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> Float[np.ndarray, "q q"]:
-    """What the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
+    """Return what the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
     By central differences of J'r along the unknowns of interest. Zero where it is not finite. Those
     of a model that is not linear reach two standard deviations to either side: over less, what a
     limit, a stop or a dead band makes of the slopes are kinks, whose differences are no curvature.
-
-    Args:
-        z: the optimum (q,), in the optimiser's coordinates.
     """
     # The fit has compiled `slopes`; second derivatives would be another program, and a longer one.
     least = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
@@ -245,7 +219,7 @@ def residual_curvature(
 def _bread(
     T: Float[np.ndarray, "q k"], singular: Float[np.ndarray, " k"], curvature: np.ndarray
 ) -> Float[np.ndarray, "q q"]:
-    """Inverse of J'J + curvature, where T'(J'J)T = 1."""
+    """Return the inverse of J'J + curvature, where T'(J'J)T = 1."""
     # Along the flattest directions the differences are rounding, divided by a small number.
     resolved = singular > _RESOLVED * singular[0]
     added = T.T @ curvature @ T
@@ -259,28 +233,33 @@ def _bread(
 
 
 def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Part:
-    """Of sensitivities (outputs, N, q) and residuals (outputs, N), zero where not seen.
+    """Return what a flight adds.
 
     Args:
+        J: sensitivities (outputs, N, q).
+        r: residuals (outputs, N), zero where not seen.
         seen: (outputs, N) where something is measured.
         T: (q, k) that whitens J'J.
     """
     S, apart, window = _spectrum(r, seen)
-    size = window.size
+    size, plain = window.size, np.tensordot(J, J, ((0, 1), (0, 1)))
     J = np.moveaxis(np.fft.rfft(J, size, axis=1), 0, 1)
     U = J @ T
     # U U' is the projection on the sensitivities: its autocovariance is what a fit to white noise
     # takes from that of the residuals.
     fitted = np.fft.irfft(U @ U.conj().swapaxes(1, 2), size, axis=0) * apart
     L = np.fft.rfft(fitted * window[:, None, None], axis=0)
-    white = np.broadcast_to(np.eye(J.shape[1]), S.shape)
-    meat, plain, taken = (_weighed(J, x, size) for x in (S, white, L))
+    meat, taken = (_weighed(J, x, size) for x in (S, L))
     return _Part(J, S, meat, plain, taken, window, seen.sum(axis=1).astype(float))
 
 
 def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spectrum (f, outputs, outputs) of residuals (outputs, N), zero where not seen; one over the
-    number of pairs (2 f - 2, outputs, outputs), and the lag window (2 f - 2,)."""
+    """Return the spectrum (f, outputs, outputs) of residuals (outputs, N), one over the number of
+    pairs of samples (2 f - 2, outputs, outputs), and the lag window (2 f - 2,).
+
+    Args:
+        r: zero where not seen.
+    """
     k, n = r.shape
     # A power of two, and twice the record at least: circular products then wrap onto zeros alone.
     size = 2 << (n - 1).bit_length()
@@ -297,14 +276,10 @@ def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise (runs, outputs, N) with the variances and correlations, over time and between
-    outputs, of residuals (outputs, N) that are NaN where nothing is measured.
+    """Draw Gaussian noise (runs, outputs, N) with the variances and correlations, over time and
+    between outputs, of residuals (outputs, N) that are NaN where nothing is measured.
 
     By circulant embedding (Dietrich and Newsam, 1997).
-
-    Args:
-        residual: (outputs, N), NaN where nothing is measured.
-        rng: drawn from, so that a seed gives the same again.
     """
     seen = ~np.isnan(residual)
     r = np.where(seen, residual, 0.0)
@@ -325,7 +300,7 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
 
 
 def _weighed(J: np.ndarray, S: np.ndarray, size: int) -> np.ndarray:
-    """The sum over samples i, k of J_i R(i - k) J_k' by spectra, (q, q)."""
+    """Return the sum over samples i, k of J_i R(i - k) J_k' by spectra, (q, q)."""
     # Real signals: each frequency stands for its negative too, but for zero and Nyquist's.
     twice = np.full(S.shape[0], 2.0 / size)
     twice[[0, -1]] = 1.0 / size
@@ -335,13 +310,13 @@ def _weighed(J: np.ndarray, S: np.ndarray, size: int) -> np.ndarray:
 
 
 def _pairs(x: np.ndarray, size: int) -> np.ndarray:
-    """The sums over k of x_a[k + lag] x_b[k] for x (outputs, N), (size, outputs, outputs)."""
+    """Return the sums (size, outputs, outputs) over k of x_a[k + lag] x_b[k] for x (outputs, N)."""
     spectra = np.fft.rfft(x.astype(np.float64), size, axis=1).T
     return np.fft.irfft(spectra[:, :, None] * spectra[:, None, :].conj(), size, axis=0)
 
 
 def _correlation_time(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
-    """The sum of squared autocorrelations over all lags, in samples; 1 for white noise."""
+    """Return the sum of squared autocorrelations over all lags, in samples; 1 for white noise."""
     # A fifth of the record: beyond, autocorrelations have too few pairs that are independent.
     lags = np.arange(1, max(n // 5, 1) + 1)
     lags = lags[pairs[lags] > 0.5]
@@ -355,7 +330,8 @@ def _correlation_time(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
 
 
 def _window(n: int, size: int, times: list[float]) -> Float[np.ndarray, " size"]:
-    """Parzen's lag window over all lags (size,), as long as the correlation times [samples] ask."""
+    """Return Parzen's lag window (size,) over all lags, as long as the correlation times [samples]
+    ask."""
     # One window for all outputs, the longest: with one each, the matrix of windowed spectra need
     # not be a covariance.
     length = max(_LENGTH * time * (n / time) ** 0.2 for time in times)

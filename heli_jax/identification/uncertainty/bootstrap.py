@@ -50,8 +50,6 @@ class Refits(NamedTuple):
     """(records,) sum of squares over the record's number of measured samples, by the noise of the
     fit: 1 where a record is as noisy, more where the model explains it less; NaN of a record with
     too few"""
-    note: str = ""
-    """why many records were not fitted by programs of machine code, where they were not"""
 
 
 def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
@@ -86,7 +84,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
         each = {n: stacked(lambda f, n=n: f.inputs[n], i) for n in names}
         inputs.append(at.layout.model.Inputs(**each))
         outputs.append({n: stacked(lambda f, n=n: f.outputs[n], i) for n in flight.outputs})
-    optima, note = _optima(at, len(flights), tuple(outputs), tuple(inputs))
+    optima, _ = _optima(at, len(flights), tuple(outputs), tuple(inputs))
     # Of every output as many samples as `fit` asks for; there are none but the fit's outputs.
     enough = np.array(
         [
@@ -96,7 +94,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
     )
     converged = np.asarray(optima.converged) & enough
     values = {n: np.where(converged, v, np.nan) for n, v in _values(at, optima.z).items()}
-    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan), note)
+    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
 
 
 def _optima(
@@ -107,7 +105,7 @@ def _optima(
     prior_means: Array | None = None,
 ) -> tuple[Optimum, str]:
     """Fit `count` records in time, from the optimum; outputs (and inputs, and the means of priors
-    where they are others) have the records as leading axis."""
+    where they are others) have the records as leading axis. Also returns a note on how."""
 
     def data(record: Any) -> Data:
         by_flight, driven, means = record
@@ -125,7 +123,7 @@ def _optima(
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
-    """By free parameter (records,) at the unknowns (records, q)."""
+    """Return by free parameter (records,) at the unknowns (records, q)."""
     z = jnp.asarray(z)
     return {
         n: np.asarray(value_of(at.layout, at.data, i, z[:, i]))
@@ -182,9 +180,6 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     are autocorrelated, noise with their covariance over time and between outputs. The methods in
     frequency draw residuals line by line, and estimate the spectrum anew.
 
-    Args:
-        fit: with the estimates, and the optimum that all refits begin from.
-
     Raises:
         ValueError: no run; the time shift is free in a fit in time, or the data do not determine
             every parameter; in frequency no part of a flight has all outputs.
@@ -218,7 +213,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
 def _records(
     fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
 ) -> tuple[dict[str, Array], ...]:
-    """By flight and output (runs, N); NaN where the record has it."""
+    """Draw by flight and output (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
     noise_free = at.layout.objective.records(at, u, runs, seed)
     records = []
@@ -255,8 +250,8 @@ def _records(
 def _fit_by_lines(
     at: Solution, means: Float[np.ndarray, "runs p"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "runs q"], Bool[np.ndarray, " runs"]]:
-    """Fit drawn records one by one, each with its means of the priors: unknowns, and whether they
-    converged."""
+    """Fit drawn records one by one, each with its means of the priors; return the unknowns, and
+    whether they converged."""
     z, converged = [], []
     begun = Optimum(
         at.z, jnp.zeros((), at.z.dtype), np.asarray(0), np.asarray(True), np.asarray(np.inf)
@@ -282,7 +277,7 @@ class _FromOptimum(Search):
 
 
 def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
-    """The numbers of the problem, again and again with other noise."""
+    """Yield the numbers of the problem, again and again with other noise."""
     layout, noise = _in_lines(at)
     errors = jax.device_get(errors_of_lines(layout, at.data, noise, at.z).errors)
     records = records_of(layout)
@@ -322,7 +317,7 @@ def _spectrum_records(at: Solution, rng: np.random.Generator) -> Iterator[Data]:
 
 
 def _in_lines(at: Solution) -> tuple[Layout, Noise]:
-    """Layout and noise by which the residual stands at the lines of whole records."""
+    """Return layout and noise by which the residual stands at the lines of whole records."""
     layout, data = at.layout, at.data
     if layout.objective is FREQUENCY_ERROR:
         return layout, at.noise

@@ -1,17 +1,16 @@
 """Four intervals of one parameter side by side, and which to believe where they differ."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from heli_jax.errors import require_kind
+from heli_jax.finding import Finding, found, sentences
 from heli_jax.identification.identifiability.profile import Profile, profile
-from heli_jax.identification.methods import objective_of
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
-from heli_jax.numbers import percent
 from heli_jax.stages import stage
 
 DIFFERENT = 0.15
@@ -19,6 +18,8 @@ DIFFERENT = 0.15
 _OF_QUANTILES = 2.0
 """over the root of the number of samples, the same for the ends of a bootstrap: three standard
 deviations of a normal sample's 2.5 % quantile, sqrt(0.025 0.975) / 0.0584 of its own, over 3.92"""
+
+type _Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,12 @@ class Intervals:
     profiles: dict[str, Profile] = field(default_factory=dict)
     bootstrap: Bootstrap | None = None
     posterior: Posterior | None = None
-    sentences: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(sentences(self.findings))
 
 
 def intervals(
@@ -44,16 +50,14 @@ def intervals(
 ) -> Intervals:
     """Profile likelihood, bootstrap and posterior beside the Gaussian intervals of a fit.
 
+    A fit that did not converge, or left a parameter open, has the Gaussian ones alone.
+
     Args:
-        fit: the result of `fit`.
         profiles: parameters to profile; none unless given.
         runs: records of the bootstrap, 0 for none.
         draws: draws of each of four NUTS chains, 0 for none (needs the extra `bayes`).
         seed: of bootstrap and chains.
         progress: called with a line of text before each longer part of the work.
-
-    Where the fit did not converge or the data leave a parameter open, there are none of these,
-    and a sentence says so.
 
     Raises:
         ValueError: a parameter that is not free, or a missing extra.
@@ -61,17 +65,13 @@ def intervals(
     """
     require_kind("fit", fit, Fit, "a Fit, as heli_jax.fit(problem) returns it")
     report = progress or (lambda _: None)
-    profiled, booted, posterior = {}, None, None
+    profiled, booted, posterior, findings = {}, None, None, []
     missing = [n for n in profiles or () if n not in fit.estimates]
     if missing:
         raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
-    sentences: list[str] = []
     # Without an optimum profiles and chains would wander off from where the optimiser stopped.
     if fit.status != "converged" and (profiles or runs or draws):
-        why = "the fit did not converge"
-        if fit.not_identifiable:
-            why = f"the data do not determine {', '.join(fit.not_identifiable)}"
-        sentences = [f"No further intervals: {why}."]
+        findings.append(found("intervals.none", "doubt", *fit.not_identifiable))
         profiles, runs, draws = None, 0, 0
     # From the quickest to the slowest, so that a mistake shows early.
     if profiles:
@@ -88,7 +88,7 @@ def intervals(
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):
             posterior = nuts(fit, draws, seed=seed)
-    by_parameter: dict[str, dict[str, tuple[float, float]]] = {}
+    by_parameter: dict[str, dict[str, _Ends]] = {}
     for name, estimate in fit.estimates.items():
         # Nothing of a parameter that is not identifiable.
         if estimate.lower95 is None or estimate.upper95 is None:
@@ -101,103 +101,61 @@ def intervals(
             by_parameter[name]["bootstrap"] = booted.interval(name)
         if posterior is not None:
             by_parameter[name]["nuts"] = posterior.interval(name)
-    sentences += _sentences(fit, by_parameter, booted, posterior)
-    return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))
+    findings += _findings(fit, by_parameter, booted, posterior)
+    return Intervals(by_parameter, profiled, booted, posterior, tuple(findings))
 
 
-def apart(first: tuple[float, float], second: tuple[float, float]) -> float:
+def apart(first: _Ends, second: _Ends) -> float:
     """The larger distance between the ends of two intervals, over the width of the first."""
     ends = np.abs(np.array(first) - np.array(second))
     return float(np.max(ends) / abs(first[1] - first[0])) if np.isfinite(ends).all() else np.inf
 
 
-def _sentences(
+def _findings(
     fit: Fit,
-    by_parameter: dict[str, dict[str, tuple[float, float]]],
+    by_parameter: Mapping[str, Mapping[str, _Ends]],
     booted: Bootstrap | None,
     posterior: Posterior | None,
-) -> list[str]:
-    sentences = []
-    # In frequency both go by the noise's spectrum, as the intervals do.
-    white = fit.coloured and objective_of(fit.method).noise_model != "spectrum"
+) -> list[Finding]:
+    findings = []
+    # In frequency all go by the noise's spectrum.
+    white = fit.coloured and fit.reached.layout.noise_model != "spectrum"
     if white and any({"profile", "nuts"} & set(by) for by in by_parameter.values()):
-        # Only what can be had: no bootstrap with a free time shift, no filter without an axis.
-        bootstrap_too = booted is not None or not fit.reached.layout.shift
-        sentences.append(
-            "The residuals are coloured: profile and NUTS take them for white and are too narrow. "
-            "Believe the Gaussian interval, which allows for their autocorrelation"
-            + (", or the bootstrap, which draws noise of their spectrum" if bootstrap_too else "")
-            + ("; or fit by filter error." if fit.disturbable else ".")
-        )
+        findings.append(found("intervals.residuals-coloured"))
     if booted is not None and booted.failures:
-        sentences.append(
-            f"{booted.failures} of the bootstrap's records could not be fitted and are left out: "
-            "its intervals are too narrow by what those would have said."
-        )
+        findings.append(found("intervals.records-failed", value=booted.failures))
     beside = [n for n in fit.nuisance if n == "time_shift" or n.startswith("gain ")]
     if beside and booted is not None:
-        sentences.append(
-            f"Estimated in each record of the bootstrap too, without an interval of it here: "
-            f"{', '.join(beside)}. The Gaussian one stands beside the parameters' estimates."
-        )
-    # The numbers with their limits: a reader can see whether a few more draws will do.
+        findings.append(found("intervals.estimated-too", "note", *beside))
     if posterior is not None and not posterior.trusted:
-        sentences.append(
-            "The NUTS chains are not to be trusted (R-hat, effective draws, divergent steps: "
-            f"expected below {RHAT}, above {EFFECTIVE} and none, got {posterior.rhat:.3f}, "
-            f"{posterior.effective:.0f} and {posterior.divergent}): take more draws."
+        numbers = {"rhat": posterior.rhat, "draws": posterior.effective}
+        limits = {"most_rhat": RHAT, "least_draws": EFFECTIVE}
+        findings.append(
+            found("intervals.chains", value=posterior.divergent, **numbers, **limits),
         )
     # With coloured residuals they differ for the reason that was given above.
     for name, by in () if fit.coloured else by_parameter.items():
+        sampled = 0 if booted is None else booted.values[name].size
+        limits = {"bootstrap": max(DIFFERENT, _OF_QUANTILES / max(sampled, 1) ** 0.5)}
         others = {method: ends for method, ends in by.items() if method != "gaussian"}
-        far = []
-        for method, ends in others.items():
-            limit = DIFFERENT
-            if method == "bootstrap" and booted is not None:
-                limit = max(limit, _OF_QUANTILES / booted.values[name].size ** 0.5)
-            if apart(by["gaussian"], ends) > limit:
-                far.append(method)
+        far = [
+            method
+            for method, ends in others.items()
+            if apart(by["gaussian"], ends) > limits.get(method, DIFFERENT)
+        ]
         if far:
-            sentences.append(f"{name}: {_which(far, others, booted, posterior)}")
-    return sentences
+            code = _which(far, others)
+            findings.append(found(code, "doubt", name, methods=far, limit=DIFFERENT))
+    return findings
 
 
-def _which(
-    far: list[str],
-    others: dict[str, tuple[float, float]],
-    booted: Bootstrap | None,
-    posterior: Posterior | None,
-) -> str:
-    """Which interval to believe where some differ from the Gaussian one."""
-    verb = "differ" if len(far) > 1 else "differs"
-    by = f"by more than {percent(DIFFERENT, 0)} of its width"
-    text = f"{' and '.join(far)} {verb} from the Gaussian interval {by}. "
-    profiled = others.get("profile")
-    if profiled is not None and not np.isfinite(profiled).all():
-        why = (
-            "It is practically not identifiable: within nine standard deviations the likelihood "
-            "bounds it to one side at most, and no interval says more."
-        )
+def _which(far: Sequence[str], others: Mapping[str, _Ends]) -> str:
+    """Return the code that tells which interval to believe where some differ from the Gaussian."""
+    if not np.isfinite(others.get("profile", (0.0, 0.0))).all():
+        return "intervals.unbounded"
     # All against the Gaussian one: it is the parabola that is wrong, not one of their assumptions.
-    elif len(far) == len(others):
-        why = (
-            "The log-likelihood is not quadratic here (few samples, strong correlation or a "
-            f"bound): believe the {'profile' if profiled is not None else far[0]}."
-        )
-    elif far == ["bootstrap"] and booted is not None and booted.failures:
-        why = "Records that could not be fitted are missing from it: believe the others."
-    elif far == ["bootstrap"]:
-        why = (
-            "The estimate scatters differently from what the curvature says (few samples, or a "
-            "bias of the method): believe the bootstrap."
-        )
-    elif far == ["nuts"] and not (posterior is not None and posterior.trusted):
-        why = "Its chains have not settled: believe the others."
-    elif far == ["nuts"]:
-        why = (
-            "The prior, flat in the logarithm, or the noise's own uncertainty is felt: NUTS is "
-            "right if that prior is meant."
-        )
-    else:
-        why = "Believe the profile, which follows the likelihood itself."
-    return text + why
+    if len(far) == len(others):
+        return "intervals.not-quadratic"
+    if "profile" in far:
+        return "intervals.profile-differs"
+    return "intervals.bootstrap-differs" if "bootstrap" in far else "intervals.nuts-differs"

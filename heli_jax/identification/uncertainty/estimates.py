@@ -1,9 +1,13 @@
-"""Estimates with standard deviations and intervals, from an optimum and its verdict."""
+"""Estimates with standard deviations and intervals: by Cramér-Rao's bound, or wider."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
@@ -18,19 +22,178 @@ from heli_jax.identification.estimation.evaluation import (
 )
 from heli_jax.identification.estimation.filter_error import innovation_sums
 from heli_jax.identification.estimation.simulated_flights import measured_count
-from heli_jax.identification.identifiability.sensitivity import unknowns_of
-from heli_jax.identification.identifiability.verdict import Unknown, Verdict
+from heli_jax.identification.identifiability.analysis import Around, unknowns_of, verdict_of
+from heli_jax.identification.identifiability.equivalents import Valley
+from heli_jax.identification.identifiability.profile import beyond_slopes
+from heli_jax.identification.identifiability.through_inputs import (
+    by_disturbance,
+    remarks,
+    through_inputs,
+)
+from heli_jax.identification.identifiability.verdict import Z95, SecondSolution, Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.uncertainty.autocorrelated_residuals import (
+    residual_curvature,
+    sandwich,
+)
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import (
     FlightUnknown,
-    Layout,
     Noise,
     Solution,
     flight_unknowns,
     unpack,
 )
+
+# Standard deviations.
+
+
+class StandardErrors(NamedTuple):
+    """How sure the numbers at the optimum are."""
+
+    verdict: Verdict
+    wider: Float[np.ndarray, " q"]
+    """by how much autocorrelated residuals widen the standard deviations of the unknowns"""
+    quantiles: Float[np.ndarray, " q"]
+    """standard deviations that a 95 % interval reaches to either side"""
+    coloured: bool
+    """whether the intervals allow for residuals that are not white"""
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """by parameter the ends of its 95 % interval by the likelihood, in its unit, where the slopes
+    have others"""
+    by: Evaluation | None = None
+    """what the standard deviations go by where it is not the optimum's own Jacobian"""
+
+
+def standard_errors(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    before: Verdict,
+    *,
+    white: bool,
+    aliased: Collection[str] = (),
+    second: tuple[SecondSolution, ...] = (),
+    optimum: bool = True,
+) -> StandardErrors:
+    """Return standard errors by the slopes, and by the likelihood where the slopes leave wide
+    intervals.
+
+    Args:
+        before: the verdict at the first guess, which stands where the optimum has no Jacobian.
+        white: whether the residuals are white and independent between outputs; of a method with
+            process noise whether the innovations are.
+        aliased: the parameters that move a mode which the samples do not tell from its aliases.
+        optimum: whether the point is one, about which the likelihood may be asked.
+    """
+    around = Around(frozenset(aliased), second, Valley(problem, at, e))
+
+    def slopes(e: Evaluation, around: Around) -> StandardErrors:
+        return _by_slopes(problem, at, e, before, around, white=white)
+
+    errors = slopes(e, around)
+    inputs = through_inputs(at, e) if optimum else None
+    if inputs is not None:
+        return _with_process_noise(problem, at, e, inputs, errors, around, slopes, white=white)
+    if not optimum:
+        return errors
+    reaches = errors.wider * errors.quantiles
+    beyond = beyond_slopes(problem, at, e, errors.verdict, reaches, around)
+    return errors if beyond is around else slopes(e, beyond)._replace(limits=beyond.limits)
+
+
+def _with_process_noise(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    inputs: Evaluation,
+    errors: StandardErrors,
+    around: Around,
+    slopes: Callable[[Evaluation, Around], StandardErrors],
+    *,
+    white: bool,
+) -> StandardErrors:
+    """Return Cramér-Rao's bound of a filter's innovations; where these are not white, or the
+    spectrum of a disturbance tells more of a parameter than the inputs do, that of the responses in
+    them alone.
+
+    Args:
+        inputs: what inputs and initial states tell there, of `through_inputs`.
+    """
+    # Neither names combinations, which take time to look for.
+    by_all, by_inputs = (
+        verdict_of(problem, at.layout, told, around._replace(valley=None)) for told in (e, inputs)
+    )
+    told = by_disturbance(by_all, by_inputs)
+    # Of several outputs one that is pushed moves the others, which is an answer to a motion that
+    # was measured. Of one the disturbance has its spectrum alone, as far as its model is right:
+    # that adds to what the inputs tell, and does not speak in their place.
+    spectrum_alone = all(len(outputs) == 1 for outputs in at.layout.outputs)
+    counts = white and not (spectrum_alone and (told.resting or told.mostly))
+    asked, names = errors.verdict, told.resting
+    if not counts:
+        lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
+        asked = replace(asked, undetermined=tuple(lacking))
+    reaches = errors.wider * errors.quantiles
+    beyond = beyond_slopes(problem, at, e, asked, reaches, around)
+    if not counts:
+        # The likelihood has the colour in it: its ends are those of parameters that rest on
+        # responses.
+        limits = {n: ends for n, ends in beyond.limits.items() if n not in told.wider}
+        beyond = beyond._replace(limits=limits)
+        if names or len(by_inputs.null_directions) > len(by_all.null_directions):
+            # The colour has put the optimum where it is along directions that no input shows:
+            # slopes there name combinations that do not hold for the vehicle.
+            beyond = beyond._replace(valley=None)
+            names = names or by_inputs.undetermined
+    if beyond is not around:
+        errors = slopes(e if counts else inputs, beyond)
+    said = (*errors.verdict.sentences, *remarks(told, names, counts=counts, white=white))
+    verdict = replace(errors.verdict, sentences=said)
+    return errors._replace(verdict=verdict, limits=beyond.limits, by=None if counts else inputs)
+
+
+def _by_slopes(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    before: Verdict,
+    around: Around,
+    *,
+    white: bool,
+) -> StandardErrors:
+    """Return Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can
+    be estimated, the sandwich; the arguments are those of `standard_errors`."""
+    layout, objective = at.layout, at.layout.objective
+    usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
+    # The noise is estimated from the same residuals: Student's t, not the normal distribution.
+    freedom = max(objective.numbers(layout, at.data, at.noise) - layout.determined, 1)
+    quantile = float(scipy.special.stdtrit(freedom, 0.975))
+    quantiles = np.full(layout.size, quantile)
+    if white or not (usable and objective.noise_model == "white"):
+        verdict = verdict_of(problem, layout, e, around) if usable else before
+        # Weighed by the noise's own spectrum, the bound allows for it as it stands.
+        allowed = usable and not white and objective.noise_model == "spectrum"
+        return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
+    errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
+    # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
+    quantiles = np.maximum(errors.quantile(), quantile)
+    # The rule of the factor of ten has to see the intervals that are reported, of which a verdict
+    # takes 1.96 standard deviations.
+    k = len(layout.of_interest)
+    factor = quantiles[:k] / Z95
+    reported = errors.covariance()[:k, :k] * np.outer(factor, factor)
+
+    def widening(along: np.ndarray) -> tuple[float, float]:
+        of_all = np.pad(along, (0, layout.size - k))[None]
+        return float(errors.inflation(of_all)[0]), float(errors.quantile(of_all)[0])
+
+    around = around._replace(reported=reported, widening=widening)
+    return StandardErrors(
+        verdict_of(problem, layout, e, around), errors.inflation(), quantiles, True
+    )
+
 
 # How well the sizes of noises are known, where all are told relative to a small one.
 #
@@ -51,9 +214,8 @@ _TAKES_PART = 0.02
 
 
 def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
-    """By size of a noise the standard deviation of its logarithm, in its own unit; {} where the
-    sizes are not relative to one that may vanish.
-    """
+    """Return by size of a noise the standard deviation of its logarithm, in its own unit; {} where
+    the sizes are not relative to one that may vanish."""
     layout = at.layout
     if not (layout.filtered and layout.concentrated and np.isfinite(e.J).all()):
         return {}
@@ -71,6 +233,8 @@ def size_deviations(at: Solution, e: Evaluation) -> dict[str, float]:
     return dict(zip(layout.sizes, map(float, sds), strict=True))
 
 
+# Estimates.
+
 _SAYS_NOTHING = 1e3
 """A disturbance's standard deviation or correlation time whose interval reaches by this factor to
 either side is not identifiable."""
@@ -79,81 +243,47 @@ _LARGEST = 700.0
 
 
 def estimates_of(
-    problem: Problem,
-    layout: Layout,
-    e: Evaluation,
-    verdict: Verdict,
-    quantiles: Float[np.ndarray, " q"],
-    wider: Float[np.ndarray, " q"],
+    problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors
 ) -> dict[str, Estimate]:
-    """The unknowns of interest: free parameters, gains, time shift.
-
-    Args:
-        problem: with units, bounds and priors.
-        verdict: what is identifiable, with the covariance as if residuals were white.
-        quantiles: (q,) standard deviations that an interval reaches to either side.
-        wider: (q,) by which the standard deviations of white residuals are multiplied.
-    """
-    unknowns = unknowns_of(problem, layout, e)
-    insensitivity = _insensitivity(e)
+    """Return the unknowns of interest: free parameters, gains, time shift."""
+    e = errors.by or e
+    alone = _insensitivity(e)
     estimates = {}
-    for i, u in enumerate(unknowns):
-        free = problem.free.get(u.name)
+    for i, u in enumerate(unknowns_of(problem, at.layout, e)):
         # Relative to its reference: the size of the value, or a sample for the time shift.
-        white = float(np.sqrt(verdict.covariance[i, i]))
-        relative = white * float(wider[i])
-        sd, low, high = _interval95(u, relative, float(quantiles[i]))
-        if free is not None and u.name in problem.model.delay_parameters:
+        white = float(np.sqrt(errors.verdict.covariance[i, i]))
+        relative = white * float(errors.wider[i])
+        ends = errors.limits.get(u.name) or _interval95(u, relative, float(errors.quantiles[i]))
+        free = problem.free.get(u.name)
+        searched, start = (-np.inf, np.inf), 1.0
+        if u.name == "time_shift":
+            # Through a tanh, which has no value beyond: slopes and likelihood are taken on past it.
+            searched, start = (-MAX_TIME_SHIFT, MAX_TIME_SHIFT), 0.0
+        elif free is not None:
+            start = free.start
             # Symmetric, as that of what may be zero; what it was not searched for it cannot be.
-            low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
-        if u.at_bound and free is not None:
-            low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
-        low, high = _searched(u.name, (low, high))
-        not_identifiable = u.name in verdict.not_identifiable
-        start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
+            if u.at_bound or u.name in problem.model.delay_parameters:
+                searched = transforms.limits(free)
+        low, high = (float(v) for v in np.clip(ends, *searched))
+        numbers = (relative * u.reference, low, high)
+        whites = (white * u.reference, float(white * u.reference * alone[i]))
+        if u.name in errors.verdict.not_identifiable:
+            numbers, whites = (None, None, None), (None, None)
         estimates[u.name] = Estimate(
-            value=u.value,
-            sd=None if not_identifiable else sd,
-            lower95=None if not_identifiable else low,
-            upper95=None if not_identifiable else high,
-            unit=_unit(problem, u.name),
-            start=start,
-            prior_share=verdict.prior_share[u.name],
-            at_bound=u.at_bound,
-            sd_white=None if not_identifiable else float(white * u.reference),
-            sd_alone=None if not_identifiable else float(white * u.reference * insensitivity[i]),
+            u.value,
+            *numbers,
+            _unit(problem, u.name),
+            start,
+            errors.verdict.prior_share[u.name],
+            u.at_bound,
+            *whites,
         )
     return estimates
 
 
-def with_limits(
-    estimates: dict[str, Estimate], limits: Mapping[str, tuple[float, float]]
-) -> dict[str, Estimate]:
-    """The estimates with those ends of their 95 % intervals that are not the slopes'.
-
-    Args:
-        limits: by name lower and upper end, in the parameter's unit.
-    """
-    found = dict(estimates)
-    for n, ends in limits.items():
-        if n in found and found[n].sd is not None:
-            lower, upper = _searched(n, ends)
-            found[n] = found[n]._replace(lower95=lower, upper95=upper)
-    return found
-
-
-def _searched(name: str, ends: tuple[float, float]) -> tuple[float, float]:
-    """The ends of an interval, of a time shift no further than it is searched for [s]."""
-    if name != "time_shift":
-        return ends
-    # Through a tanh, which has no value beyond: slopes and likelihood are taken on past it.
-    low, high = (float(v) for v in np.clip(ends, -MAX_TIME_SHIFT, MAX_TIME_SHIFT))
-    return low, high
-
-
 def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
-    """The standard deviation of each unknown if all others were known, over that which it has; 1
-    where it is not identifiable."""
+    """Return the standard deviation of each unknown if all others were known, over that which it
+    has; 1 where it is not identifiable."""
     norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
     sds = deviations(e.J)
     known = (norms > 0) & np.isfinite(sds)
@@ -162,14 +292,14 @@ def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
     return np.minimum(1.0, np.divide(1.0, product, where=known, out=np.ones_like(norms)))
 
 
-def _interval95(u: Unknown, relative: float, quantile: float) -> tuple[float, float, float]:
-    sd = float(relative * u.reference)
+def _interval95(u: Unknown, relative: float, quantile: float) -> tuple[float, float]:
     # Symmetric in the coordinate of the search: in the parameter of one sign, by equal factors.
     if u.symmetric or not u.logarithmic:
-        return sd, u.value - quantile * sd, u.value + quantile * sd
-    reach = float(np.exp(min(quantile * relative, _LARGEST)))
-    low, high = sorted((u.value / reach, u.value * reach))
-    return sd, float(low), float(high)
+        reach = quantile * relative * u.reference
+        return u.value - reach, u.value + reach
+    factor = float(np.exp(min(quantile * relative, _LARGEST)))
+    low, high = sorted((u.value / factor, u.value * factor))
+    return low, high
 
 
 def _unit(problem: Problem, name: str) -> str:
@@ -180,11 +310,55 @@ def _unit(problem: Problem, name: str) -> str:
     return naming.unit(problem.model.Params, name) or ""
 
 
+def flight_nuisances(
+    problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors
+) -> dict[str, Estimate]:
+    """Return the disturbance, then initial states, biases and input offsets."""
+    layout = at.layout
+    if layout.size == len(layout.of_interest):
+        return {}
+    whites, wider = deviations(e.J), errors.wider
+    sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
+    for name, relative in size_deviations(at, e).items():
+        sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
+    reaches = errors.quantiles * sds
+    estimates = {}
+    # The parameters of process noise, searched in their logarithms: intervals by factors.
+    starts = problem.noise | {sensor_noise(n): f for n, f in problem.filtered_noise.items()}
+    disturbance = unpack(layout, at.data, at.z).noise
+    for i, name in enumerate(layout.noises, len(layout.of_interest)):
+        value, factor = float(disturbance[name]), float(np.exp(min(reaches[i], _LARGEST)))
+        numbers = (value * float(sds[i]), value / factor, value * factor)
+        if factor >= _SAYS_NOTHING:
+            numbers = (None, None, None)
+        unit = naming.unit(layout.model.Params, name) or ""
+        estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)
+    unknowns = flight_unknowns(layout, labels(problem.training))
+    for i, u in enumerate(unknowns, layout.first_nuisance):
+        scale = u.scale(at.data)
+        value, sd, reach = (float(v * scale) for v in (at.z[i], sds[i], reaches[i]))
+        # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
+        share = min(1.0, float(whites[i]) ** 2)
+        estimates[u.label] = Estimate(
+            value, sd, value - reach, value + reach, _unit_of(problem, u), 0.0, share, False
+        )
+    return estimates
+
+
+def _unit_of(problem: Problem, u: FlightUnknown) -> str:
+    if u.kind == "initial_state":
+        return naming.unit(problem.model.State, u.of) or ""
+    if u.kind == "bias":
+        return naming.unit(problem.model.Outputs, u.of) or ""
+    # An offset is in the log's plain numbers where the estimated gain carries the unit.
+    plain = problem.gain_units.get(u.of, "1") != "1"
+    return "1" if plain else naming.unit(problem.model.Inputs, u.of) or ""
+
+
 def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
-    """The estimate of a disturbance's parameter where no disturbance shows.
+    """Return the estimate of a disturbance's parameter where no disturbance shows.
 
     Args:
-        estimate: of a size or of a correlation time.
         size: whether it is a size, which is zero then, at its bound; a time means nothing.
     """
     value = 0.0 if size else estimate.value
@@ -194,7 +368,7 @@ def without_disturbance(estimate: Estimate, *, size: bool) -> Estimate:
 def noise_by_name(
     problem: Problem, noise: Noise, scales: Mapping[str, ArrayLike]
 ) -> dict[str, float]:
-    """Standard deviation of the measurement noise as 'flight/output', in the output's SI unit.
+    """Return the sd of the measurement noise as 'flight/output', in the output's SI unit.
 
     Args:
         scales: factors on it by output that are unknowns themselves (filter error); 1 unless named.
@@ -204,70 +378,3 @@ def noise_by_name(
         for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
         for n, sd in by_name.items()
     }
-
-
-def flight_nuisances(
-    problem: Problem,
-    at: Solution,
-    e: Evaluation,
-    quantiles: Float[np.ndarray, " q"],
-    wider: Float[np.ndarray, " q"],
-) -> dict[str, Estimate]:
-    """The disturbance, then initial states, biases and input offsets with their weak priors.
-
-    Args:
-        problem: with flights, units and starts.
-        quantiles: (q,) standard deviations that an interval reaches to either side.
-        wider: (q,) by which the standard deviations of white residuals are multiplied.
-    """
-    layout = at.layout
-    if layout.size == len(layout.of_interest):
-        return {}
-    whites = deviations(e.J)
-    sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
-    for name, relative in size_deviations(at, e).items():
-        sds[layout.disturbance_at(name)] = relative * wider[layout.disturbance_at(name)]
-    estimates = _disturbance(problem, at, sds, quantiles)
-    unknowns = flight_unknowns(layout, labels(problem.training))
-    for i, u in enumerate(unknowns, layout.first_nuisance):
-        scale = u.scale(at.data)
-        value, sd = float(at.z[i] * scale), float(sds[i] * scale)
-        # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
-        share = min(1.0, float(whites[i]) ** 2)
-        reach = float(quantiles[i]) * sd
-        unit = _unit_of(problem, u) or ""
-        estimates[u.label] = Estimate(
-            value, sd, value - reach, value + reach, unit, 0.0, share, False
-        )
-    return estimates
-
-
-def _disturbance(
-    problem: Problem,
-    at: Solution,
-    sds: Float[np.ndarray, " q"],
-    quantiles: Float[np.ndarray, " q"],
-) -> dict[str, Estimate]:
-    """The parameters of process noise, searched in their logarithms: intervals by factors."""
-    layout = at.layout
-    starts = problem.noise | {sensor_noise(n): f for n, f in problem.filtered_noise.items()}
-    estimates = {}
-    disturbance = unpack(layout, at.data, at.z).noise
-    for i, name in enumerate(layout.noises, len(layout.of_interest)):
-        value, relative = float(disturbance[name]), float(sds[i])
-        reach = float(np.exp(min(float(quantiles[i]) * relative, _LARGEST)))
-        unit = naming.unit(layout.model.Params, name) or ""
-        limits = (value / reach, value * reach)
-        numbers = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
-        estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)
-    return estimates
-
-
-def _unit_of(problem: Problem, u: FlightUnknown) -> str | None:
-    if u.kind == "initial_state":
-        return naming.unit(problem.model.State, u.of)
-    if u.kind == "bias":
-        return naming.unit(problem.model.Outputs, u.of)
-    # An offset is in the log's plain numbers where the estimated gain carries the unit.
-    plain = problem.gain_units.get(u.of, "1") != "1"
-    return "1" if plain else naming.unit(problem.model.Inputs, u.of)

@@ -1,6 +1,5 @@
 """Draws from the posterior by the No-U-Turn sampler, on the residual that the fit minimised."""
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -25,51 +24,6 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 
-# Samples of all unknowns by the names that a fit gives them.
-
-
-class NamedSamples(NamedTuple):
-    """Samples of the unknowns, SI, each of the shape of all."""
-
-    parameters: dict[str, np.ndarray]
-    """the free ones"""
-    nuisance: dict[str, np.ndarray]
-    """what was estimated beside them, by the names of `Fit.nuisance`; the noise's factors as
-    'noise factor OUTPUT'"""
-
-
-def named_samples(fit: Fit, z: Float[Array, "... q"]) -> NamedSamples:
-    """Names and SI for samples of the vector of unknowns.
-
-    Args:
-        z: the samples (..., q), in the optimiser's coordinates.
-    """
-    layout, data = fit.reached.layout, fit.reached.data
-    shape = z.shape[:-1]
-    one_by_one = _unpacked(layout, data, z.reshape(-1, z.shape[-1]))
-    u: Unknowns = jax.tree.map(np.asarray, one_by_one)
-    parameters = {name: u.params[name] for name in layout.free}
-    nuisance = {f"gain {name}": v for name, v in u.gains.items()}
-    if layout.shift:
-        nuisance["time_shift"] = u.shift
-    nuisance |= {name: u.noise[name] for name in layout.noises}
-    nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
-    fitted = [s.flight for s in fit.signals if not s.hold_out]
-    for i, one in enumerate(flight_unknowns(layout, fitted), layout.first_nuisance):
-        samples = np.asarray(z[..., i]).reshape(-1) * float(one.scale(data))
-        nuisance[one.label] = samples
-
-    def shaped(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: np.asarray(v).reshape(shape) for name, v in samples.items()}
-
-    return NamedSamples(shaped(parameters), shaped(nuisance))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _unpacked(layout: Layout, data: Data, z: Float[Array, "n q"]) -> Unknowns:
-    return jax.vmap(lambda z: unpack(layout, data, z))(z)
-
-
 RHAT = 1.01
 """potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
 EFFECTIVE = 400
@@ -82,7 +36,7 @@ _TARGET = 0.8
 
 
 class Convergence(NamedTuple):
-    """Whether the chains agree on one parameter."""
+    """How well the chains agree on one parameter."""
 
     rhat: float
     effective: float
@@ -102,15 +56,15 @@ class Posterior:
     convergence: dict[str, Convergence] = field(default_factory=dict)
     """by free parameter, in the optimiser's coordinates"""
     nuisance: dict[str, np.ndarray] = field(default_factory=dict)
-    """draws of what was sampled beside the free parameters, as `Fit.nuisance` names it; the scale
-    of the noise is integrated out and so has none"""
+    """draws of what was sampled beside the free parameters, as `Fit.nuisance` names it, the noise's
+    factors as 'noise factor OUTPUT'; the scale of the noise is integrated out and so has none"""
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
     """by draw (chains, draws), by arviz' names: `diverging`, `energy`, `acceptance_rate`, `n_steps`
     (of the integrator), `tree_depth`, `lp` (log density but for a constant), `step_size`"""
 
     @property
     def trusted(self) -> bool:
-        """Whether the chains agree, and are long enough for an interval."""
+        """True if the chains agree, and are long enough for an interval."""
         return self.rhat < RHAT and self.effective > EFFECTIVE and self.divergent == 0
 
     def interval(self, name: str) -> tuple[float, float]:
@@ -119,8 +73,8 @@ class Posterior:
         return float(low), float(high)
 
     def to_arviz(self) -> Any:
-        """The draws as arviz' inference data (an xarray DataTree) for its diagnostics and plots:
-        groups `posterior`, of the free parameters, and `sample_stats`.
+        """Return the draws as arviz' inference data (an xarray DataTree): groups `posterior`, of
+        the free parameters, and `sample_stats`.
 
         Raises:
             ValueError: arviz is not installed (extra `bayes`).
@@ -131,7 +85,7 @@ class Posterior:
 
 
 def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Posterior:
-    """Four chains of `draws` draws each, begun about the optimum in its own ellipse.
+    """Draw four chains of `draws` draws each, begun about the optimum in its own ellipse.
 
     The prior is flat in the optimiser's coordinates (log of a parameter of one sign) beside the
     priors of the problem; the scale of the noise is integrated out (Jeffreys).
@@ -189,7 +143,7 @@ def _sample(
     warmup: int,
     seed: int,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Positions (chains, draws, q) and `Posterior.statistics`."""
+    """Return positions (chains, draws, q) and `Posterior.statistics`."""
     q = at.layout.size
     keys = jax.random.split(jax.random.key(seed), 3)
     adaptation = blackjax.window_adaptation(
@@ -244,21 +198,32 @@ def _sample(
 def _posterior(
     fit: Fit, z: Float[Array, "chains draws q"], statistics: dict[str, np.ndarray]
 ) -> Posterior:
+    """Return the draws of all unknowns by the names that a fit gives them, SI."""
     from blackjax import diagnostics
 
-    names = fit.reached.layout.free
+    layout, data = fit.reached.layout, fit.reached.data
+    unpacked = jax.jit(lambda data, z: jax.vmap(jax.vmap(lambda z: unpack(layout, data, z)))(z))
+    u: Unknowns = jax.tree.map(np.asarray, unpacked(data, z))
+    nuisance = {f"gain {name}": v for name, v in u.gains.items()}
+    if layout.shift:
+        nuisance["time_shift"] = u.shift
+    nuisance |= {name: u.noise[name] for name in layout.noises}
+    nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
+    fitted = [s.flight for s in fit.signals if not s.hold_out]
+    for i, one in enumerate(flight_unknowns(layout, fitted), layout.first_nuisance):
+        nuisance[one.label] = np.asarray(z[..., i]) * one.scale(data)
     # In the optimiser's coordinates, in which the posterior is nearest to a normal distribution.
-    named = z[:, :, : len(names)]
+    named = z[:, :, : len(layout.free)]
     rhat = np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named))
     effective = np.asarray(jax.jit(diagnostics.effective_sample_size)(named))
-    samples = named_samples(fit, z)
+    agreed = [Convergence(float(r), float(n)) for r, n in zip(rhat, effective, strict=True)]
     return Posterior(
-        samples.parameters,
+        {name: np.asarray(u.params[name]) for name in layout.free},
         float(np.max(rhat)),
         float(np.min(effective)),
         int(np.sum(statistics["diverging"])),
-        {n: Convergence(float(rhat[i]), float(effective[i])) for i, n in enumerate(names)},
-        samples.nuisance,
+        dict(zip(layout.free, agreed, strict=True)),
+        {name: np.asarray(v) for name, v in nuisance.items()},
         statistics,
     )
 
@@ -266,13 +231,10 @@ def _posterior(
 def log_posterior(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
 ) -> Float[Array, ""]:
-    """Log density of z but for a constant, from the fit's own rows.
+    """Return the log density of z but for a constant, from the fit's own rows.
 
     The scale of the noise is integrated out under Jeffreys' prior: of each flight and output with
     output error, the common one with filter error, unless it was fixed.
-
-    Args:
-        z: the unknowns (q,), in the optimiser's coordinates.
     """
     # Draws are of all parameters together: nothing is taken up by those of the mean.
     rows = rows_of(layout, data, noise._replace(own=()), z)
