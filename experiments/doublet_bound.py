@@ -19,11 +19,10 @@ from r50_record import NOISE, truth, turbulent
 
 from heli_jax import Flight, Nuisance, Problem, fit, naming, simulate
 from heli_jax.dynamics.onboard.delays import with_delays
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.problem import Free
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 
 jax.config.update("jax_enable_x64", True)

@@ -22,9 +22,8 @@ from matplotlib.figure import Figure
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.equation_error.rls import baseline
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.inputs import random_steps

@@ -21,11 +21,10 @@ import numpy as np
 from r50_record import FIXED, NOISE, problem, record
 
 from heli_jax import Flight, Problem
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.identifiability.analysis import verdict_of
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
 
 jax.config.update("jax_enable_x64", True)

@@ -78,7 +78,7 @@ def responses_of_log(
 
 def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
     """Note that flights held out of a fit count here, so that its report shows other responses."""
-    from heli_jax.identification.unknowns.initial_guess import labels
+    from heli_jax.flights.flight import labels
 
     named = zip(labels(tuple(flights)), flights, strict=True)
     names = [label for label, flight in named if flight.hold_out]
@@ -134,8 +134,8 @@ def _read_in_degrees(experiment: Experiment, flights: Sequence[Flight]) -> tuple
     """Outputs that look like degrees read as radians: gains are off by 35 dB, and nothing in them
     shows it."""
     # Not before it is needed: it brings what fits are judged by.
+    from heli_jax.flights.flight import labels
     from heli_jax.identification.diagnostics.units import in_degrees
-    from heli_jax.identification.unknowns.initial_guess import labels
 
     return tuple(
         doubt

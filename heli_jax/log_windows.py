@@ -119,8 +119,8 @@ def _print_doubts(ranking: Ranking) -> None:
     for name in ranking.guessed:
         tell(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
-    if sentence := too_good(finite, bool(ranking.guessed)):
-        tell(f"! {sentence}")
+    if doubt := too_good(finite, bool(ranking.guessed)):
+        tell(f"! {doubt.sentence}")
     for found in ranking.notes:
         tell(f"! {found.sentence}")
     if names := not_determined(ranking):

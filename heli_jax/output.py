@@ -209,8 +209,8 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
-    if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
-        tell(f"! {sentence}")
+    if doubt := too_good(sds, bool(check.guessed), nothing_follows=not follows):
+        tell(f"! {doubt.sentence}")
     tell("\nIs this log enough?")
     print_findings(check.findings, verbose=verbose)
 

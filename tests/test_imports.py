@@ -125,7 +125,7 @@ def test_imports_point_one_way(name):
 
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
-    "methods", "free", "defaults", "problem", "unknowns",
+    "methods", "defaults", "problem", "unknowns",
     "estimation", "identifiability", "design", "validation", "equation_error", "result",
     "uncertainty",
     "agreement", "diagnostics", "restarts", "search", "fit",

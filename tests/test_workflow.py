@@ -11,7 +11,7 @@ import heli_jax
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.identification.design.accuracy import starting_at_zero
-from heli_jax.identification.free import Free, Prior
+from heli_jax.identification.problem import Free, Prior
 from heli_jax.output import print_check
 
 CONFIG = """

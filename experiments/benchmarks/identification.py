@@ -40,9 +40,8 @@ from heli_jax import (
     rls,
 )
 from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from heli_jax.naming import replace
 

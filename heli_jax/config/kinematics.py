@@ -22,7 +22,7 @@ from heli_jax.dynamics.kinematics import (
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located
 from heli_jax.flights.flight import Flight, Signal
-from heli_jax.identification.free import Free, Prior
+from heli_jax.identification.problem import Free, Prior
 from heli_jax.naming import Record
 
 NAME = "kinematics"

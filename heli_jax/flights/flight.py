@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -279,3 +279,11 @@ def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
         raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, expected numbers")
     samples.setflags(write=False)
     return samples
+
+
+def labels(flights: Sequence[Flight]) -> list[str]:
+    """Return what to call each flight; the second and further of one name have a number."""
+    names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
+    # Two logs may bear one file name; results are kept by label, so one would hide the other.
+    before = [names[:i].count(name) for i, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.evaluation import Evaluation, directions
 from heli_jax.identification.result import Signals
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Layout
 from heli_jax.identification.validation.metrics import (
     NO_METRICS,

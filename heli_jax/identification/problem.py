@@ -1,32 +1,53 @@
-"""Problem: what is fitted to what."""
+"""Problem: what is fitted to what, what is free in it, and what makes no sense of it."""
 
 import functools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.spectra import ResponseOptions
-from heli_jax.dynamics.check_model import cannot_start, check_model
+from heli_jax.dynamics.check_model import cannot_start, check_model, check_params
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise
 from heli_jax.dynamics.model import Model, require_constants, require_linear
 from heli_jax.errors import VehicleError, nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.defaults import filtered_noise, offset_inputs, push_scales
-from heli_jax.identification.free import (
-    Free,
-    Prior,
-    Sign,
-    check_arguments,
-    check_free,
-    warn_of_degrees,
-)
+from heli_jax.identification.defaults import filtered_noise, offset_inputs
 from heli_jax.identification.methods import objective_of
 from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
+
+
+class Prior(NamedTuple):
+    """What is known of a parameter beforehand: a normal distribution, in the parameter's unit."""
+
+    mean: float
+    sd: float
+
+
+Sign = Literal["keep", "any"]
+
+
+class Free(NamedTuple):
+    """A parameter to be estimated: where to start, between what bounds, with what prior.
+
+    `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
+    logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
+    Helicopter's parameters keep theirs, and so do those that `Model.positive` names; others of a
+    model of one's own may have any. Bounds that lie on one side of zero keep it in either case.
+    """
+
+    start: float = math.nan
+    """the initial guess; NaN where none is stated, and one has to be found before a Problem is made
+    (`equation_error_start`)"""
+    lower: float | None = None
+    upper: float | None = None
+    prior: Prior | None = None
+    sign: Sign | None = None
 
 
 class Nuisance(NamedTuple):
@@ -49,7 +70,6 @@ class Nuisance(NamedTuple):
 
 
 # `Any` stands for Params, a class of the user's, here and below.
-__all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
 
 _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
@@ -109,11 +129,11 @@ class Problem:
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.
         check_model(self.model)
-        check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
+        _check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
         if not isinstance(self.nuisance, Nuisance):
             got = type(self.nuisance).__name__
             raise TypeError(f"nuisance: expected Nuisance(time_shift=True, ...), got {got}")
-        warn_of_degrees(self.model.Outputs, self.flights)
+        _warn_of_degrees(self.model.Outputs, self.flights)
         object.__setattr__(self, "flights", tuple(self.flights))
         if self.instrument is not None:
             names = (self.instrument,) if isinstance(self.instrument, str) else self.instrument
@@ -133,7 +153,7 @@ class Problem:
         if not self.free:
             raise ValueError("nothing is free: name at least one parameter to estimate")
         for name, free in self.free.items():
-            check_free(name, free, self.model)
+            _check_free(name, free, self.model)
         _check_possible(self)
         _check_windows(self)
         _check_offsets(self)
@@ -158,7 +178,7 @@ class Problem:
         if self.noise_model != "disturbance":
             return {}
         # Of the size of the motion, and a second: a coarse search takes it from there.
-        sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
+        sizes = {d.sigma: self.motion for d in disturbances_of(self.model)}
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
             # What somebody stated goes before the guess. Zero is the default of a sigma and no
@@ -196,24 +216,6 @@ class Problem:
     def noise_is_fixed(self) -> bool:
         """Whether the measurement noise is taken as stated."""
         return self.noise_model == "disturbance" and "sigma_y" in self.fixed_noise
-
-    @functools.cached_property
-    def push_scales(self) -> dict[str, float]:
-        """By the name of its sigma how large each of several disturbances may be, SI; of a single
-        one it is the motion."""
-        disturbances = disturbances_of(self.model)
-        if len(disturbances) < 2:
-            return {}
-        # One flight for the matrices: a size to begin a search with needs no more, and the
-        # deviations are the largest of all flights.
-        flight = self.training[0]
-        sds = {
-            n: max(float(np.nanstd(f.outputs[n])) for f in self.training if n in f.outputs)
-            for n in sorted({n for f in self.training for n in f.outputs})
-        }
-        params = naming.replace(self.start_params(), **flight.known)
-        first = {n: float(flight.inputs[n][0]) for n in naming.names(self.model.Inputs)}
-        return push_scales(self.model, params, first, sds, disturbances)
 
     @functools.cached_property
     def offset_inputs(self) -> tuple[str, ...]:
@@ -302,9 +304,8 @@ def _check_method(problem: Problem) -> None:
 
 
 def _check_offsets(problem: Problem) -> None:
-    offsets = problem.nuisance.input_offset
-    known = naming.names(problem.model.Inputs)
-    for name in () if offsets is None or isinstance(offsets, bool) else offsets:
+    offsets, known = problem.nuisance.input_offset, naming.names(problem.model.Inputs)
+    for name in offsets if isinstance(offsets, tuple) else ():
         if name not in known:
             raise ValueError(
                 f"nuisance.input_offset: model {problem.model.name} has no input {name!r}"
@@ -313,16 +314,14 @@ def _check_offsets(problem: Problem) -> None:
 
 
 def _check_windows(problem: Problem) -> None:
-    if problem.window is None:
-        if problem.continuity is not None:
-            raise ValueError("continuity is for windows only: expected a window as well, got none")
+    window, continuity = problem.window, problem.continuity
+    if window is None and continuity is not None:
+        raise ValueError("continuity is for windows only: expected a window as well, got none")
+    for key, value in (("window", window), ("continuity", continuity)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{key} must be above zero, got {value:g}")
+    if window is None:
         return
-    if not (math.isfinite(problem.window) and problem.window > 0):
-        raise ValueError(f"window must be above zero, got {problem.window:g} s")
-    if problem.continuity is not None and not (
-        math.isfinite(problem.continuity) and problem.continuity > 0
-    ):
-        raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
     # A filter corrects its state at every sample, which is what windows are for.
     if problem.noise_model != "white":
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
@@ -330,11 +329,10 @@ def _check_windows(problem: Problem) -> None:
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     for flight in problem.flights:
-        samples = round(problem.window / flight.dt)
-        if samples < _FEWEST:
+        if (samples := round(window / flight.dt)) < _FEWEST:
             raise ValueError(
                 f"{_of(flight)}: a window must hold {_FEWEST} samples at least, got {samples} in "
-                f"{problem.window:g} s"
+                f"{window:g} s"
             )
 
 
@@ -375,20 +373,20 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         )
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
-    _check_measured(flight, problem, where)
-    _check_known(flight, problem, where)
-    count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
-    # What counts is what was measured, of the output of which most was.
-    measured = max((int(np.isfinite(y).sum()) for y in flight.outputs.values()), default=0)
-    if not flight.hold_out and measured < least:
-        raise ValueError(
-            f"{where}: expected at least {least} samples for {count} free parameters, got "
-            f"{measured}"
-        )
-
-
-def _check_known(flight: Flight, problem: Problem, where: str) -> None:
-    model = problem.model
+    for name, y in flight.outputs.items():
+        # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
+        # own, and so no noise.
+        if (seen := int(np.isfinite(y).sum())) < FEWEST_SEEN:
+            raise ValueError(
+                f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
+                f"{seen} of {y.size}"
+            )
+        # A flight held out is simulated, not weighed: it needs no noise.
+        if problem.noise_is_fixed and name not in flight.sd and not flight.hold_out:
+            raise ValueError(
+                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
+                "(sigma_y), got none"
+            )
     # What one flight knows cannot be estimated over all of them.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
@@ -403,44 +401,166 @@ def _check_known(flight: Flight, problem: Problem, where: str) -> None:
         wrong = impossible({name: value}) if of_helicopter(model.Params) else None
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
-
-
-def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
-    for name, y in flight.outputs.items():
-        # Most may be missing, as those of a slow sensor are; but a handful has no variance of its
-        # own, and so no noise.
-        seen = int(np.isfinite(y).sum())
-        if seen < FEWEST_SEEN:
-            raise ValueError(
-                f"{where}, output {name!r}: expected at least {FEWEST_SEEN} measured samples, got "
-                f"{seen} of {y.size}"
-            )
-        # A flight held out is simulated, not weighed: it needs no noise.
-        stated = name in flight.sd or flight.hold_out
-        if problem.noise_is_fixed and not stated:
-            raise ValueError(
-                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
-                "(sigma_y), got none"
-            )
+    count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
+    # What counts is what was measured, of the output of which most was.
+    measured = max(int(np.isfinite(y).sum()) for y in flight.outputs.values())
+    if not flight.hold_out and measured < least:
+        raise ValueError(
+            f"{where}: expected at least {least} samples for {count} free parameters, got "
+            f"{measured}"
+        )
 
 
 def _check_model(problem: Problem) -> None:
-    params = problem.start_params()
-    # With what each flight knows: that alone may complete a vehicle.
+    params, model = problem.start_params(), problem.model
     for flight in problem.flights:
-        require_constants(problem.model, naming.replace(params, **flight.known))
-    if not problem.model.linear:
-        _check_start(problem, params)
-    require_linear(problem.model, params)
+        # With what each flight knows: that alone may complete a vehicle.
+        own = naming.replace(params, **flight.known)
+        require_constants(model, own)
+        # A helicopter of ours begins anywhere. First rates depend on the flight's first inputs.
+        if not model.linear and not of_helicopter(model.Params):
+            first = {n: float(u[0]) for n, u in flight.inputs.items()}
+            if wrong := cannot_start(model, own, first):
+                raise ValueError(wrong)
+    require_linear(model, params)
 
 
-def _check_start(problem: Problem, params: Any) -> None:
-    """Refuse a model that cannot begin at its initial state; one of ours begins anywhere."""
-    if of_helicopter(problem.model.Params):
-        return
-    for flight in problem.flights:
-        # Its first rates depend on the inputs that the flight begins with.
-        first = {n: float(u[0]) for n, u in flight.inputs.items()}
-        wrong = cannot_start(problem.model, naming.replace(params, **flight.known), first)
+def _check_free(name: str, free: Free, model: Model) -> None:
+    """Refuse a free parameter that the model does not have, or whose numbers contradict.
+
+    Args:
+        free: its start, bounds, prior and sign; the sign is filled in.
+
+    Raises:
+        ValueError: naming the key, what was expected and what was got.
+    """
+    known, start = naming.names(model.Params), free.start
+    if name not in known:
+        raise ValueError(
+            f"free.{name}: model {model.name} has no such parameter{nearest(name, known)}"
+        )
+    if math.isnan(start):
+        raise ValueError(
+            f"free.{name}.start: missing, expected a number to begin with (or, for a linear model, "
+            "start: equation-error, which finds one)"
+        )
+    for key, value in _numbers(free).items():
+        if not math.isfinite(value):
+            raise ValueError(f"free.{name}.{key}: expected a finite number, got {value}")
+    low = -math.inf if free.lower is None else free.lower
+    high = math.inf if free.upper is None else free.upper
+    bounded, positive = high - low < math.inf, name in model.positive
+    keeps, since = free.sign == "keep", "since the model says that it is positive"
+    wrongs = (
+        (
+            free.prior is not None and free.prior.sd <= 0,
+            f".prior.sd must be above zero, got {free.prior and free.prior.sd}",
+        ),
+        (free.sign not in ("keep", "any"), f".sign: expected 'keep' or 'any', got {free.sign!r}"),
+        (positive and start <= 0, f".start: expected more than zero, {since}, got {start:g}"),
+        # Zero will do as a lower bound, which is open.
+        (
+            positive and -math.inf < low < 0,
+            f".lower: expected zero or more, {since}, got {low:g}",
+        ),
+        (positive and not keeps, f".sign: expected keep, {since}, got any"),
+        (
+            keeps and bounded and low < 0 < high,
+            f".sign: keep: expected bounds of one sign, got {low:g} to {high:g}",
+        ),
+        (low >= high, f": lower must be below upper, got {low:g} and {high:g}"),
+        # Not on a bound either: in the coordinates of a bounded parameter its ends are at infinity.
+        (
+            not low < start < high,
+            f".start: expected a value inside {low:g} to {high:g}, got {start:g}",
+        ),
+        # Zero has no logarithm; between two bounds the search is in another coordinate.
+        (
+            start == 0 and keeps and not bounded,
+            ".start: expected a start of the right sign and size, or lower and upper, or sign: "
+            "any; got 0 without two bounds",
+        ),
+    )
+    for wrong, words in wrongs:
         if wrong:
-            raise ValueError(wrong)
+            raise ValueError(f"free.{name}{words}")
+
+
+def _numbers(free: Free) -> dict[str, Any]:
+    """The numbers that are given, by the name of their key."""
+    prior = free.prior
+    numbers = {"start": free.start, "lower": free.lower, "upper": free.upper}
+    if prior is not None:
+        numbers |= {"prior.mean": prior.mean, "prior.sd": prior.sd}
+    return {key: value for key, value in numbers.items() if value is not None}
+
+
+# What a script may pass for a Problem, said in words where it passed something else.
+
+
+_HEADINGS = {"psi", "yaw"}
+"""angles that may go on for more than a turn"""
+_FURTHEST = 6 * math.pi
+"""rad: linear models of an axis roll over in long records, with no pilot to hold them"""
+_HALF_TURN = 1.1 * math.pi
+"""rad that nothing but an unwrapped roll or loop goes beyond"""
+_FASTEST, _OVER = 15.0, 0.1
+"""rad/s, 860 deg/s: no helicopter turns as fast for that many seconds"""
+
+
+def _check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
+    """Refuse what is of another kind than it has to be.
+
+    Raises:
+        TypeError: naming the argument, what was expected and what was found.
+    """
+    check_params(params, vehicle)
+    several = isinstance(flights, Sequence) and not isinstance(flights, str)
+    odd = [f for f in (flights if several else [flights]) if not isinstance(f, Flight)]
+    if odd or not several:
+        raise TypeError(
+            f"flights: expected a list of Flights, got {type((odd or [flights])[0]).__name__}; "
+            "heli_jax.read_flight(path, ...) reads a log"
+        )
+    by_name = free if isinstance(free, Mapping) else {}
+    odd = [f for f in by_name.values() if not isinstance(f, Free)]
+    if odd or not isinstance(free, Mapping):
+        raise TypeError(
+            "free: expected Free by the parameter's name, as {'Ixx': Free(0.02)}, got "
+            f"{type((odd or [free])[0]).__name__}"
+        )
+    for name, each in by_name.items():
+        if not isinstance(each.prior, Prior | None):
+            kind = type(each.prior).__name__
+            raise TypeError(f"free.{name}.prior: expected Prior(mean, sd), got {kind}")
+        for key, value in _numbers(each).items():
+            # Of Python, NumPy or JAX; True is none, though Python counts with it.
+            kind = getattr(value, "dtype", np.dtype(type(value))).kind
+            if getattr(value, "shape", ()) != () or kind not in "iuf":
+                raise TypeError(f"free.{name}.{key}: expected a number, got {value!r:.60}")
+
+
+def _warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
+    """Warn of angles that turn further or faster than a helicopter does, as degrees would.
+
+    Args:
+        outputs: the model's class, which has the units.
+        flights: those made in Python; of a log its unit is stated and checked.
+    """
+    angles = {n for n in naming.names(outputs) if naming.unit(outputs, n) == "rad"} - _HEADINGS
+    signals = [(f, n) for f in flights if f.source is None for n in f.outputs if n in angles]
+    for flight, name in signals:
+        y, steps = np.asarray(flight.outputs[name], float), max(1, round(_OVER / flight.dt))
+        turned = np.abs(y[steps:] - y[:-steps])
+        turned = turned[np.isfinite(turned)]
+        # Single wild samples are left out.
+        fastest = float(np.quantile(turned, 0.98)) / (steps * flight.dt) if turned.size else 0.0
+        largest = float(np.nanmax(np.abs(y), initial=0.0))
+        if largest > _FURTHEST or (largest > _HALF_TURN and fastest > _FASTEST):
+            warnings.warn(
+                f"{flight.name or 'a flight'}: {name} reaches {largest:.3g} rad and "
+                f"{fastest:.2g} rad/s, farther or faster than helicopters turn; angles are in "
+                "radians here: np.radians(degrees)",
+                UserWarning,
+                stacklevel=4,
+            )

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.equation_error.start import equation_error_start
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE, with_noise_guess
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.multistart import FirstGuess, Search, named_values
@@ -19,7 +19,6 @@ from heli_jax.identification.estimation.starts import draw
 from heli_jax.identification.identifiability.equivalents import second_solutions
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, Solution, layout_of
 from heli_jax.identification.validation.adequacy import is_unstable
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax.finding import found
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.disturbance_search import significant_disturbances
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.multistart import (
@@ -28,7 +28,6 @@ from heli_jax.identification.estimation.noise_covariance import (
 from heli_jax.identification.estimation.starts import coarse_guess, delay_start, draw
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.restarts import RESTARTS, SearchState, left_stability
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
 
 _FIRST_STEPS = 40

@@ -22,11 +22,11 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
-from heli_jax.identification.equation_error.regression import Step
 from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
     StartValue,
+    Step,
 )
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.fit import Fit

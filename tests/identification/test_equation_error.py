@@ -13,8 +13,7 @@ from heli_jax import Flight, Free, Model, linear_model, load_config, models
 from heli_jax.config import problem
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.records import segments, smoothed
-from heli_jax.identification.equation_error.regression import Rows, covariance
-from heli_jax.identification.equation_error.start import equation_error_start
+from heli_jax.identification.equation_error.start import Rows, covariance, equation_error_start
 from heli_jax.naming import Scalar
 
 DT = 0.02

@@ -10,11 +10,10 @@ import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.filter_error import disturbed_records
 from heli_jax.identification.estimation.noise_covariance import first_noise
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Solution, layout_of, unpack
 from heli_jax.identification.validation.adequacy import (
     gain_of_inputs,

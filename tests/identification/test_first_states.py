@@ -9,7 +9,7 @@ import scipy.optimize
 
 from heli_jax import Helicopter, models, naming
 from heli_jax.dynamics.check_model import starting_at
-from heli_jax.identification.unknowns.initial_guess import own_start
+from heli_jax.identification.estimation.data import own_start
 from tests.dynamics import full_helicopter as oracle
 
 VEHICLE = Helicopter(**oracle.FULL)

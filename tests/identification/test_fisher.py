@@ -7,11 +7,10 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.problem import Nuisance
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import asdict
 from tests.dynamics.paper import BENCH, matrices

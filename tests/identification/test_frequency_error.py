@@ -22,7 +22,7 @@ from heli_jax import (
     simulate,
 )
 from heli_jax.dynamics.jacobians import point
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.frequency_lines import (
     Matrices,
     Record,
@@ -36,7 +36,6 @@ from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.simulated_flights import Drive
 from heli_jax.identification.select import MethodComparison, MethodResult
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.report.document import MethodsCompared, written
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle

@@ -11,13 +11,12 @@ import scipy.optimize
 from heli_jax import Free, Nuisance, Prior, Problem, fit, models
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.identification.estimation import many_runs
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.filter_error import OBJECTIVE as FILTER_ERROR
 from heli_jax.identification.estimation.many_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.uncertainty.bootstrap import bootstrap, refit
 from heli_jax.identification.uncertainty.comparison import intervals
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from tests.identification.bench import BENCH, record, response, vehicle
 

@@ -9,8 +9,7 @@ import pytest
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.fit import fit
-from heli_jax.identification.free import Free
-from heli_jax.identification.problem import Nuisance, Problem
+from heli_jax.identification.problem import Free, Nuisance, Problem
 
 DT, N, NOISE, SCALE, BIAS = 0.05, 6000, 0.5, -0.03, 0.2
 

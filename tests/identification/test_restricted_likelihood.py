@@ -8,8 +8,7 @@ import scipy.optimize
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.fit import fit
-from heli_jax.identification.free import Free
-from heli_jax.identification.problem import Nuisance, Problem
+from heli_jax.identification.problem import Free, Nuisance, Problem
 from tests.identification.test_noisy_scales import MODEL, Params
 
 DT, N, WALK, NOISE = 0.1, 200, 0.02, 0.1

@@ -10,11 +10,10 @@ import pytest
 
 from heli_jax import Flight, Free, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.filter_error import filtered_flights
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.estimation.shared_covariance import Gaussian, Records, filtered_records
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of, unpack
 from heli_jax.naming import asdict
 

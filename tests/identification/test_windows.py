@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from heli_jax import Free, Nuisance, Problem, fit, models
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise
-from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
 from tests.identification.bench import BENCH, record, vehicle
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.finding import Finding, found
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.identifiability.analysis import relative_rows, verdict_of
 from heli_jax.identification.identifiability.directions import projected
@@ -110,21 +111,16 @@ _WORTH_DOUBT = 0.1
 
 def too_good(
     sds: Sequence[float] | np.ndarray, guessed: bool, *, nothing_follows: bool = False
-) -> str:
-    """Return a sentence where expected sds are too small to be true; empty where they are not."""
-    if nothing_follows and len(sds) and float(np.min(sds)) < _WORTH_DOUBT:
-        return (
-            f"An expected sd of {100 * float(np.min(sds)):.2g} % is no promise: it takes for "
-            "granted that the outputs answer the inputs as the model has it, and no output "
-            "follows any input in this record."
-        )
-    if not guessed or not len(sds) or float(np.min(sds)) >= _TOO_GOOD:
-        return ""
-    return (
-        f"An expected sd of {100 * float(np.min(sds)):.2g} % is no promise: the noise was guessed "
-        "from differences between samples, and is far too small where the log was smoothed or "
-        "simulated; state the outputs' sd. Compare such numbers with one another alone."
-    )
+) -> Finding | None:
+    """Return a finding if expected sds are too small to be true."""
+    least = float(np.min(sds, initial=np.inf))
+    if nothing_follows and least < _WORTH_DOUBT:
+        code = "accuracy.nothing-follows"
+    elif guessed and least < _TOO_GOOD:
+        code = "accuracy.guessed-noise"
+    else:
+        return None
+    return found(code, value=least, percent=100.0 * least)
 
 
 def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.finding import Finding, found
 from heli_jax.flights.cut import part
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     FREE,
@@ -30,11 +30,11 @@ from heli_jax.identification.design.accuracy import (
     together,
     triangle,
 )
+from heli_jax.identification.estimation.data import runs_away
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
@@ -52,9 +52,6 @@ _RAILS = 0.05
 """part of a window's samples at an end of a signal's range, from which on it is left out"""
 _GAP = 0.25
 """seconds without a sample of an output, and five of its usual steps, that are a gap"""
-_DIVERGED = 10.0
-"""times the largest measurement, beyond which the simulation of the record says nothing of where a
-window begins"""
 _PARTS = 12
 """windows in a record, unless their length is stated"""
 _SHORTEST, _LONGEST = 2.0, 20.0
@@ -175,13 +172,11 @@ def rank_windows(
     every, flights = labels(problem.training), problem.training
     layout, shooting = at.layout, problem.window is not None
     for flight, run in zip(flights, e.simulated, strict=True):
-        for name, y in run.items():
-            if not np.max(np.abs(y)) <= _DIVERGED * np.nanmax(np.abs(flight.outputs[name])):
-                raise ValueError(
-                    f"windows: the simulation of {name} goes more than {_DIVERGED:g} times as far "
-                    "as was measured at the start values, expected nearer ones, fit.shooting, or "
-                    "fit.method: filter-error"
-                )
+        if away := [n for n, y in run.items() if runs_away(y, flight.outputs[n])]:
+            raise ValueError(
+                f"windows: the simulation of {', '.join(away)} diverges at the start values, "
+                "expected fit.shooting or fit.method: filter-error"
+            )
     lacking = not_determined(problem, layout, e)
     if shooting:
         sizes = [m * max(1, round(samples / m)) for _, m in layout.windows]

@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.finding import Finding
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.agreement import (
     correlated_residuals,
     free_runs,
@@ -33,7 +33,6 @@ from heli_jax.identification.uncertainty.estimates import (
     standard_errors,
     without_disturbance,
 )
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import Solution, scales_of
 from heli_jax.identification.validation.adequacy import (
     EXPLAINED,

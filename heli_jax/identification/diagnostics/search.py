@@ -6,9 +6,9 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.finding import Finding, found
+from heli_jax.flights.flight import labels
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.diagnostics.context import Context
-from heli_jax.identification.unknowns.initial_guess import labels
 
 STOPPED = "search.stopped"
 FAR = 3.0

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from heli_jax.finding import Finding, Severity, found
+from heli_jax.flights.flight import labels
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.validation.logging_rate import (
     RATE,
     Rate,

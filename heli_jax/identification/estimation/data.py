@@ -1,13 +1,17 @@
-"""The numbers of a problem over its flights, as arrays that the residual is traced with."""
+"""The numbers of a problem over its flights as arrays, and the unknowns at the start values."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.analysis.trim import is_full_nonlinear, trim
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import (
@@ -17,13 +21,13 @@ from heli_jax.identification.estimation.simulated_flights import (
 )
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms as coordinates
-from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import (
     Data,
     FlightData,
     Layout,
     Noise,
+    flight_places,
     layout_of,
 )
 
@@ -36,7 +40,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     """
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
-    bounds = [coordinates.limits(f) for f in frees]
+    bounds = [transforms.limits(f) for f in frees]
 
     def column(values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
@@ -45,7 +49,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     follows = [None] * len(flights) if by is None else by
     numbers = Data(
         base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
-        sign=column([coordinates.sign_or_scale(f) for f in frees]),
+        sign=column([transforms.sign_or_scale(f) for f in frees]),
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
@@ -55,7 +59,6 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         flights=tuple(
             _flight_data(problem, f, dtype, u) for f, u in zip(flights, follows, strict=True)
         ),
-        push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},
     )
     numbers = _placed(numbers)
     if not nuisance.initial_state:
@@ -95,22 +98,24 @@ def _flight_data(
         bias_scale={
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
-        offset_scale={n: np.asarray(10.0 * _motion(u), dtype) for n, u in inputs.items()},
+        # How far an input moves, or its size where it never does.
+        offset_scale={
+            n: np.asarray(10.0 * _size(u - np.mean(u) if np.ptp(u) > 0 else u), dtype)
+            for n, u in inputs.items()
+        },
         by_instrument=None if follows is None else model.Inputs(**arrays(follows)),
     )
 
 
+def _rms(values: jax.Array | np.ndarray) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
+
+
 def _size(values: jax.Array | np.ndarray) -> float:
     """rms of a signal, 1 where that says nothing."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        rms = float(np.sqrt(np.mean(np.square(np.asarray(values)))))
+    rms = _rms(values)
     return rms if np.isfinite(rms) and rms > 0 else 1.0
-
-
-def _motion(u: np.ndarray) -> float:
-    """How far an input moves (rms about its mean), or its size where it never does."""
-    motion = float(np.std(u))
-    return motion if np.isfinite(motion) and motion > 0 else _size(u)
 
 
 def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
@@ -161,7 +166,7 @@ def _before_it_grows(
         simulated = with_biases(layout, runs)
         windows = [count for count, _ in layout.windows]
         far = any(
-            _grows(v) and not _rms(v) < _GROWN * _size(f.outputs[n][np.isfinite(f.outputs[n])])
+            runs_away(v, np.asarray(f.outputs[n]))
             for f, by_name in zip(data.flights, simulated, strict=True)
             for n, v in by_name.items()
         )
@@ -179,12 +184,112 @@ def _before_it_grows(
     return runs, simulated
 
 
-def _rms(values: np.ndarray) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(np.mean(np.square(values))))
+def runs_away(simulated: np.ndarray, measured: np.ndarray) -> bool:
+    """True if a simulation grows, and far beyond what was measured, which no wrong gain makes it.
+
+    Args:
+        simulated: an output (N,).
+        measured: of it (M,), NaN where a sample is missing.
+    """
+    half = len(simulated) // 2
+    grows = not _rms(simulated[half:]) <= 10.0 * _rms(simulated[:half])
+    return grows and not _rms(simulated) < _GROWN * _size(measured[np.isfinite(measured)])
 
 
-def _grows(values: np.ndarray) -> bool:
-    """Whether a run is ten times as large in its second half, which no wrong gain makes it."""
-    half = len(values) // 2
-    return not _rms(values[half:]) <= 10.0 * _rms(values[:half])
+# Where z begins.
+
+
+def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
+    """Return z at the start values: gains 1, no shift, the model's own initial state, no bias."""
+    dtype = data.low.dtype
+    # Fetched once: an entry by itself would be a program of its own, for each of the unknowns.
+    limits = zip(*jax.device_get((data.sign, data.low, data.high)), strict=True)
+    z = [
+        transforms.to_coordinate(kind, np.asarray(f.start, dtype), *of_one)
+        for f, kind, of_one in zip(problem.free.values(), layout.kinds, limits, strict=True)
+    ]
+    one, zero = np.ones((), dtype), np.zeros((), dtype)
+    z += [one] * len(layout.gains) + [zero] * layout.shift
+    z += [np.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
+    z += [np.asarray(np.log(problem.filtered_noise[n].start), dtype) for n in layout.filtered]
+    # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
+    whole = np.zeros(layout.size, dtype)
+    whole[: len(z)] = jax.device_get(z)
+    # A linear model without a start of its own begins at zero, as z does.
+    if layout.initial_state and not (layout.model.linear and layout.model.start is None):
+        _initial_states(layout, data, problem, whole)
+    return jnp.asarray(whole)
+
+
+def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray) -> None:
+    """Enter the model's own initial state (of a whole helicopter its hover), or for one that is not
+    linear the nearest that shows the measured outputs at the first sample of the window."""
+    names, places = naming.names(layout.model.State), flight_places(layout)
+    values = {n: np.asarray(f.start, z.dtype) for n, f in problem.free.items()}
+    for flight, own, (_, m) in zip(data.flights, places, layout.windows, strict=True):
+        # What is known of this flight alone stands over what is free in all of them.
+        params = layout.model.Params(**{**data.base, **values, **flight.known})
+        by_model = own_start(layout.model, params)
+        first = np.array([by_model[n] for n in names])
+        # Coordinates of states are in units of their weak priors' sds.
+        scales = np.array([float(flight.state_scale[n]) for n in layout.states])
+        for k, at in enumerate(own.states):
+            x0 = first
+            # The residual of a linear model is linear in its initial states: one step finds them
+            # from anywhere. Of others a far start can lie in the valley of another solution.
+            if not layout.model.linear:
+                x0 = _state_that_shows(layout, params, flight, k * m, first)
+            z[at] = x0[[names.index(n) for n in layout.states]] / scales
+
+
+# Any: the model's Params, whose class may be a user's own.
+def own_start(model: Model, params: Any) -> dict[str, float]:
+    """Return the model's initial state; zeros of a whole helicopter's are as in hover."""
+    start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
+    if not is_full_nonlinear(model):
+        return start
+    # With its tail's side force a helicopter hovers on a bank, with its rotor tilted. From level it
+    # would slide away, and what no output shows would have to be searched for from there.
+    try:
+        hover = trim(model, params).state
+    except ValueError:  # the start values cannot fly; the optimum may
+        return start
+    return {n: v if v != 0.0 else float(getattr(hover, n)) for n, v in start.items()}
+
+
+_LINE = 5
+"""samples to which a straight line is fitted for the value at the first"""
+
+
+def _state_that_shows(
+    layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
+) -> np.ndarray:
+    """The state (n,) nearest to `first` whose outputs are the measured ones at sample k.
+
+    Three Gauss-Newton steps: outputs are mostly states themselves, or angles of them.
+    """
+    measured = {n: _at_start(np.asarray(y)[k:]) for n, y in flight.outputs.items()}
+    measured = {n: v for n, v in measured.items() if np.isfinite(v)}
+    inputs = jax.tree.map(lambda u: u[k], flight.inputs)
+    names, x = naming.names(layout.model.State), first
+    rows = [naming.names(layout.model.Outputs).index(n) for n in measured]
+    for _ in range(3):
+        state = layout.model.State(**dict(zip(names, jnp.asarray(x), strict=True)))
+        _, _, C, _ = jacobians(layout.model, params, state, inputs)
+        outputs = naming.asdict(layout.model.output(params, state, inputs))
+        error = np.array([v - float(outputs[n]) for n, v in measured.items()])
+        # The least step: states that no output shows stay where the model puts them.
+        x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ error
+    return x
+
+
+def _at_start(y: np.ndarray) -> float:
+    """The value at the first of the samples, from a few with less noise than one has; NaN where
+    nothing is measured."""
+    seen = np.flatnonzero(np.isfinite(y[:_LINE]))
+    if seen.size < 3:
+        # Too few for a line that averages anything. A slow sensor's first sample comes later: the
+        # machine was near that, rather than at zero.
+        seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
+        return float(y[seen[0]]) if seen.size else float("nan")
+    return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

@@ -18,7 +18,7 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.finding import Finding, found
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.kalman import (
     SMALL,
@@ -53,7 +53,6 @@ from heli_jax.identification.estimation.simulated_flights import (
     signals,
 )
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,

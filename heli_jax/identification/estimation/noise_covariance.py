@@ -13,9 +13,8 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
 from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
-from heli_jax.identification.free import Free
 from heli_jax.identification.methods import objective_of
-from heli_jax.identification.problem import Problem
+from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout, Noise
 from heli_jax.numerics.white_noise import noise_guess

@@ -119,7 +119,9 @@ def coarse_guess(
     linear least squares; what is not among the unknowns stays.
     """
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
-    if not (layout.shift or len(layout.gains) == 1):
+    # A machine that is held through its instruments leaves a simulation by its inputs.
+    by_inputs = data.flights[0].by_instrument is None
+    if not (by_inputs and (layout.shift or len(layout.gains) == 1)):
         return z0
     grid = (
         np.linspace(-_SHIFT_RANGE, _SHIFT_RANGE, _SHIFTS) * MAX_TIME_SHIFT
@@ -129,13 +131,7 @@ def coarse_guess(
     # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
     # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
     coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
-    if data.flights[0].by_instrument is not None and not layout.gains:
-        # By the rows: of a machine that somebody holds a simulation by its inputs drifts off.
-        points = np.tile(np.asarray(z0), (_SHIFTS, 1))
-        points[:, len(layout.free)] = coordinate
-        costs, gains = costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)), coordinate
-    else:
-        costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
+    costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
     costs = np.where(np.isfinite(costs), costs, np.inf)
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
@@ -201,13 +197,10 @@ def draw(
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
-    dtype = z0.dtype
     for i, (free, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
-        values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
-        sign = jnp.asarray(transforms.sign_or_scale(free), dtype)
-        low, high = (jnp.asarray(b, dtype) for b in transforms.limits(free))
-        rows[1:, i] = np.asarray(transforms.to_coordinate(kind, values, sign, low, high))
-    return jnp.asarray(rows, dtype)
+        values = _draw_values(free, rows.shape[0] - 1, rng)
+        rows[1:, i] = transforms.coordinates(free, kind, values)
+    return jnp.asarray(rows, z0.dtype)
 
 
 def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
@@ -314,8 +307,7 @@ def _grids(problem: Problem, layout: Layout, data: Data, J: np.ndarray) -> dict[
             low, high = max(low, min(early, free.start)), min(high, max(_LATEST, 2.0 * free.start))
         values = np.unique([free.start, *_between(low, high, step)])
         values = values[[transforms.inside(free, float(v)) for v in values]]
-        limits = transforms.sign_or_scale(free), *transforms.limits(free)
-        grids[i] = np.asarray(transforms.to_coordinate(layout.kinds[i], values, *limits))
+        grids[i] = transforms.coordinates(free, layout.kinds[i], values)
     if layout.shift:
         i = len(layout.free) + len(layout.gains)
         ends = -_SHIFT_RANGE * MAX_TIME_SHIFT, _SHIFT_RANGE * MAX_TIME_SHIFT

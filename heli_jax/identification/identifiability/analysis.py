@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import NULL, Evaluation
 from heli_jax.identification.identifiability.directions import (
     TAKES_NO_PART,
@@ -44,7 +45,6 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
 # From the residual's Jacobian to relative coordinates.

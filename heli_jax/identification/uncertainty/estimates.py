@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import sensor_noise
+from heli_jax.flights.flight import labels
 from heli_jax.identification.estimation.evaluation import (
     Evaluation,
     combined_deviations,
@@ -37,7 +38,6 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import (
     sandwich,
 )
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.identification.unknowns.layout import (
     FlightUnknown,
     Noise,

@@ -71,8 +71,6 @@ class Data(NamedTuple):
     prior_sd: Any
     """inf where a parameter has no prior"""
     flights: tuple[FlightData, ...]
-    push_scales: dict[str, Any]
-    """see `Problem.push_scales`"""
 
 
 class Layout(eqx.Module):
@@ -398,7 +396,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
     A correlation time below a hundredth of a sample is white noise to any record, one above a
     thousand records is a random walk; beyond these a likelihood without a maximum would take the
     numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
-    of several disturbances each its own, with room for a disturbance that is none.
+    with room for a disturbance that is none.
     """
     dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
     longest = functools.reduce(
@@ -415,7 +413,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
         layout.disturbance, (jnp.log(_SHORTEST * dt), jnp.log(_LONGEST * longest))
     )
     for name in layout.sigmas:
-        size = jnp.log(data.push_scales.get(name, motion))
+        size = jnp.log(motion)
         limits[name] = (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST)
     for output in layout.filtered:
         # A bias's scale is ten times what the output does, which no noise exceeds by far.

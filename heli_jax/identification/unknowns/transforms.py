@@ -94,16 +94,19 @@ def inside(free: Free, value: float) -> bool:
     return bool(low <= value <= high)
 
 
-def coordinate(free: Free, kind: str, value: float) -> float | None:
-    """The coordinate of a value; None where it lies outside the bounds, or has none.
+def coordinates(free: Free, kind: str, values: Real) -> np.ndarray:
+    """The coordinates of values; infinite or NaN of those on the bounds or outside.
 
     Args:
         kind: one of `KINDS`.
     """
-    if not inside(free, value):
-        return None
-    z = float(to_coordinate(kind, value, sign_or_scale(free), *limits(free)))
-    return z if math.isfinite(z) else None
+    return np.asarray(to_coordinate(kind, values, sign_or_scale(free), *limits(free)))
+
+
+def coordinate(free: Free, kind: str, value: float) -> float | None:
+    """The coordinate of a value; None where it lies outside the bounds, or has none."""
+    z = float(coordinates(free, kind, value))
+    return z if inside(free, value) and math.isfinite(z) else None
 
 
 def at_bound(free: Free, value: float) -> bool:

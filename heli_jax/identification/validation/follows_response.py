@@ -29,9 +29,8 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.dynamics.kinematics import is_kinematic
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
 from heli_jax.numbers import percent
 
 # How one signal is correlated with sums over past samples of another, and how surely.

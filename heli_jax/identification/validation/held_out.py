@@ -11,8 +11,8 @@ import scipy.special
 from jaxtyping import Array, Float
 
 from heli_jax.finding import Finding, found
-from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.data import data_of
+from heli_jax.flights.flight import Flight, labels
+from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, parts_of
@@ -21,7 +21,6 @@ from heli_jax.identification.estimation.noise_covariance import first_noise, fir
 from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels, start_vector
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
