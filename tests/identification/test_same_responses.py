@@ -7,8 +7,8 @@ import pytest
 
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.free import Free
 from heli_jax.identification.fit import check
+from heli_jax.identification.free import Free
 from heli_jax.identification.problem import Nuisance, Problem
 
 ZNU, DT, N = 6.0, 0.02, 2000
