@@ -51,11 +51,6 @@ ABLATIONS: tuple[Ablation, ...] = (
     ),
     Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
     Ablation(
-        "likelier_hold",
-        f"{_IDENTIFICATION}.select:with_likelier_hold",
-        lambda problem, fit, refit: (problem, fit),
-    ),
-    Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",
         lambda *_, **__: (),

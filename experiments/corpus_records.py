@@ -355,6 +355,11 @@ def written(rig: Rig, folder: Path) -> Path:
     return path
 
 
+def stated_held(name: str, unit: str) -> dict[str, Any]:
+    """Signals of a log whose one input is stated to be held between samples."""
+    return {"inputs": {name: {"signal": name, "unit": unit, "hold": "zero-order"}}}
+
+
 DELAYED = TRUTH | {"tau": ACTS * DT}
 FREQUENCY = {"fit": {"method": "frequency-error"}}
 RESPONSE = {"fit": {"method": "frequency-response"}}
@@ -413,8 +418,14 @@ RIGS: dict[str, Rig] = {
     ),
     "heave in calm air": Rig(lambda: heave(0.0, 0.15), HEAVE, {"Zw": -0.6, "Zcol": -14.0}),
     # Sound records on which a search may go astray, or the reader.
-    "computed command": Rig(computed, truth=TRUTH),
-    "spring far from its start": Rig(spring, SPRING, {"k": 25.0, "d": 0.5, "b": 20.0}),
+    "computed command": Rig(computed, truth=TRUTH, ought=("likelier-hold",)),
+    "computed command, stated": Rig(computed, truth=TRUTH, signals=stated_held("da", "rad")),
+    "spring far from its start": Rig(
+        spring,
+        SPRING,
+        {"k": 25.0, "d": 0.5, "b": 20.0},
+        signals=stated_held("f", "1"),
+    ),
     "heave by frequency error": Rig(
         lambda: heave(1.0, 0.04), HEAVE, {"Zw": -0.6, "Zcol": -14.0}, FREQUENCY
     ),

@@ -321,7 +321,7 @@ def _private_cache() -> str | None:
 
 
 def _new_directory(options: argparse.Namespace) -> Path:
-    """Where a run's files go, known to be free."""
+    """Return the directory of a run's files, which does not exist yet."""
     out = _directory(options)
     resume = ", or --resume" if hasattr(options, "resume") else ""
     run_directory.require_free(out, resume)  # at once, before the seconds of the imports
@@ -574,7 +574,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def _selection(options: argparse.Namespace) -> "Selection":
-    """What `convert` takes of a log."""
+    """Return the part of a log that `convert` takes."""
     from heli_jax.flights import convert, named
 
     if options.preset is not None and (options.signals or options.config is not None):

@@ -52,13 +52,13 @@ class SensorError:
 
     @property
     def shows(self) -> bool:
-        """Whether the record determines it, and it is not zero."""
+        """True if the record determines it and it is not zero."""
         low, high = self.estimate.lower95, self.estimate.upper95
         return self.determined and low is not None and high is not None and low * high > 0
 
     @property
     def words(self) -> str:
-        """What the table says of it."""
+        """Text of its row in the table."""
         if not self.determined:
             return "unknown"
         return "yes" if self.shows else "no"
@@ -66,7 +66,7 @@ class SensorError:
 
 @dataclass(frozen=True)
 class Compatibility:
-    """What a log's sensors say of each other."""
+    """Agreement of a log's sensors with each other."""
 
     run: FitRun
     errors: tuple[SensorError, ...]
@@ -131,7 +131,7 @@ def run_compatibility(
 
 
 def _agreement(compatibility: Compatibility) -> SensorAgreement:
-    """What the page says before it shows the fit, whose own first line knows nothing of sensors."""
+    """Return the sentences above the fit's own page, whose first line knows nothing of sensors."""
     head, rows = table(compatibility)
     # The fit's findings stand on its page already.
     doubts = tuple(d for d in compatibility.doubts if d not in compatibility.run.fit.findings)
@@ -152,7 +152,7 @@ _BEYOND_NOISE = (
 
 
 def _without_noise(run: FitRun) -> bool:
-    """Whether filter error looked for noise to hold its innovations against, and found none."""
+    """True if filter error looked for measurement noise and found none."""
     searched = {*NOISES} & {*run.problem.free}
     return (
         run.problem.noise_model == "disturbance"
@@ -162,7 +162,7 @@ def _without_noise(run: FitRun) -> bool:
 
 
 def _smooth(run: FitRun) -> bool:
-    """Whether the noise of an output ran to zero, beside that of the gyros."""
+    """True if the noise of an output went to zero, beside that of the gyros."""
     sizes = [np.nanstd(y) for s in run.fit.signals for y in s.measured.values()]
     return min(run.fit.noise.values(), default=1.0) < _NO_NOISE * max(sizes, default=0.0)
 
@@ -175,7 +175,7 @@ def _by_output_error(experiment: Experiment) -> Experiment:
 
 
 def judged(run: FitRun) -> Compatibility:
-    """What a fit of a kinematic model says of the sensors."""
+    """Judge the sensors by the fit of a kinematic model."""
     errors = tuple(_error(run, n, e) for n, e in run.fit.estimates.items() if n in SIZES)
     r_squared = r_squared_of(run)
     converged = run.fit.status != "not-converged"
@@ -260,7 +260,8 @@ def _verdict(
 
 
 def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
-    """What of a verdict that all is well these channels do not tell; empty where they tell all."""
+    """Return what these channels cannot show where the verdict is good; empty where they show
+    all."""
     untold = [e for e in errors if not e.determined]
     if not untold:
         return ""
@@ -280,7 +281,7 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
-    """What a fit says of itself, and errors that no sensor has."""
+    """Return the fit's own doubts, and the errors that no real sensor has."""
     # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
     of_model = ("adequacy.", "dynamics.", "excitation.")
     notes = once(

@@ -47,7 +47,7 @@ class VehicleError(ValueError):
 
     @property
     def problem(self) -> str:
-        """What is wrong."""
+        """Description of the error."""
         return self.args[0]
 
     def __str__(self) -> str:

@@ -50,7 +50,7 @@ class Finding(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """What was found, as a heading."""
+        """Heading of the finding."""
         known = messages().get(self.code)
         return known.title if known else self.code.partition(".")[2].replace("-", " ")
 

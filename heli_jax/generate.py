@@ -51,7 +51,7 @@ class Simulated(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether it was the full nonlinear helicopter that flew."""
+        """True if the full nonlinear helicopter was simulated."""
         return is_full_nonlinear(self.model)
 
 
@@ -93,7 +93,7 @@ def _stick(config: StickConfig, n: int, dt: float, rng: np.random.Generator) -> 
 
 
 def _factor_to_si(unit: str, si: str, where: str) -> float:
-    """As `units.factor`, with a place.
+    """Return `units.factor`; an error names the place.
 
     Args:
         si: the SI unit of what it is for.
@@ -159,7 +159,7 @@ def generate(experiment: Experiment) -> Simulated:
 
 
 class Made(NamedTuple):
-    """What drives a sweep whose inputs `simulate` makes."""
+    """Drive of a sweep whose inputs `simulate` makes."""
 
     experiment: Experiment
     """with wind in its model where there is some"""
@@ -313,7 +313,7 @@ def _diverged_at(run: Trajectory) -> float:
 
 
 def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
-    """What is to be said of a run: its end, and where it left the range of model and sticks."""
+    """Return the notes on a run: how it ended, and where it left the range of model and sticks."""
     notes = []
     if np.isfinite(run.ended):
         settings = experiment.config.simulate
@@ -339,7 +339,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
 
 
 def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[Finding]:
-    """Where sticks are past their ends, in the samples that are `flown`."""
+    """Return the notes on sticks beyond their ends, in the samples that were flown."""
     # Other models' inputs are lengths or anyone's own, without known ends.
     if not is_full_nonlinear(experiment.model):
         return []

@@ -22,7 +22,7 @@ _PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 def is_path(text: str) -> bool:
-    """Whether a text has the form of an import path."""
+    """True if a text has the form of an import path."""
     return _PATH.fullmatch(text) is not None
 
 
@@ -103,7 +103,7 @@ def _check_size(module_name: str, where: str) -> None:
 
 
 def _words(e: BaseException) -> str:
-    """What went wrong and in which line of which file."""
+    """Return the error, with the line and file where it arose."""
     # The last frame: the line in the user's module, or in what it called with wrong arguments.
     at = traceback.extract_tb(e.__traceback__)
     line = f"{at[-1].filename}, line {at[-1].lineno}: " if at else ""

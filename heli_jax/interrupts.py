@@ -141,7 +141,7 @@ def _words(written: tuple[Path, ...]) -> str:
 
 
 def _are_pythons_own() -> bool:
-    """Whether interrupts are handled as Python does by itself: not another's, and not ignored."""
+    """True if Python's own handler receives interrupts."""
     # Python sets handlers in its main thread alone; elsewhere signal.signal raises.
     ours = threading.current_thread() is threading.main_thread()
     return ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,4 +1,4 @@
-"""What `heli-jax info` prints of a log, as text or as JSON.
+"""Output of `heli-jax info`, as text or as JSON.
 
 Apart from `output.py`, which imports JAX: a look at a log need not wait for it.
 """

@@ -77,7 +77,7 @@ def responses_of_log(
 
 
 def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """That flights which a fit holds out count here: its report shows other responses."""
+    """Note that flights held out of a fit count here, so that its report shows other responses."""
     from heli_jax.identification.unknowns.initial_guess import labels
 
     named = zip(labels(tuple(flights)), flights, strict=True)
@@ -92,7 +92,7 @@ def _held_out(flights: Sequence[Flight]) -> tuple[Finding, ...]:
 
 
 def between_samples(flights: Sequence[Flight], inputs: Collection[str]) -> list[Finding]:
-    """What inputs were taken to do between samples where a log decided it, and what hangs on it."""
+    """Return how inputs move between samples where the log decided it, and what depends on it."""
     mixed: dict[tuple[str, str], list[str]] = {}
     guessed: dict[str, str] = {}
     for name in inputs:
@@ -191,7 +191,7 @@ def run_responses(
 
 
 def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
-    """That no response is coherent with its input, where none is."""
+    """Return a sentence if no response is coherent with its input."""
     pairs = [pair for output in responses.outputs.values() for pair in output.pairs.values()]
     if any(np.max(octave_mean(responses.omega, p.coherence)) >= COHERENT for p in pairs):
         return ()
@@ -203,7 +203,7 @@ def not_usable(responses: FlightResponses) -> tuple[Finding, ...]:
 
 
 def print_responses(responses: FlightResponses) -> None:
-    """What each response is good for, and the transfer functions, on standard output."""
+    """Print the use of each response, and the transfer functions, on standard output."""
     from heli_jax.report.responses import FIT_HEAD, fit_row, fit_sentences, useful_band
 
     rows = []

@@ -1,17 +1,13 @@
 """`heli-jax windows`: which parts of a log say most of what a configuration has free."""
 
-import dataclasses
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax.config import Experiment
 from heli_jax.config.logs import require_flights, with_log
-from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import located
-from heli_jax.finding import note
 from heli_jax.identification.design.accuracy import GUESSED, too_good
 from heli_jax.identification.design.windows import (
     DETERMINES,
@@ -21,9 +17,6 @@ from heli_jax.identification.design.windows import (
     window_samples,
 )
 from heli_jax.identification.fit import windows
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.initial_guess import labels
-from heli_jax.numerics.white_noise import noise_guess
 from heli_jax.stages import Note
 from heli_jax.terminal import print_table, tell
 
@@ -37,7 +30,7 @@ def rank_log(
     length: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Ranking:
-    """What each window of a configuration's logs says of its free parameters.
+    """Rank the windows of a configuration's logs by their information on its free parameters.
 
     Args:
         experiment: the configuration; windows that it states for its flights are left out of
@@ -55,10 +48,6 @@ def rank_log(
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
         # Two flights of one log are, without their windows, the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
-    first = config.flights[0]
-    same = log is None or (path.parent / first.log).resolve() == Path(log).resolve()
-    asked = flights if log is None else [first] if same else []
-    stated = [_stated_window(config.flights, f) for f in asked]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
     for flight in problem.flights:
@@ -67,54 +56,8 @@ def rank_log(
     with located(f"{path}"):
         # Before the work, and not after it: with many windows that takes a while.
         seconds = window_samples(problem, length) * problem.training[0].dt
-        progress(f"comparing windows of {seconds:.3g} s, half overlapping")
-        ranking = _ranked(problem, stated, length)
-    ranked = {window.flight for window in ranking.windows}
-    for i, flight in enumerate(problem.training):
-        if i not in ranked:
-            words = f"is shorter than a window of {ranking.length:.3g} s, and left out"
-            progress(Note(f"{flight.name}: {flight.duration:.4g} s {words}"))
-    return ranking
-
-
-_Window = tuple[float, float] | None
-
-
-def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Window:
-    """The window [s] that a configuration states for a log, of several the first; None where it
-    takes all of it."""
-    windows = [
-        f.window
-        for f in flights
-        if (f.log, f.flight) == (whole.log, whole.flight) and not f.hold_out
-    ]
-    return None if isinstance(windows[0], str) else windows[0]
-
-
-def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -> Ranking:
-    """The ranking with the noise that `check` guesses: of the windows that are stated."""
-    flights = list(problem.training)
-    # Filter error estimates the noise itself; parts of a split log are no flights of the file.
-    same = len(stated) == len(flights) and any(stated)
-    if not same or problem.noise_model == "disturbance":
+        progress(f"comparing windows of {seconds:.3g} s, side by side")
         return windows(problem, length)
-    guessed: list[str] = []
-    every = labels(problem.training)
-    for i, (flight, window) in enumerate(zip(flights, stated, strict=True)):
-        first, last = (0, flight.n_samples)
-        if window is not None:
-            first, last = (round(t / flight.dt) for t in window)
-        sd = {n: noise_guess(y[first : last + 1]) for n, y in flight.outputs.items()}
-        guessed += [f"{every[i]}/{n}" for n in sd if n not in flight.sd]
-        flights[i] = dataclasses.replace(flight, sd={**sd, **flight.sd})
-    held = tuple(f for f in problem.flights if f.hold_out)
-    ranking = windows(dataclasses.replace(problem, flights=(*flights, *held)), length)
-    begun = note(
-        "windows.noise-of-those-stated",
-        "The noise is that of the windows which the configuration states, as check guesses it; "
-        "check begins each at rest, and these windows begin where the whole log has come to.",
-    )
-    return dataclasses.replace(ranking, guessed=tuple(guessed), notes=(*ranking.notes, begun))
 
 
 def print_ranking(ranking: Ranking) -> None:
@@ -159,7 +102,7 @@ def print_ranking(ranking: Ranking) -> None:
 
 
 def cannot_be_fitted(ranking: Ranking) -> bool:
-    """Whether the log says nothing of what is asked, whichever part of it is taken."""
+    """True if no part of the log has any information on what is asked."""
     return any(f.severity == "refuse" for f in ranking.record)
 
 
@@ -170,7 +113,7 @@ def not_determined(ranking: Ranking) -> tuple[str, ...]:
 
 
 def _print_doubts(ranking: Ranking) -> None:
-    """What the numbers of a ranking rest on, and what speaks against the record."""
+    """Print the assumptions of a ranking, and the doubts about the record."""
     for finding in ranking.record:
         tell(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:

@@ -56,8 +56,8 @@ def sentence(code: str, **numbers: Any) -> str:
 
 
 def listed(names: Sequence[str], joined: str = "and") -> str:
-    """`a, b and c`."""
-    *first, last = names
+    """`a, b and c`; nothing of no names."""
+    *first, last = names or ("",)
     return f"{', '.join(first)} {joined} {last}" if first else last
 
 

@@ -61,13 +61,13 @@ def unit(record: type, name: str) -> str | None:
 
 
 def meaning(record: type, name: str) -> str:
-    """What a field is, in words; empty where the class does not say."""
+    """Return the meaning of a field in words; empty if the class does not state it."""
     notes = _notes(record).get(name, ())
     return notes[1] if len(notes) > 1 else ""
 
 
 def texts(record: type) -> dict[str, str]:
-    """What stands below each of a class's own fields in its source, by field."""
+    """Return the text below each of a class's own fields in its source, by field."""
     body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(record))).body[0]
     assert isinstance(body, ast.ClassDef)
     stated = {}

@@ -220,7 +220,8 @@ def _power(value: float) -> int:
 
 
 def _reads_well(power: int) -> bool:
-    """Whether a number of so many powers of ten does: 0.0032 and 12345 do, against 3.2·10⁻³."""
+    """True if a number of this order of magnitude reads well: 0.0032 and 12345 do, 3.2·10⁻³ does
+    not."""
     return -4 < power < 5
 
 

@@ -1,4 +1,4 @@
-"""What the commands print and write."""
+"""Printed and written output of the commands."""
 
 import math
 from collections import Counter
@@ -98,7 +98,8 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
 
 
 def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Those of all flights, and offsets of inputs that are not zero, the most significant ones."""
+    """Return the nuisances that all flights share, and offsets of inputs that are not zero, most
+    significant first."""
     # Others of a single flight ('flight/bias') are many and of interest to few: they stand in
     # fit.json and the report. An offset says that a stick's zero is not the log's.
     common = {n: e for n, e in nuisance.items() if "/" not in n}
@@ -130,7 +131,7 @@ def _print_handling(run: FitRun) -> None:
 
 
 def print_compatibility(result: Compatibility) -> None:
-    """Whether a log's sensors agree, and their errors, on standard output."""
+    """Print the agreement of a log's sensors and their errors on standard output."""
     tell(result.verdict)
     for found in result.doubts:
         tell(f"! {found.sentence}")

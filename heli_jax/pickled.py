@@ -11,7 +11,7 @@ import cloudpickle
 
 
 def by_value(self: Any) -> tuple[Any, ...]:
-    """What `__reduce__` answers: the class with the object, both by value.
+    """Return `__reduce__`'s answer: the class with the object, both by value.
 
     Args:
         self: a named tuple, or an object whose fields are its `__dict__`.

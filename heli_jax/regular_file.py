@@ -90,8 +90,8 @@ def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
 
 
 def in_the_way(path: str | Path) -> str | None:
-    """What stands in a place where a file is to be written, in words; None where a regular file
-    does or nothing, so that it can be replaced."""
+    """Return, in words, what prevents a file from being written at a place; None if nothing
+    does."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -100,7 +100,7 @@ def in_the_way(path: str | Path) -> str | None:
 
 
 def kind_of(mode: int) -> str:
-    """What a file is that is no regular one, in words, from its `st_mode`."""
+    """Return the kind of a file that is not regular, in words, from its `st_mode`."""
     return next((words for is_it, words in _KINDS if is_it(mode)), "no regular file")
 
 

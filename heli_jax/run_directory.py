@@ -185,5 +185,5 @@ def remove_unfinished() -> None:
 
 
 def written() -> tuple[Path, ...]:
-    """What this process has written as a whole."""
+    """Return the directories that this process has completed."""
     return tuple(_finished)

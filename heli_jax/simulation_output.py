@@ -1,5 +1,4 @@
-"""What `simulate`, `sweep` and studies print and write: without the estimation, which they need not
-load."""
+"""Output of `simulate`, `sweep` and studies, which need no estimation."""
 
 import json
 import os
@@ -193,7 +192,7 @@ def _measured(one: Any, parameter: str) -> str:
 
 
 def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
-    """What lies between the fits beside what each of them claims."""
+    """Print the scatter between the fits beside the sd that each of them claims."""
     rows = []
     arrived = flat["status"].to_numpy() != "not-converged"
     for i, parameter in enumerate(parameters):

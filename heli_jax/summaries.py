@@ -1,5 +1,5 @@
-"""How flights, problems, fits, runs and vehicles show themselves: as text in a session, as a table
-in a notebook.
+"""Summaries of flights, problems, fits, runs and vehicles: text in a session, a table in a
+notebook.
 
 Each `of_...` function makes a `Summary` of one object; `as_text` and `as_html` lay it out. The
 classes call these from `__repr__` and `_repr_html_`. Since they import this module, it imports
@@ -22,7 +22,7 @@ type Row = tuple[str, ...]
 
 # Between objects and their layout, so that text and HTML cannot differ in what they show.
 class Summary(NamedTuple):
-    """What is shown of an object."""
+    """Content of a summary."""
 
     title: str
     head: Row = ()
@@ -75,7 +75,7 @@ def of_flight(flight: Any) -> Summary:
 
 
 def of_problem(problem: Any) -> Summary:
-    """What is free, with bounds and priors, and which flights are fitted."""
+    """Summarise the free parameters with bounds and priors, and the flights that are fitted."""
     # As stated, not as transformed: the search may be in logarithms.
     rows = []
     for name, free in problem.free.items():
@@ -205,7 +205,7 @@ def of_vehicle(vehicle: Any) -> Summary:
 
 
 def _concrete(values: Iterable[Any]) -> bool:
-    """Whether all are numbers that can be read now."""
+    """True if all are numbers and not traced by JAX."""
     try:
         for value in values:
             np.asarray(value, dtype=float)

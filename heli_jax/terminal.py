@@ -1,4 +1,4 @@
-"""What commands print: sentences and tables, and on standard error how far long work is.
+"""Terminal output: sentences and tables, and the progress of long work on standard error.
 
 No number is ever cut off or in two, and no name of a log, a file or a configuration reaches the
 terminal with what it would obey.

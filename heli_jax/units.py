@@ -159,7 +159,7 @@ _FROM_ANOTHER_ZERO = {
 
 
 def _unknown(unit: str, text: str) -> str:
-    """What to say of a unit that cannot be read: the name that is wrong, and what is near it."""
+    """Return a sentence on a unit that cannot be read, with the names that are near it."""
     if text in _FROM_ANOTHER_ZERO:
         remedy = _FROM_ANOTHER_ZERO[text]
         return f"unit {text!r} counts from another zero than K; of a signal state {remedy}"
@@ -205,7 +205,7 @@ def factor(unit: str, si: str) -> float:
 
 
 def fits(unit: str, si: str) -> bool:
-    """Whether `factor` turns one into the other."""
+    """True if `factor` converts one into the other."""
     try:
         factor(unit, si)
     except ValueError:
@@ -256,7 +256,7 @@ def base_of(unit: str) -> dict[str, int]:
 
 
 def is_unit(unit: str) -> bool:
-    """Whether a text is a unit of any kind."""
+    """True if a text is a unit."""
     try:
         _parse(unit)
     except ValueError:
@@ -290,12 +290,12 @@ def _shortest(exponents: Mapping[str, int]) -> dict[str, int]:
 
 
 def is_plain(unit: str) -> bool:
-    """Whether `unit` is a plain ratio: `1`, `%`, `stick`."""
+    """True if `unit` is a plain ratio: `1`, `%`, `stick`."""
     return not dict(_parse(unit).dimensionality)
 
 
 def is_time(unit: str) -> bool:
-    """Whether a text is a unit of time: `s`, `us`."""
+    """True if a text is a unit of time: `s`, `us`."""
     return is_unit(unit) and _parse(unit).dimensionality == _parse("s").dimensionality
 
 

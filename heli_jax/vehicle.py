@@ -129,14 +129,14 @@ _MAY_BE_ZERO = {
 
 
 def of_helicopter(record: type) -> bool:
-    """Whether a class of parameters has all of Helicopter's, as that of a disturbed model has."""
+    """True if a class of parameters has all of Helicopter's, as that of a disturbed model has."""
     return set(naming.names(Helicopter)) <= set(naming.names(record))
 
 
 def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, ...]]]:
-    """What could be wrong with a helicopter's constants: whether it is, and the end of a sentence
-    with the numbers for it. From numbers or arrays (k,) by name; a name that is missing is not
-    checked, and a value that is not a number passes."""
+    """Return the rules for a helicopter's constants: whether each is broken, and the end of its
+    sentence. Values are numbers or arrays (k,) by name; a name that is missing is not checked, and
+    a value that is not a number passes."""
     for name, value in params.items():
         if name in naming.names(Helicopter) and name not in _MAY_BE_NEGATIVE:
             zero = name in _MAY_BE_ZERO
@@ -154,12 +154,12 @@ def _reasons(params: Mapping[str, Any]) -> Iterator[tuple[Any, str, tuple[Any, .
 
 
 def impossible(params: Mapping[str, float]) -> str | None:
-    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can."""
+    """Return the end of a sentence on constants that are impossible; None if all are possible."""
     return next((words.format(*of) for is_so, words, of in _reasons(params) if is_so), None)
 
 
 def possible(params: Mapping[str, Any]) -> np.ndarray:
-    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name."""
+    """Return which helicopters are possible (k,), from arrays (k,) or numbers by name."""
     # For a batch of a sweep: what cannot be is a status there, not an error.
     values = {n: np.asarray(v) for n, v in params.items()}
     fine = np.asarray(True)
@@ -197,7 +197,7 @@ def load_vehicle(path: str | Path, params: type = Helicopter) -> Any:
 def read_vehicle(
     path: str | Path, params: type = Helicopter, may_lack: Collection[str] = ()
 ) -> Vehicle:
-    """As `load_vehicle`, with each constant's unit and source beside the parameters.
+    """Read a vehicle as `load_vehicle` does, with each constant's unit and source.
 
     Args:
         may_lack: constants that may be missing, and are NaN then.

@@ -18,7 +18,7 @@ _PACKAGES = (
 
 
 def version() -> str:
-    """That of heli_jax, as installed."""
+    """Return the installed version of heli_jax."""
     return importlib.metadata.version("heli_jax")
 
 

@@ -17,7 +17,6 @@ from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
 from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
-from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, located, require_kind
 from heli_jax.finding import Finding, note, once
 from heli_jax.identification.equation_error.rls import Baseline, baseline
@@ -29,7 +28,6 @@ from heli_jax.identification.select import (
     MethodComparison,
     choose,
     compare_methods,
-    with_likelier_hold,
 )
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.report import files
@@ -184,9 +182,12 @@ def _fit_run(
             if finding.severity == "refuse":
                 raise ValueError(finding.sentence)
         with stage("fit"):
-            fitted = _fitted(problem, options, progress)
-            problem, fitted = with_likelier_hold(
-                problem, fitted, lambda held: _fitted(held, options, progress)
+            fitted = fit(
+                problem,
+                starts=options.starts,
+                seed=options.seed,
+                max_steps=options.max_steps,
+                progress=progress,
             )
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
@@ -202,18 +203,8 @@ def _fit_run(
     return FitRun(config, problem, fitted, rls, further, directory=kept, began=began)
 
 
-def _fitted(problem: Problem, options: FitConfig, progress: Say) -> Fit:
-    return fit(
-        problem,
-        starts=options.starts,
-        seed=options.seed,
-        max_steps=options.max_steps,
-        progress=progress,
-    )
-
-
 def _long_intervals(config: Experiment) -> bool:
-    """Whether intervals are asked for that take longer than the fit."""
+    """True if intervals are asked for that take longer than the fit."""
     options = config.config.fit
     assert options is not None
     methods = options.intervals
@@ -234,7 +225,7 @@ def _keep(run: FitRun, out: Path, progress: Say) -> Path | None:
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
-    """What a configuration's flights can determine, before any fit.
+    """Judge what a configuration's flights can determine, before any fit.
 
     Args:
         config: of `load_config`, or the path of a configuration.
@@ -255,8 +246,7 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 def reading_notes(problem: Problem) -> list[Finding]:
     """Notes of the logs' readers, and on the origin of starts that were found."""
     guess = problem.first_guess
-    begun = guess.sentences if guess else ()
-    return once((*log_notes(problem), *(note("search.first-guess", words) for words in begun)))
+    return once((*log_notes(problem), *(guess.findings if guess else ())))
 
 
 def log_notes(problem: Problem) -> list[Finding]:

@@ -74,7 +74,7 @@ _KINDS: dict[type, str] = {str: "text", list: "a list", int: "a number", float: 
 
 
 def parse_mapping(text: str, where: str) -> dict[str, Any]:
-    """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
+    """Parse a text as `read_mapping` does; `where` stands for the file's name."""
     value = parse_value(text, where)
     if not isinstance(value, dict):
         kind = "nothing" if value is None else _KINDS.get(type(value), "something else")

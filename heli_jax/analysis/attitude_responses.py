@@ -1,4 +1,4 @@
-"""Which responses of a model handling qualities are read off, and those of flights."""
+"""Responses of a model that handling qualities are read from, and those of flights."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -46,7 +46,8 @@ class HandlingPair(NamedTuple):
 
 
 class Handling(NamedTuple):
-    """What model and data say of one pair; in words why one says nothing, None where not asked."""
+    """Handling qualities of one pair by model and data; text says why one is missing, None if not
+    asked."""
 
     pair: HandlingPair
     model: HandlingQualities | str | None

@@ -19,24 +19,18 @@ from heli_jax.analysis.responses import (
     Z95,
     TooFewAveragesError,
     averaged,
-    combined,
     independent_shares,
     responses,
     student95,
-    weights_by_output,
     without_ends,
 )
 from heli_jax.analysis.spectra import (
     HIGHEST,
-    LONGEST,
     OVERLAP,
-    OWN,
-    CrossSpectra,
+    chosen,
     cross_spectra,
-    leakage,
+    is_own,
     octave_mean,
-    one_rate,
-    require_window,
     segment_transforms,
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
@@ -111,8 +105,6 @@ class Pair(NamedTuple):
     """of its real and of its imaginary part"""
     coherence: np.ndarray
     """partial: what the other inputs explain is taken out; of the flights in which it moves"""
-    picture: np.ndarray
-    """H of the composite of several windows, for looking; NaN where there is none"""
     half95: float = Z95
     """half of a 95 % interval in sd: Student's t of the averages that there are"""
     added: np.ndarray | float = 0.0
@@ -162,17 +154,9 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has a part that is long enough.
     """
-    dt = one_rate(flights)
     flights = [without_jumps(f) for f in flights]
-    longest = max(f.duration for f in flights)
-    window = settings.window or min(longest / 5.0, LONGEST)
-    require_window(window, longest + dt)
-    inputs = [n for n in flights[0].inputs if any(_moves(f.inputs[n]) for f in flights)]
-    if not inputs:
-        raise ValueError(
-            "no input moves, and a response is one to an input; a free decay is fitted by "
-            "output-error or frequency-error"
-        )
+    dt, window, moving = chosen(flights, settings.window)
+    inputs = list(moving)
     step = {n: max(f.logged_step(n, "input") for f in flights) for n in inputs}
     omega = _frequencies(settings, window, dt, max(dt, min(step.values())))
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
@@ -331,10 +315,8 @@ def _outputs(
     assert estimate.ends is not None
     added, sd = without_ends(omega, H, sd, estimate.ends, window)
     H = H - added
-    several = several_windows(records, dt, spectra, window, m)
-    averages = float(estimate.averages[0])
+    averages = estimate.averages
     half95 = float(student95(np.asarray(2.0 * (averages - m))))
-    pictures = pictures_of(several, omega, (u, y, by))
     result = {}
     for i, name in enumerate(outputs):
         pairs = {
@@ -342,7 +324,6 @@ def _outputs(
                 H[:, i, j],
                 sd[:, i, j],
                 coherence[:, i, j],
-                pictures[:, i, j],
                 half95,
                 added[:, i, j],
             )
@@ -361,10 +342,12 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
     length = round(window / dt)
     power = 0.0
     for record in records:
-        lines, transforms = segment_transforms(record, dt, length)
-        power = power + np.sum(np.abs(transforms) ** 2, axis=1)
-    own = np.stack([OWN * leakage(S) < S for S in np.transpose(power)])
-    return own[:, np.clip(np.round(omega / lines[1]).astype(int), 0, own.shape[1] - 1)]
+        of_record = segment_transforms(record, dt, length)
+        power = power + np.sum(np.abs(of_record.X) ** 2, axis=1)
+    own = np.stack([is_own(S) for S in np.transpose(power)])
+    return own[
+        :, np.clip(np.round(omega * dt * length / (2.0 * np.pi)).astype(int), 0, own.shape[1] - 1)
+    ]
 
 
 def steady_sd(
@@ -512,59 +495,6 @@ def coherence_where_moving(
     share = np.where(used > 0, used, np.sum(windows)) / np.sum(windows)
     with np.errstate(all="ignore"):
         return coherence / (coherence + share * (1.0 - coherence))
-
-
-_LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
-"""of the windows of a composite, in that one's length"""
-
-
-def several_windows(
-    records: Sequence[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
-) -> list[CrossSpectra]:
-    """Spectra of several windows beside those of one, as far as the records have three of each.
-
-    Args:
-        records: signals (c, N) of each part.
-        dt: between two samples [s].
-    """
-    longest = max(r.shape[1] for r in records) * dt
-    several: list[CrossSpectra] = []
-    for length in _LENGTHS:
-        # Three windows are the least that a coherence can be taken from.
-        if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
-            continue
-        own = length == 1.0
-        spectra = one if own else cross_spectra(records, dt, one.omega, length * window, OVERLAP)
-        if np.min(spectra.averages) >= m + 1:
-            several.append(spectra)
-    return several
-
-
-def pictures_of(
-    several: list[CrossSpectra],
-    omega: np.ndarray,
-    which: tuple[list[int], list[int], list[int] | None],
-) -> np.ndarray:
-    """H (k, l, m) of several windows together; NaN where the record has no two of them.
-
-    Args:
-        omega: (k,) [rad/s]
-        which: places of the m inputs, of the l outputs and of the instruments.
-    """
-    u, outputs, by = which
-    made = np.full((omega.size, len(outputs), len(u)), np.nan, complex)
-    if len(several) < 2:
-        return made
-    weights = weights_by_output(several, u, outputs)
-    for i, y in enumerate(outputs):
-        # Without the other outputs, of which each has its own weights.
-        kept = [*dict.fromkeys([*u, *(by or u)]), y]
-        place = {signal: j for j, signal in enumerate(kept)}
-        own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
-        us, zs = [place[k] for k in u], None if by is None else [place[k] for k in by]
-        both = combined(own, weights[:, :, i])
-        made[:, i] = responses(both, us, [place[y]], zs).H[:, 0]
-    return made
 
 
 _BLOCK = 4096

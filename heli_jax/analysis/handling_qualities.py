@@ -71,13 +71,13 @@ class Number(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether it has an interval: that of a model whose parameters the data do not determine,
-        or whose fit stopped on its way, has none and is no result."""
+        """True if it has an interval: a model whose parameters the data do not determine, or whose
+        fit did not converge, has none."""
         return self.sd >= 0.0
 
 
 class HandlingQualities(NamedTuple):
-    """What a response says."""
+    """Handling qualities of a response."""
 
     kind: Kind
     numbers: dict[str, Number]
@@ -166,8 +166,8 @@ class _Response:
     def falls(
         self, quantity: str, level: float, below: float | None = None, first: bool = False
     ) -> float | None:
-        """Where gain or phase falls through a level: the highest such frequency, or the first one;
-        None where it does not within the band, or not below a frequency.
+        """Return the highest frequency (or the first) at which gain or phase falls below a level;
+        None if it does not within the band, or not below `below`.
 
         Args:
             quantity: log_gain or phase.
@@ -370,7 +370,7 @@ def _loop(response: _Response, numbers: dict[str, Number], sentences: list[str])
 
 
 def _low_gain(response: _Response, crossover: float, sentences: list[str]) -> None:
-    """How far the gain of a loop may fall that holds an unstable machine."""
+    """Return how far the gain of a loop around an unstable vehicle may fall."""
     below = response.grid < crossover
     values = response.phase[below] + np.pi
     upward = np.flatnonzero((values[:-1] <= 0) & (values[1:] > 0))

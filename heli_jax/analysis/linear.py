@@ -1,4 +1,4 @@
-"""What a model is like near a point: named matrices, modes, frequency response."""
+"""Linearised models: named matrices, modes, frequency response."""
 
 from typing import Any, NamedTuple
 

@@ -27,7 +27,7 @@ _EPS = float(np.finfo(np.float64).eps)
 
 
 class Margins(NamedTuple):
-    """How far loops are from instability; NaN where a loop is not stable as it is."""
+    """Margins of loops to instability; NaN if a loop is not stable as it is."""
 
     gain: np.ndarray
     """(batch,) [dB]: the smallest change of the loop's gain, up or down, that takes a pole of the
@@ -155,7 +155,8 @@ def _eigenvalues(A: np.ndarray) -> _Complex:
 
 
 def _stable(before: _Complex, after: _Complex, size: np.ndarray) -> np.ndarray:
-    """Whether the eigenvalues `after` (m, n) are stable, those apart that were there `before`."""
+    """True if the eigenvalues `after` (m, n) are stable, apart from those that were there
+    `before`."""
     n = after.shape[1]
     limit = _SAME * size[:, None]
     # As many there before as now, and no faster growing than the limit.
@@ -349,7 +350,7 @@ def _roots(
     f2: np.ndarray,
     which: int,
 ) -> np.ndarray:
-    """Where test `which` is zero, between x1 and x2, logs of frequencies, all (c,).
+    """Return the zeros of test `which` between x1 and x2, logarithms of frequencies, all (c,).
 
     Chandrupatla's method for all at once: inverse quadratic interpolation where it can be
     trusted, bisection otherwise.

@@ -1,4 +1,4 @@
-"""Where a model that is not linear is linearised for a record: a trim, or the record's mean.
+"""Operating points: the trim or the record's mean about which a nonlinear model is linearised.
 
 The matrices of a helicopter at zero throttle say nothing of one that flies: its rotor stands still.
 """

@@ -32,7 +32,7 @@ where 0.01 mm does the same, within 0.25."""
 
 
 class Pilot(NamedTuple):
-    """How far each stick moves for each state's distance from the trim."""
+    """Stick deflection by the distance of each state from trim."""
 
     gains: dict[str, dict[str, Float[Array, ""]]]
     """by stick and state"""

@@ -1,4 +1,4 @@
-"""How a model's frequency responses agree with measured ones: chi-squared, and Tischler's J."""
+"""Agreement of a model's frequency responses with measured ones: chi-squared, and Tischler's J."""
 
 from typing import NamedTuple
 
@@ -82,7 +82,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What takes no part."""
+        """Sentences on the responses that are not compared."""
         words = list(self.notes)
         left = [f"{p.input} to {p.output}" for p in self.pairs if not p.lines]
         if left:
@@ -98,7 +98,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def misfit(self) -> str:
-        """What chi-squared says where it lies outside of its interval; else empty."""
+        """Sentence if chi-squared lies outside its interval; else empty."""
         if self.chi_squared < self.lower95:
             chance = "chance makes as little in one of forty; or "
             return (
@@ -175,8 +175,7 @@ def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.
 
 
 def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
-    """What chi-squared over its degrees of freedom lies in with 95 % probability, where the noise
-    was estimated from what no response explains: Fisher's F.
-    """
+    """Return the 95 % interval of chi-squared over its degrees of freedom if the noise was
+    estimated from the residual of the responses: Fisher's F."""
     low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))
     return float(low), float(high)

@@ -56,7 +56,7 @@ class Point(NamedTuple):
 
     @property
     def gain_sd(self) -> Float[np.ndarray, " k"]:
-        """Of the logarithm of the gain."""
+        """Standard deviation of the logarithm of the gain."""
         return np.linalg.norm(self.gain_gradient, axis=1)
 
     @property
@@ -173,7 +173,8 @@ def measured_curve(
 
 
 def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
-    """Where a response (k,) is off its own local fits by what is no random error, in words."""
+    """Return, in words, where a response (k,) differs from its own local fits by more than random
+    error."""
     far = (off > _SHARP) & (off > _SURELY * relative)
     both = np.flatnonzero(far[:-1] & far[1:])
     if not both.size:
@@ -187,7 +188,7 @@ def _too_sharp(w: np.ndarray, off: np.ndarray, relative: np.ndarray) -> str:
 
 
 def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Which bins (k,) lie more than a right angle off the phase of those around them."""
+    """Return which bins (k,) lie more than a right angle off the phase of their neighbours."""
     relative = sd / np.abs(H)
     # By the errors, but not so that one bin has it all: its own may be too small by chance.
     weights = 1.0 / (relative**2 + np.median(relative) ** 2)
@@ -288,7 +289,8 @@ def _with_slopes(
 
 
 class Acting(NamedTuple):
-    """What an input does before it acts on the model, and the derivatives by q parameters."""
+    """Transfer function from an input to its action on the model, and the derivatives by q
+    parameters."""
 
     gain: float = 1.0
     late: float = 0.0
@@ -357,7 +359,7 @@ _PHASE = (
 
 
 class Envelope(NamedTuple):
-    """Of measured over modelled, lower and upper limits (k,)."""
+    """Lower and upper limits of measured over modelled (k,)."""
 
     gain_db: tuple[np.ndarray, np.ndarray]
     phase_deg: tuple[np.ndarray, np.ndarray]

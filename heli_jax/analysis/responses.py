@@ -16,7 +16,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
-from heli_jax.analysis.spectra import CrossSpectra, octave_mean
+from heli_jax.analysis.spectra import Spectra, octave_mean
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
@@ -49,14 +49,14 @@ class Responses(NamedTuple):
     """(k, l) of an output's power, the part that all inputs explain together"""
     noise: np.ndarray
     """(k, l) density of what they leave, per Hz"""
-    averages: np.ndarray
-    """(k,) independent ones"""
+    averages: float
+    """independent ones"""
     ends: np.ndarray | None = None
     """(k, m, m) what of each input in the window's slope counts as each input [1/s]"""
 
 
 def responses(
-    spectra: CrossSpectra,
+    spectra: Spectra,
     inputs: Sequence[int],
     outputs: Sequence[int],
     instruments: Sequence[int] | None = None,
@@ -76,14 +76,14 @@ def responses(
     """
     u, y = list(inputs), list(outputs)
     z = u if instruments is None else list(instruments)
-    m, S, n = len(u), spectra.S, np.broadcast_to(spectra.averages, spectra.omega.shape)[:, None]
+    m, S, n = len(u), spectra.density, spectra.averages
     if len(z) != m:
         raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
-    if np.min(n) < m + 1:
+    if n < m + 1:
         many = "1 input" if m == 1 else f"{m} inputs"
         raise TooFewAveragesError(
             f"expected at least {m + 1} independent averages for {many}, got "
-            f"{np.min(n):.2f}: a longer record, or a shorter window"
+            f"{n:.2f}: a longer record, or a shorter window"
         )
     # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
     P = inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
@@ -97,14 +97,17 @@ def responses(
         coherence = np.abs(H) ** 2 / (np.abs(H) ** 2 + error)
         multiple = np.clip(1.0 - left / power, 0.0, 1.0)
     # Each input takes one of the averages for its own response.
-    sd = np.sqrt(0.5 * error / (n - m)[:, :, None])
+    sd = np.sqrt(0.5 * error / (n - m))
     if instruments is not None:
-        half95 = student95(2.0 * (n - m))
+        half95 = float(student95(np.asarray(2.0 * (n - m))))
         sd = sd_of_ratio(spectra.omega, S, (u, y, z), H, left, spread / (n - m), half95)
         H = np.where(np.isfinite(sd), H, np.nan)
     noise = left * n / (n - m)
-    ends = None if spectra.slopes is None else P @ spectra.slopes[:, z][:, :, u]
-    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0], ends)
+    ends = None
+    if spectra.steep is not None:
+        Z = spectra.X[:, :, z]
+        ends = P @ (np.conj(np.swapaxes(Z, 1, 2)) @ spectra.steep[:, :, u]) / Z.shape[1]
+    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n, ends)
 
 
 def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -132,48 +135,6 @@ def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarra
     return np.maximum(power - 2.0 * crossed + explained, _ROUNDING * power)
 
 
-def weights_by_output(
-    several: Sequence[CrossSpectra], inputs: Sequence[int], outputs: Sequence[int]
-) -> Float[np.ndarray, "w k l"]:
-    """What each length of segments counts for in one picture of several, output by output: long
-    ones for low frequencies, short ones for high, each by the fourth power of its random error.
-
-    Args:
-        several: of the same signals and frequencies, of segments of different length.
-        inputs: those whose responses decide, by their place among the signals.
-
-    Raises:
-        ValueError: the frequencies differ.
-
-    Source: Tischler and Remple (2012), chapter 10, without its last search.
-    """
-    omega = several[0].omega
-    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
-        raise ValueError("several: expected the same frequencies in all")
-    estimates = [responses(s, inputs, outputs) for s in several]
-    with np.errstate(all="ignore"):
-        each = np.abs(np.stack([e.H / e.sd for e in estimates])) ** 2
-    seen = np.isfinite(each)
-    count = np.maximum(np.sum(seen, axis=3), 1)
-    information = np.sum(np.where(seen, each, 0.0), axis=3) / count
-    # Two periods within a segment are the least that a window resolves.
-    seconds = np.array([s.seconds for s in several])[:, None, None]
-    resolved = omega[:, None] >= 4.0 * np.pi / seconds * (1.0 - 1e-9)
-    return np.where(resolved, information, 1e-12 / seconds) ** 2
-
-
-def combined(several: Sequence[CrossSpectra], weights: Float[np.ndarray, "w k"]) -> CrossSpectra:
-    """One picture of several lengths of segments, their mean. It is for looking: no intervals are
-    to be taken from it, since the lengths share the record.
-    """
-    omega, total = several[0].omega, np.sum(weights, axis=0)
-    # Inputs that move as one have no response that could decide.
-    weights = np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / len(several))
-    S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
-    n = np.stack([np.broadcast_to(s.averages, omega.shape) for s in several])
-    return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
-
-
 # Intervals of responses by instrument.
 #
 # These are ratios of two numbers with errors. With w_j the combination of the instruments that goes
@@ -195,7 +156,7 @@ def sd_of_ratio(
     H: Complex[np.ndarray, "k l m"],
     left: Float[np.ndarray, "k l"],
     spread: Float[np.ndarray, "k m"],
-    half95: Float[np.ndarray, "k 1"],
+    half95: float,
 ) -> Float[np.ndarray, "k l m"]:
     """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
     NaN where these have no end.
@@ -227,7 +188,7 @@ def sd_of_ratio(
         # c S_vv again, with the octave's share of the input that instruments explain.
         likely = 0.5 * Z95**2 * spread
         strong = direct | (likely * explained * (1.0 - around) < _STRONG * around)
-        return np.where((room > 0) & strong[:, None, :], reach / half95[:, None], np.nan)
+        return np.where((room > 0) & strong[:, None, :], reach / half95, np.nan)
 
 
 # Variances from few averages.

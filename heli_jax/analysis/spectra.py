@@ -1,7 +1,7 @@
 """Spectra of signals in Hann windows, and flights in such windows.
 
 Segments of a record in Hann windows are transformed to the frequencies asked for (any band, any
-resolution), and their cross-spectra averaged over segments and flights.
+resolution); cross-spectra are means over segments and flights.
 
 Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Welch (1967), IEEE Trans. Audio
 and Electroacoustics 15(2); Harris (1978), Proceedings of the IEEE 66(1).
@@ -26,8 +26,6 @@ OVERLAP = 2.0 / 3.0
 all times: no sample counts for more than another but at the ends of a record, and what they cut off
 of answers that end outside of them, in proportion to the square's slope, cancels; of windows that
 overlap by half it does not"""
-_FINE = 64
-"""samples whose turns are sines, each times those of every so many"""
 LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
 HIGHEST = 0.4
@@ -53,12 +51,18 @@ white noise in one window with those in all others"""
 
 
 class Spectra(NamedTuple):
-    """Signals in windows at k frequencies; squares are one-sided densities per Hz."""
+    """Fourier transforms of c signals in W Hann windows at k frequencies."""
 
     omega: np.ndarray
     """(k,) [rad/s]"""
     X: np.ndarray
-    """(k, W, c) Fourier transforms of c signals in W windows"""
+    """(k, W, c), scaled so that squares are one-sided densities per Hz"""
+    averages: float
+    """independent averages that the windows make: overlapping ones count for less than one"""
+    seconds: float
+    """length of a window"""
+    steep: np.ndarray | None = None
+    """(k, W, m) the first m signals in the window's slope [1/s]"""
 
     @property
     def density(self) -> Complex[np.ndarray, "k c c"]:
@@ -86,8 +90,10 @@ def segment_transforms(signals: Float[np.ndarray, "c N"], dt: float, length: int
     # Zero frequency and Nyquist's, which an odd length has not, have no twin of negative frequency.
     twins = np.full(len(X), 2.0)
     twins[[0] if length % 2 else [0, -1]] = 1.0
+    X = X * np.sqrt(twins * dt / np.sum(window**2))[:, None, None]
     omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)
-    return Spectra(omega, X * np.sqrt(twins * dt / np.sum(window**2))[:, None, None])
+    averages = _independent(window, length - length // 2, X.shape[1])
+    return Spectra(omega, X, averages, length * dt)
 
 
 def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -164,20 +170,9 @@ def leakage(S: np.ndarray) -> np.ndarray:
     return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
 
 
-class CrossSpectra(NamedTuple):
-    """Spectral densities of several signals with one another."""
-
-    omega: np.ndarray
-    """(k,) [rad/s]"""
-    S: np.ndarray
-    """(k, c, c) one-sided densities per Hz: S[:, a, b] is the mean of conj(X_a) X_b"""
-    averages: float | np.ndarray
-    """independent averages that each is made of, a number or (k,): overlapping segments count for
-    less than one"""
-    seconds: float
-    """length of a segment"""
-    slopes: np.ndarray | None = None
-    """(k, c, m) those of the signals with the first m of them in the window's slope [1/s]"""
+def is_own(S: np.ndarray) -> np.ndarray:
+    """True (k,) where a density is the signal's own, and not what sidelobes bring."""
+    return OWN * leakage(S) < S
 
 
 def cross_spectra(
@@ -187,8 +182,8 @@ def cross_spectra(
     seconds: float,
     overlap: float = 0.5,
     sloped: int = 0,
-) -> CrossSpectra:
-    """Averages over Hann windows of all records, each segment less its mean.
+) -> Spectra:
+    """Hann windows of all records, each segment less its mean, at any frequencies.
 
     Args:
         records: the same c signals in each, (c, N) with any N; no sample missing.
@@ -204,22 +199,29 @@ def cross_spectra(
     length = round(seconds / dt)
     step = max(round(length * (1.0 - overlap)), 1)
     _require(records, dt, omega, length)
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
-    counts = [max(1 + (r.shape[1] - length) // step, 0) for r in records]
-    total, averages = np.zeros(1), 0.0
-    for record, count in zip(records, counts, strict=True):
-        if count:
-            mean = _products(np.asarray(record, np.float64), window, dt, omega, step, sloped)
-            total, averages = (
-                total + count * mean,
-                averages + _independent(window, step, count),
-            )
-    # One-sided: each frequency stands for its negative twin as well.
-    density = 2.0 * dt / np.sum(window**2)
-    S = density / sum(counts) * total
-    c = records[0].shape[0]
-    slopes = S[:, :, c:] if sloped else None
-    return CrossSpectra(np.asarray(omega), S[:, :, :c], averages, length * dt, slopes)
+    window, t = hann(length), np.arange(length)
+    # Of the window, a cosine, per second.
+    slope = np.pi / (length * dt) * np.sin(2.0 * np.pi * t / length)
+    turns = np.exp(-1j * np.outer(t, omega * dt)) * np.sqrt(2.0 * dt / np.sum(window**2))
+
+    def transforms(record: Float[np.ndarray, "c N"], window: np.ndarray) -> np.ndarray:
+        segments = np.lib.stride_tricks.sliding_window_view(record, length, axis=1)[:, ::step]
+        kernel = window[:, None] * turns
+        # Less its mean in place of each segment's. Two real products, of fewer operations.
+        kernel = kernel - kernel.mean(axis=0)
+        rows = segments.reshape(-1, length)
+        X = rows @ kernel.real + 1j * (rows @ kernel.imag)
+        return X.reshape(*segments.shape[:2], -1).transpose(2, 1, 0)
+
+    long = [np.asarray(r, np.float64) for r in records if r.shape[1] >= length]
+    # The bulk of the mean here: rounding would leave some of it in each segment.
+    long = [r - r.mean(axis=1, keepdims=True) for r in long]
+    X = np.concatenate([transforms(r, window) for r in long], axis=1)
+    steep = [transforms(r[:sloped], slope) for r in long] if sloped else None
+    averages = sum(_independent(window, step, 1 + (r.shape[1] - length) // step) for r in long)
+    return Spectra(
+        np.asarray(omega), X, averages, length * dt, steep and np.concatenate(steep, axis=1)
+    )
 
 
 def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
@@ -236,73 +238,6 @@ def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length
             f"omega: expected frequencies between 0 and the Nyquist frequency, "
             f"{np.pi / dt:.6g} rad/s; got {np.min(omega):.6g} to {np.max(omega):.6g} rad/s"
         )
-
-
-# In NumPy: there is a program to compile for each length of the windows, and it is called once.
-def _products(
-    record: Float[np.ndarray, "c N"],
-    window: Float[np.ndarray, " n"],
-    dt: float,
-    omega: Float[np.ndarray, " k"],
-    step: int,
-    sloped: int,
-) -> Complex[np.ndarray, "k c both"]:
-    """Mean over the segments of conj(X_a) X_b, then of the first signals in the window's slope."""
-    c, n = record.shape[0], window.shape[0]
-    count = 1 + (record.shape[1] - n) // step
-    # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
-    record = record - record.mean(axis=1, keepdims=True)
-    segments = np.lib.stride_tricks.sliding_window_view(record, n, axis=1)[:, ::step]
-    even, odd, means = (part.reshape(c * count, -1) for part in _folded(segments))
-    # Products of matrices: for the few hundred frequencies of a band faster than fast Fourier
-    # transforms of twice the length, and they may lie anywhere.
-    late = np.arange((n + 1) // 2, n)
-    cosines, sines = _turns(late.size, omega * dt, (n + 1) // 2 - 0.5 * n)
-    ones = _folded(np.ones(n))[0]
-    w = window[late, None]
-    C = w * cosines
-    X = (even @ C - means * (ones @ C) - 1j * (odd @ (w * sines))).reshape(c, count, -1)
-    both, rows = [X], sloped * count
-    if sloped:
-        # Of the window itself, a cosine, per second.
-        v = (np.pi / (n * dt) * np.sin(2.0 * np.pi * late / n))[:, None]
-        S = v * sines
-        steep = odd[:rows] @ (v * cosines) - 1j * (even[:rows] @ S - means[:rows] * (ones @ S))
-        both.append(steep.reshape(sloped, count, -1))
-    Y = np.concatenate(both, axis=0)
-    return np.conj(X).transpose(2, 0, 1) @ Y.transpose(2, 1, 0) / count
-
-
-def _folded(
-    segments: Float[np.ndarray, "... n"],
-) -> tuple[
-    Float[np.ndarray, "... half"], Float[np.ndarray, "... half"], Float[np.ndarray, "... 1"]
-]:
-    """Even and odd part of segments about their middle, twice each, and their means.
-
-    A window is even about its middle and its slope odd, so that cosines go with one part and sines
-    with the other: half of the products. Of the first sample neither makes anything.
-    """
-    n = segments.shape[-1]
-    late, early = segments[..., (n + 1) // 2 :], segments[..., n // 2 : 0 : -1]
-    even, odd = late + early, late - early
-    if n % 2 == 0:
-        # The middle itself, once.
-        even[..., 0] *= 0.5
-    return even, odd, ((even.sum(axis=-1) + segments[..., 0]) / n)[..., None]
-
-
-def _turns(
-    count: int, angle: Float[np.ndarray, " k"], first: float
-) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
-    """Cosines and sines of m angle, m from the first on in steps of one, by products of few: so
-    many would take as long as the transform."""
-    coarse = np.outer(first + _FINE * np.arange(-(-count // _FINE)), angle)[:, None]
-    fine = np.outer(np.arange(_FINE), angle)[None]
-    (c, s), (C, S) = ((np.cos(v), np.sin(v)) for v in (fine, coarse))
-    k = angle.shape[0]
-    turns = C * c - S * s, S * c + C * s
-    return turns[0].reshape(-1, k)[:count], turns[1].reshape(-1, k)[:count]
 
 
 def _independent(window: np.ndarray, step: int, count: int) -> float:
@@ -345,34 +280,45 @@ class ResponseOptions(NamedTuple):
     """those that take part; all where none is named"""
 
 
-def require_window(window: float, longest: float) -> None:
-    """Refuse windows that no record holds.
+class Choice(NamedTuple):
+    """How flights are cut into windows, and what moves in them."""
+
+    dt: float
+    """[s]"""
+    window: float
+    """length [s]"""
+    inputs: tuple[str, ...]
+    """those that move"""
+
+
+def chosen(flights: Sequence[Flight], window: float | None) -> Choice:
+    """Return the windows that responses of some flights are taken from.
 
     Args:
-        window: length [s]
-        longest: of the flights [s]
+        window: length [s]; None: a fifth of the longest flight, 30 s at most.
 
     Raises:
-        ValueError: the window is longer.
-    """
-    if window > longest * (1.0 + 1e-9):
-        raise ValueError(
-            f"window: the longest flight is {longest:.4g} s, too short for a window of "
-            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
-        )
-
-
-def one_rate(flights: Sequence[Flight]) -> float:
-    """The sample time [s] of flights that share it.
-
-    Raises:
-        ValueError: they do not.
+        ValueError: rates differ, no flight holds a window, or no input moves.
     """
     rates = sorted({round(1.0 / f.dt, 6) for f in flights})
     if len(rates) > 1:
         listed = ", ".join(f"{r:g}" for r in rates)
         raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return float(flights[0].dt)
+    dt = float(flights[0].dt)
+    longest = max(f.duration for f in flights) + dt
+    window = window or min(longest / 5.0, LONGEST)
+    if window > longest * (1.0 + 1e-9):
+        raise ValueError(
+            f"window: the longest flight is {longest:.4g} s, too short for a window of "
+            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
+        )
+    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
+    if not inputs:
+        raise ValueError(
+            "no input moves, and a response is one to an input; a free decay is fitted by "
+            "output-error or frequency-error"
+        )
+    return Choice(dt, window, inputs)
 
 
 class Windowed(NamedTuple):
@@ -494,19 +440,10 @@ def windowed(
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
             no output has windows enough.
     """
-    dt = one_rate(flights)
-    longest = max(f.duration for f in flights) + dt
-    seconds = options.window or min(longest / 5.0, LONGEST)
-    require_window(seconds, longest)
+    dt, seconds, inputs = chosen(flights, options.window)
     # Even, so that half of it is a number of samples.
     length = 2 * round(0.5 * seconds / dt)
     lines = _lines(options, length, dt)
-    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
-    if not inputs:
-        raise ValueError(
-            "no input moves, and a response is one to an input; a free decay is fitted by "
-            "output-error or frequency-error"
-        )
     instruments = tuple(
         n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
     )
@@ -544,7 +481,7 @@ class _Cut(NamedTuple):
         ]
         whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
         power = np.mean(np.abs(whole) ** 2, axis=0).T
-        own = [(OWN * leakage(S) < S)[self.lines] for S in power]
+        own = [is_own(S)[self.lines] for S in power]
         return whole[:, self.lines], np.stack(own, axis=1)
 
 

@@ -44,7 +44,7 @@ class Coefficient(NamedTuple):
 
     @property
     def determined(self) -> bool:
-        """Whether the response says anything of it."""
+        """True if the response determines it."""
         return bool(np.isfinite(self.sd))
 
 
@@ -66,8 +66,8 @@ class TransferFit(NamedTuple):
 
     @property
     def determined(self) -> bool:
-        """Whether the response says something of every coefficient of the denominator, and of one
-        of the numerator."""
+        """True if the response determines every coefficient of the denominator and one of the
+        numerator."""
         return all(c.determined for c in self.denominator) and any(
             c.determined for c in self.numerator
         )
@@ -83,7 +83,7 @@ class TransferFit(NamedTuple):
         return np.roots([c.value for c in self.numerator])
 
     def sampled(self, omega: Float[np.ndarray, " k"], hold: "Hold | None") -> np.ndarray:
-        """What a record of samples shows of it (k,), complex.
+        """Return its response as a sampled record shows it (k,), complex.
 
         Args:
             omega: (k,) [rad/s]
@@ -201,7 +201,7 @@ def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True)
 
 
 def _shares(m: Measured) -> np.ndarray:
-    """Of each frequency (k,) how much of an independent one it is."""
+    """Return by frequency (k,) the part of an independent frequency that it counts for."""
     sound = np.isfinite(m.H) & np.isfinite(m.sd) & (m.sd > 0)
     return np.where(sound, independent_shares(m.omega, m.seconds), 0.0)
 
@@ -361,7 +361,7 @@ def _result(
 
 
 def _deviations(J: np.ndarray) -> np.ndarray:
-    """Of each unknown; inf where the rows do not determine it."""
+    """Return the sd of each unknown; inf if the rows do not determine it."""
     size = np.linalg.norm(J, axis=0)
     if not (np.isfinite(J).all() and np.all(size > 0)):
         return np.full(J.shape[1], np.inf)

@@ -127,7 +127,7 @@ def equilibrium(
     wind: tuple[Any, Any, Any] = (0.0, 0.0, 0.0),
     power_off: bool = False,
 ) -> Trim:
-    """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
+    """Trim as `trim` does, from one start and without its errors: for jit, vmap and derivatives.
 
     Args:
         params: its constants, concrete or traced.
@@ -148,7 +148,7 @@ def _equilibrium(
     offset: Float[Array, " k"],
     power_off: bool,
 ) -> Trim:
-    """From the guess and half of `offset`, in the unknowns' sizes."""
+    """Solve from the guess and half of `offset`, in the unknowns' sizes."""
     names, rates = _require(model, power_off)
     dtype = offset.dtype
     # In units of their sizes: a rotor's speed is a thousand times a flapping angle.
@@ -217,8 +217,8 @@ def _along_the_ground(condition: Condition) -> dict[str, Any]:
 
 
 def steady_flight(model: Model) -> SteadyFlight | None:
-    """What trim solves for: as the model states it, or by the names of its states and inputs where
-    these are those of the helicopter models here; None where it cannot be trimmed."""
+    """Return the unknowns of trim: as the model states them, or by the names of its states and
+    inputs if these are those of the helicopter models here; None if it cannot be trimmed."""
     if model.steady_flight is not None:
         return model.steady_flight
     states, inputs = naming.names(model.State), naming.names(model.Inputs)
@@ -240,12 +240,12 @@ def steady_flight(model: Model) -> SteadyFlight | None:
 
 
 def is_full_nonlinear(model: Model) -> bool:
-    """Whether a model is the full nonlinear model of a helicopter, so that it can be trimmed."""
+    """True if a model is the full nonlinear model of a helicopter, which can be trimmed."""
     return of_helicopter(model.Params) and steady_flight(model) is not None
 
 
 def _require(model: Model, power_off: bool = False) -> SteadyFlight:
-    """What trim solves for.
+    """Return the unknowns of trim, or refuse the model.
 
     Raises:
         ValueError: the model is not the full nonlinear model of a helicopter, or without power it
@@ -271,7 +271,7 @@ def _require(model: Model, power_off: bool = False) -> SteadyFlight:
 
 
 def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
-    """Whether the rotor turns, the blades push upwards, and the machine is not on its back."""
+    """True if the rotor turns, the blades push upwards, and the helicopter is not inverted."""
     state, inputs = result.state, result.inputs
     # Absolute values and & in place of `and`: the same test serves numbers and batches of tracers.
     level = (abs(state.phi) < _UPRIGHT) & (abs(state.theta) < _UPRIGHT)

@@ -23,7 +23,7 @@ _LATEST = 1.0
 
 
 class Conversion(Section):
-    """Of the log's numbers, as in `signals`."""
+    """Conversion of the log's numbers, as in `signals`."""
 
     scale: Finite = 1.0
     offset: Finite = 0.0
@@ -31,12 +31,12 @@ class Conversion(Section):
 
     @property
     def words(self) -> str:
-        """As a configuration has it."""
+        """Text as in a configuration."""
         return f"{{scale: {self.scale:g}, offset: {self.offset:g}, invert: {self.invert}}}".lower()
 
 
 class SignalCorrection(Section):
-    """What one signal of a log showed: (1 + scale) truth + bias, late by the delay."""
+    """Correction of one signal of a log: (1 + scale) truth + bias, late by the delay."""
 
     of: str = ""
     """what it is, for the reader"""
@@ -103,7 +103,7 @@ def logged_signals(flight: Flight) -> Iterator[Logged]:
 
 
 def conversion_of(signal: Signal) -> Conversion:
-    """How the log's numbers were read."""
+    """Return the conversion by which the log's numbers were read."""
     return Conversion(scale=signal.scale, offset=signal.offset, invert=signal.invert)
 
 
@@ -152,7 +152,7 @@ def with_notes(flight: Flight, notes: Iterable[Finding]) -> Flight:
 
 
 def _factor(each: Logged, correction: SignalCorrection, where: str) -> float:
-    """From the stated unit to SI."""
+    """Return the factor from the stated unit to SI."""
     signal = each.signal
     place = f"{where}.corrections: {signal.name}"
     with located(place):
@@ -190,7 +190,7 @@ def _earlier(x: np.ndarray, samples: float, role: str) -> np.ndarray:
 def _lever_arm(
     model: Model, flight: Flight, corrections: Corrections
 ) -> tuple[dict[str, float], list[Finding]]:
-    """What a model gets to know of its accelerometers' place, and a note of it."""
+    """Return the place of a model's accelerometers, and a note on it."""
     arm = corrections.lever_arm
     if not arm:
         return {}, []

@@ -1,4 +1,4 @@
-"""What may stand in a configuration's section `disturbance`."""
+"""Section `disturbance` of a configuration."""
 
 from typing import Annotated, Any, Literal
 
@@ -9,7 +9,7 @@ from heli_jax.errors import nearest
 
 
 def _has_unit(value: Any) -> bool:
-    """Whether this is one number with its unit, and not one for each of several by name."""
+    """True if this is one number with its unit, and not one for each of several by name."""
     return isinstance(value, dict) and "value" in value
 
 
@@ -84,12 +84,12 @@ class DisturbanceConfig(Section):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is disturbed, as it stands in the file."""
+        """Names of what is disturbed, as in the file."""
         return self.on if self.axis is None else (self.axis,)
 
     @property
     def has_units(self) -> bool:
-        """Whether some number has a unit of its own, and is not in SI yet."""
+        """True if some number has a unit of its own and is not in SI yet."""
         values = (self.sigma_w, self.tau_w)
         return any(
             _has_unit(v) or (isinstance(v, dict) and any(map(_has_unit, v.values())))

@@ -66,7 +66,8 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
 def read_overridden(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()
 ) -> dict[str, Any]:
-    """What a configuration's file says, with overrides in place, as of `load`; not yet validated.
+    """Return the content of a configuration's file with overrides in place, as `load` does; not yet
+    validated.
 
     Raises:
         InputError: no such file, no YAML, or an override that cannot be put in.

@@ -1,4 +1,4 @@
-"""Which outputs of a model follow an input within a sample, as an acceleration does the stick."""
+"""Outputs of a model that follow an input within a sample, as an acceleration does the stick."""
 
 from collections.abc import Mapping
 

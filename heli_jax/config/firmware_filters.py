@@ -1,4 +1,4 @@
-"""What the settings in a log say of how its signals were filtered before they were logged.
+"""Filters of a log's signals before they were logged, by the settings in the log.
 
 PX4 filters `vehicle_angular_velocity` and `vehicle_acceleration` (VehicleAngularVelocity.cpp,
 VehicleAcceleration.cpp), ArduPilot the gyros and accelerometers of all its messages but the raw
@@ -16,7 +16,7 @@ type Settings = Mapping[str, str | int | float]
 
 
 class LoggedFilters(NamedTuple):
-    """How a signal was filtered, as far as the settings say."""
+    """Filters of a signal, as far as the settings state them."""
 
     filters: tuple[Filter, ...]
     """those with fixed constants"""
@@ -27,7 +27,7 @@ class LoggedFilters(NamedTuple):
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
-    """How a channel was filtered; None where the log does not say."""
+    """Return the filters of a channel; None if the log does not state them."""
     for pattern, reader in _CHANNELS:
         if re.fullmatch(pattern, channel):
             return reader(_Reading(firmware, settings))
@@ -159,7 +159,7 @@ def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
 
 
 def _rotorflight_raw(read: _Reading) -> LoggedFilters | None:
-    """Of `gyroRAW`, which is taken behind the decimation."""
+    """Return the filters of `gyroRAW`, which is taken behind the decimation."""
     if "gyro_decimation_hz" not in read.settings:
         return None
     _decimation(read)
@@ -175,7 +175,7 @@ def _decimation(read: _Reading) -> None:
 
 
 def _moves(limits: list[float], hz: float, rotorflight: bool) -> bool:
-    """Whether a low-pass follows throttle or headspeed: by its lower limit in Betaflight; in
+    """True if a low-pass follows throttle or headspeed: by its lower limit in Betaflight; in
     Rotorflight the fixed frequency lies between the two limits as well."""
     if len(limits) != 2 or not limits[0] > 0:
         return False

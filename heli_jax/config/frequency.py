@@ -1,4 +1,4 @@
-"""What the section `frequency` asks for, in terms of the model."""
+"""Section `frequency` in terms of the model."""
 
 from collections.abc import Collection, Sequence
 

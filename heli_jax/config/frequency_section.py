@@ -1,4 +1,4 @@
-"""What may stand in a configuration's section `frequency`: responses of the logs, and their fit."""
+"""Section `frequency` of a configuration: responses of the logs, and their fit."""
 
 from typing import Annotated, Literal
 
@@ -81,7 +81,7 @@ class HandlingConfig(Section):
 
 
 class FrequencyConfig(Section):
-    """Which frequencies, in windows of which length."""
+    """Frequencies, and the length of the windows."""
 
     band: _Band | None = None
     """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""

@@ -45,7 +45,8 @@ def matching(pattern: str) -> list[Key]:
 
 
 def expected(place: Sequence[str | int]) -> str:
-    """What may stand at a place of a configuration, in words: `number or list of number`."""
+    """Return the values that are allowed at a place of a configuration: `number or list of
+    number`."""
     schema = json_schema()
     at: Any = schema
     for part in place:

@@ -1,4 +1,4 @@
-"""What a configuration of `model: kinematics` means where it leaves things out."""
+"""Defaults of a configuration with `model: kinematics`."""
 
 import dataclasses
 import math
@@ -120,7 +120,8 @@ def _names(content: dict[str, Any], role: str) -> set[str]:
 
 
 def _named(signals: dict[str, Any], role: str) -> set[str]:
-    """Of one log; a preset supplies all inputs that are needed for the outputs asked of it."""
+    """Return the named signals of one log; a preset supplies all inputs that the outputs asked of
+    it need."""
     named, asked = signals.get(role), signals.get("preset_outputs")
     names = {str(n) for n in named} if isinstance(named, dict) else set()
     asked = {str(n) for n in asked} if isinstance(asked, list) else set()
@@ -197,8 +198,8 @@ def _unwrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
-    """How far the noise of gyros and accelerometers lets angles and velocities drift in a second,
-    by the model's parameter, from the third differences of what they logged.
+    """Return the drift of angles and velocities in a second by the noise of gyros and
+    accelerometers, by the model's parameter, from the third differences of the logged signals.
 
     Args:
         model: of `heli_jax.dynamics.kinematics`.

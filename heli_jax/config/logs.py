@@ -144,7 +144,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
 
 
 def _noise_given(experiment: Experiment) -> bool:
-    """Whether filter error takes the outputs' stated noise as it is."""
+    """True if filter error takes the outputs' stated noise as it is."""
     fit, disturbance = experiment.config.fit, experiment.config.disturbance
     if fit is None or disturbance is None or objective_of(fit.method).noise_model != "disturbance":
         return False
@@ -152,7 +152,7 @@ def _noise_given(experiment: Experiment) -> bool:
 
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:
-    """What can be refused before the log is read."""
+    """Refuse what can be refused before the log is read."""
     # A constant of one flight alone is part of the machine, so only a parameter can be one: a
     # misspelt name would leave the vehicle's value in its place without a word.
     known = naming.names(model.Params)
@@ -183,7 +183,7 @@ def _treated(
 
 
 def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
-    """With what is stated of the inputs and outputs of further logs."""
+    """Return the signals with those stated of the inputs and outputs of further logs."""
     merged: dict[str, dict[str, Any]] = {
         role: dict(getattr(named, role)) for role in ("inputs", "outputs")
     }
@@ -225,7 +225,7 @@ def _also(
 
 
 def as_configured(experiment: Experiment, selection: Selection) -> Selection:
-    """What is taken of a log where a configuration's first flight says what its signals are.
+    """Return the selection of a log if a configuration's first flight states its signals.
 
     Args:
         selection: goes before what the configuration says of rate, flight and clock. Without
@@ -266,7 +266,7 @@ def _of_clock(selection: Selection, time: TimeConfig | None) -> dict[str, Any]:
 
 
 def _columns(experiment: Experiment) -> NamedBy:
-    """What names columns after the inputs and outputs of the first flight."""
+    """Return the names of columns after the inputs and outputs of the first flight."""
     config, path = experiment.config, experiment.path
     first, where = config.flights[0], f"{path}: flights[0]"
     gain = config.fit is not None and config.fit.nuisance.input_gain
@@ -373,7 +373,7 @@ def signals(
     where: str,
     gain: bool = False,
 ) -> dict[str, Signal]:
-    """Which column is which of the model's inputs or outputs, with units checked.
+    """Return the columns of the model's inputs or outputs, with units checked.
 
     Args:
         role: whether they are its inputs or its outputs.

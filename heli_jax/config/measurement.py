@@ -1,4 +1,4 @@
-"""What stands between motion and log according to the flights' outputs: filters and delays."""
+"""Filters and delays between motion and log, according to the flights' outputs."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -163,7 +163,8 @@ def filter_words(filter: Filter) -> str:
 def filter_cautions(
     source: Source | None, outputs: Mapping[str, OutputConfig]
 ) -> tuple[Finding, ...]:
-    """What the log's settings say of an output's filter and the configuration does not model."""
+    """Return cautions on an output's filter that the log's settings state and the configuration
+    does not model."""
     if source is None:
         return ()
     said = []
@@ -280,8 +281,8 @@ def _stated(flight: Flight, output: OutputConfig) -> list[Filter]:
 def _not_taken(
     y: np.ndarray, dt: float, filters: list[Filter]
 ) -> tuple[float, float, float, float] | None:
-    """Of the pair of bands that says most: their frequencies [Hz], how much of the slower one's
-    power the faster one has, and how much the filters leave; None where noise falls off."""
+    """Return the most significant pair of bands: their frequencies [Hz], the power of the faster
+    over that of the slower one, and the part that the filters leave; None if noise falls off."""
     from scipy.signal import welch
 
     rate = 1.0 / dt

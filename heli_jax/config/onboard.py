@@ -66,7 +66,7 @@ class GyroConfig(Section):
 
 
 class SensorsConfig(Section):
-    """What the log's sensors do (`with_sensors`)."""
+    """Sensors of the log (`with_sensors`)."""
 
     imu: bool = False
     """adds the specific forces ax, ay, az at the place of the accelerometer"""
@@ -154,7 +154,7 @@ Notches = list[_Positive]
 
 
 class VibrationConfig(Section):
-    """What shakes the sensors, to give lines of the spectrum a name."""
+    """Sources of vibration, by which lines of the spectrum are named."""
 
     rotor: _Positive
     """speed of the rotor, in rad/s unless `unit` says otherwise"""
@@ -163,7 +163,7 @@ class VibrationConfig(Section):
 
 
 class OnboardConfig(Section):
-    """What stands between stick and blade, motion and log; each on what stands before it."""
+    """Devices between stick and blade, motion and log, each in series with the one before it."""
 
     servos: Annotated[
         list[ServosConfig],

@@ -1,4 +1,4 @@
-"""From a preset to the signals of a model: which channel of this log is which input and output."""
+"""Signals of a model by a preset: which channel of this log is which input and output."""
 
 from collections.abc import Collection
 from typing import Any, NamedTuple
@@ -184,11 +184,11 @@ class _Search(NamedTuple):
         return choose(self.log, alternatives), f"the log has no {signal} in {tried}"
 
     def origin(self, chosen: Alternative) -> str:
-        """Where unit, axes and sign come from."""
+        """Source of unit, axes and sign."""
         return f"by preset {self.table.title}: {chosen.source}"
 
     def holdings(self) -> str:
-        """What the log does hold, as the end of a sentence."""
+        """Channels that the log has, as the end of a sentence."""
         if self.log is None:
             return ""
         names = list(self.log.names)

@@ -121,7 +121,7 @@ def by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
 def _of_method(
     experiment: Experiment, method: str, flights: Sequence[Flight], free: dict[str, Free]
 ) -> dict[str, Any]:
-    """What of a problem depends on the method that solves it."""
+    """Return the parts of a problem that depend on its method."""
     config = experiment.config
     assert config.fit is not None
     # Output error gets the bare model, whatever `disturbance` says: that section is then for
@@ -147,7 +147,7 @@ def _of_method(
 
 
 def _responses(experiment: Experiment) -> ResponseOptions:
-    """Which frequency responses are fitted, where the method fits any."""
+    """Return the frequency responses to fit, if the method fits any."""
     config, method = experiment.config.frequency, experiment.config.fit
     if method is not None and not objective_of(method.method).fits_responses:
         for key in ("pairs", "coherence"):
@@ -323,7 +323,7 @@ def _first_guesses(
 
 
 def _shipped_value(experiment: Experiment, name: str) -> str:
-    """What a linear model that ships has of a parameter, in SI; nothing of other models."""
+    """Return a parameter's value in a shipped linear model, in SI; None of other models."""
     model = experiment.config.model
     if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
         return ""

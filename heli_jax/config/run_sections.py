@@ -12,7 +12,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class StickConfig(Section):
-    """How one input moves in a simulation."""
+    """Movement of one input in a simulation."""
 
     # "sweep" is the older name of "chirp".
     kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"

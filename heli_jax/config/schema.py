@@ -1,4 +1,4 @@
-"""What may stand in a configuration: its sections, their keys and their bounds."""
+"""Schema of a configuration: its sections, their keys and their bounds."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -90,7 +90,7 @@ class SignalsConfig(PresetConfig):
     """the model's outputs, by its names"""
     instruments: dict[str, InputConfig] = Field(default={})
     """by input, an excitation that was added to it and that no feedback reaches
-    (docs/frequency.md)"""
+    (docs/frequency-fits.md)"""
 
 
 class AlignConfig(Section):
@@ -232,7 +232,7 @@ StartMethod = Literal["given", "equation-error", "frequency-error"]
 
 
 class StartMethodConfig(Section):
-    """Where the starts of the free parameters come from."""
+    """Source of the free parameters' start values."""
 
     method: StartMethod = "given"
     """equation-error: by regression of the records themselves, for linear models; frequency-error:
@@ -280,7 +280,7 @@ class FitConfig(Section):
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
     instrument: str | Annotated[list[str], Field(min_length=1)] | None = None
     """in frequency: inputs that are taken by their instrument, or none; unless given, all of
-    which every flight holds one (docs/frequency.md)"""
+    which every flight holds one (docs/frequency-fits.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
     """what is estimated beside"""
     shooting: ShootingConfig | None = None
@@ -367,7 +367,7 @@ class Config(Section):
     disturbance: DisturbanceConfig | None = None
     """random pushes: drawn by simulate, estimated by filter error"""
     frequency: FrequencyConfig | None = None
-    """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
+    """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency-fits.md)"""
     report: ReportConfig = ReportConfig()
     """files beside the page of `fit` and `frf`"""
     simulate: SimulateConfig | None = None

@@ -1,5 +1,4 @@
-"""What every section of a configuration is: frozen, without unknown keys, and of numbers that are
-numbers."""
+"""Base of every section of a configuration: frozen, without unknown keys, and of finite numbers."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -35,7 +34,7 @@ class Section(BaseModel):
 
 # Any: whatever stands in the file.
 def _numbers(written: Any, made: Any) -> Iterator[tuple[Any, int | float]]:
-    """What a field holds of numbers, each beside what is written for it."""
+    """Return the numbers of a field, each beside its text in the file."""
     if isinstance(made, int | float):
         yield written, made
     elif isinstance(made, Mapping) and isinstance(written, Mapping):

@@ -110,7 +110,7 @@ def _of_those_that_ship(schema: dict[str, Any]) -> None:
 
 
 class PresetConfig(Section):
-    """What of the signals comes from a table or from a geometry (docs/logs.md)."""
+    """Signals that come from a table or from a geometry (docs/logs.md)."""
 
     preset: Annotated[str | None, Field(json_schema_extra=_of_those_that_ship)] = None
     """the table of an autopilot; what `inputs` and `outputs` name goes before it"""

@@ -42,12 +42,12 @@ class Study(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many values each axis has."""
+        """Number of values of each axis."""
         return tuple(len(values) for values in self.axes.values())
 
     @property
     def size(self) -> int:
-        """How many fits there are."""
+        """Number of fits."""
         return math.prod(self.shape)
 
     def points(self) -> list[dict[str, Any]]:

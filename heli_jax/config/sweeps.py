@@ -25,7 +25,7 @@ from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_un
 
 
 def simulates(experiment: Experiment) -> bool:
-    """Whether the sweep's inputs are those that `simulate` makes.
+    """True if `simulate` makes the sweep's inputs.
 
     Raises:
         InputError: there is no sweep, or nothing to take the inputs from.
@@ -225,7 +225,7 @@ def _table(section: DesignConfig, model: Model, path: Path) -> Design:
 
 
 def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
-    """What takes the axis's numbers to SI."""
+    """Return the factor from the axis's numbers to SI."""
     if axis.unit is None:
         return 1.0
     try:

@@ -1,4 +1,4 @@
-"""Whether an object is a model that JAX can trace, said in a sentence before anything is computed.
+"""Check that an object is a model that JAX can trace, before anything is computed.
 
 A model's functions are called with tracers, which stand for numbers that are not known yet. What
 works on numbers may not work on them: NumPy's functions, `if x > 0`, `float(x)`.
@@ -88,7 +88,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
 
 
 def what_instead(value: Any) -> str:
-    """What stands where a Model was expected, for the end of a sentence."""
+    """Describe an object that is no Model, for the end of a sentence."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     function = _bare(value)
@@ -100,7 +100,7 @@ def what_instead(value: Any) -> str:
 
 
 class _Parts(NamedTuple):
-    """What of a Model is looked at: equal where the same functions and classes are."""
+    """Functions and classes of a Model, by which two models are compared."""
 
     name: str
     vector_field: Any
@@ -192,7 +192,7 @@ def _check_record(model: _Parts, role: str) -> None:
 
 
 def _is_leaf(record: type, names: tuple[str, ...]) -> bool:
-    """Whether JAX takes a record for one value, not for the values of its fields."""
+    """True if JAX takes a record for one value, and not for the values of its fields."""
     try:
         # A class that JAX does not know as a pytree would be one opaque value: every function of it
         # would then fail within jit, with words about something else.
@@ -296,7 +296,7 @@ class _Function:
 
 # Arguments in another order are the most common mistake, and show as a missing attribute.
 def _words(e: Exception) -> str:
-    """What went wrong in a function, with the remedy where it is known."""
+    """Return the error of a function in words, with the remedy where it is known."""
     if isinstance(e, jax.errors.TracerBoolConversionError):
         return (
             "branches on a value that is traced (if, while, and, or, min, max); expected "

@@ -148,7 +148,7 @@ def disturbances_of(model: Model) -> tuple[Disturbance, ...]:
 
 
 def only_disturbed(model: Model) -> bool:
-    """Whether all process noise is that of disturbances: none is the model's own."""
+    """True if all process noise comes from disturbances and none is the model's own."""
     if model.noise_intensity is None:
         return True
     # With every sigma at zero what is left is the model's own, at any value of its parameters.
@@ -159,7 +159,7 @@ def only_disturbed(model: Model) -> bool:
 
 
 def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Disturbance, ...]:
-    """What is added, by name; ValueError where it cannot be."""
+    """Return the disturbances to add, by name; ValueError if one is not possible."""
     if not on:
         raise ValueError("a disturbance needs an axis or a state to act on, got none")
     rates = {axis.name: axis.rate for axis in axes_of(model)}

@@ -124,7 +124,7 @@ def helicopter(
 
 
 def _axes(corrections: Corrections) -> tuple[Axis, ...]:
-    """With the states of flybar and tip-path plane that there are."""
+    """Return the axes, with the states of flybar and tip-path plane that the model has."""
 
     def with_rotor(axis: Axis) -> Axis:
         bar = () if corrections.flybarless else axis.flybar
@@ -314,7 +314,7 @@ _UPRIGHT = 0.1
 
 
 def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> dict[str, Any]:
-    """Where the model's range ends, by name; True where it has been left."""
+    """Return the limits of the model's range, by name; True if one is exceeded."""
     s = _turning(corrections, s, u)
     air = flow(corrections, p, s, u, motion(corrections, s, u))
     outside = {

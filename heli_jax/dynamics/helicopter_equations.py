@@ -84,7 +84,8 @@ class HelicopterOutputs(NamedTuple):
 # told from that of the others. A NamedTuple of booleans is static to jit, so a switch that is off
 # costs nothing.
 class Corrections(NamedTuple):
-    """What of the paper is corrected or added; each for itself."""
+    """Corrections of the paper's equations and additions to them, each independent of the
+    others."""
 
     direction: bool = False
     """eqs 2-3: thrust along the mast at any heading (printed, they hold near psi = 0)"""
@@ -143,7 +144,7 @@ class Attitude(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How the body turns and meets the air; body axes are forward, right, down."""
+    """Motion of the body and of the air past it; body axes are forward, right, down."""
 
     at: Attitude
     dx: Scalar
@@ -353,7 +354,7 @@ def accelerations(
 
 
 def _drag(p: Helicopter, m: Motion) -> tuple[Scalar, ...]:
-    """What drag takes off the accelerations forward, right and down [m/s^2]."""
+    """Return the deceleration by drag forward, right and down [m/s^2]."""
     square = m.u**2 + m.v**2 + m.w**2
     # The root of a speed of zero has no derivative; this one has, and gives zero drag there.
     speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)

@@ -144,7 +144,7 @@ class Positions(NamedTuple):
 
 
 def corrected(p: Record, u: Record, names: tuple[str, str, str]) -> Vector:
-    r"""What three sensors should have shown: $y = (z - b)/(1 + \lambda)$.
+    r"""Return the true value of three sensors: $y = (z - b)/(1 + \lambda)$.
 
     Args:
         p: the errors, SI.
@@ -224,7 +224,7 @@ def _position_field(p: KinematicErrors, s: PositionState, u: RatesAndForces) -> 
 
 
 def _arm(p: KinematicErrors) -> Vector:
-    """From the IMU to where velocities and positions are measured, along the body [m]."""
+    """Return the vector from the IMU to the point of velocities and positions, in body axes [m]."""
     return -p.x_imu, -p.y_imu, -p.z_imu
 
 
@@ -359,5 +359,5 @@ def kinematics(inputs: set[str], outputs: set[str]) -> Model:
 
 
 def is_kinematic(model: Model) -> bool:
-    """Whether a model is one of these, bare or with devices around it."""
+    """True if a model is one of these, bare or with devices around it."""
     return model.name.startswith("kinematics-")

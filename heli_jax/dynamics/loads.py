@@ -1,4 +1,4 @@
-r"""What the rotors and the motor do to the body: eqs 10, 14-17 and 19 with corrections.
+r"""Loads of rotors and motor on the body: eqs 10, 14-17 and 19 with corrections.
 
 The tail rotor (eqs 16, 17 and 20) has inflow, a side force and a power that it takes. The motor's
 throttle is the stick's, or that of a governor that holds the rotor's speed:
@@ -33,7 +33,7 @@ from heli_jax.vehicle import Helicopter
 
 
 class TailRotor(NamedTuple):
-    """What the tail rotor does."""
+    """Loads of the tail rotor."""
 
     T: Scalar
     """thrust, to the left: it turns the nose to the right [N]"""
@@ -145,7 +145,8 @@ def rigid_hub_moments(
 
 
 def _tip(corrections: Corrections, p: Helicopter) -> Scalar:
-    """Where the lift of flapping and hub moment ends; thrust and torque have B in any variant."""
+    """Return the radius at which lift ends for flapping and hub moment; thrust and torque use B in
+    any variant."""
     return p.B if corrections.tip_loss else 1.0
 
 

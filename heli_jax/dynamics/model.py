@@ -57,7 +57,7 @@ class Disturbance(NamedTuple):
 
 
 class LowPass(NamedTuple):
-    """Where the noise of a sensor comes in that an output's low-passes have filtered."""
+    """Sensor noise at the input of the low-passes that have filtered an output."""
 
     output: str
     """whose filters they are"""
@@ -71,7 +71,7 @@ class LowPass(NamedTuple):
 
 
 class SteadyFlight(NamedTuple):
-    """What trim solves for, by name: as many unknowns as equations."""
+    """Unknowns and equations of trim by name, as many of the one as of the other."""
 
     unknowns: tuple[str, ...]
     """states, then inputs"""
@@ -260,7 +260,8 @@ def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
 
 
 def linear_misfit(model: Model, params: Record) -> float:
-    """How far a model is from `linear=True`: 0 where f(x, u) and h(x, u) are linear, else ~1.
+    """Return the distance of a model from `linear=True`: 0 if f(x, u) and h(x, u) are linear, else
+    about 1.
 
     Compares f and h at two states with the sum of both, relative to their size. Concrete
     parameters only.
@@ -357,8 +358,8 @@ def require_constants(model: Model, params: Record, given: Collection[str] = ())
 
 
 def reads(model: Model, params: Record, name: str) -> bool:
-    """Whether the rates or the outputs depend on a parameter, where states and inputs are one, or
-    an input is late by it.
+    """True if the rates or the outputs depend on a parameter, at states and inputs of one, or an
+    input is delayed by it.
 
     Args:
         params: the model's Params; concrete numbers.

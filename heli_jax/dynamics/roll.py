@@ -224,7 +224,7 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
 
 
 class Ratios(NamedTuple):
-    """What a fourth-order denominator says of the physical parameters."""
+    """Ratios of the physical parameters that a fourth-order denominator determines."""
 
     values: dict[str, Scalar]
     """a over the inertia of the axis, and a/If (a_paddle/If where a_paddle is given)"""
@@ -268,5 +268,5 @@ def ratios_from_denominator(
 
 
 def _is_given(value: Scalar) -> bool:
-    """Whether an optional constant is there; not so where it is traced, which nobody can tell."""
+    """True if an optional constant is given; False if it is traced, where nobody can tell."""
     return not isinstance(value, core.Tracer) and not bool(jnp.isnan(value))

@@ -72,7 +72,7 @@ def speed_lift(p: Helicopter, Omega: Scalar, theta0: Scalar, inflow: Scalar, B: 
 
 
 def flap_back(p: Helicopter, Omega: Scalar, lift: Scalar, B: Scalar) -> Scalar:
-    r"""How far the plane tilts away from a speed of 1 m/s [rad s/m].
+    r"""Return the tilt of the plane away from a speed of 1 m/s [rad s/m].
 
     $$\frac{1}{R\Omega}\frac{\partial a_1}{\partial\mu}
       = \frac{2 K_\mu}{R\Omega}\,\frac{1}{B^4}
@@ -120,7 +120,7 @@ def flapping_rates(
 
 
 class HubLoads(NamedTuple):
-    """What a tilted rotor does to the body, beside its thrust along the mast."""
+    """Loads of a tilted rotor on the body, beside its thrust along the mast."""
 
     forward: Scalar
     """force [N]"""
@@ -132,7 +132,8 @@ class HubLoads(NamedTuple):
 
 
 def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
-    r"""In-plane forces $-T a_1$ and $T b_1$ at the hub, and $(k_\beta + T h_r)$ times the tilt.
+    r"""Return the in-plane forces $-T a_1$ and $T b_1$ at the hub, and $(k_\beta + T h_r)$ times
+    the tilt.
 
     Args:
         p: vehicle, SI; k_beta is the stiffness of the whole hub.

@@ -24,7 +24,7 @@ class UnsupportedError(Exception):
 
 @contextmanager
 def translating() -> Iterator[None]:
-    """What goes wrong meanwhile, however unforeseen, leaves a program that is not to be had.
+    """Turn any error while translating into one that leaves the program untranslated.
 
     XLA computes the same: no failure here may end what somebody asked for. An error of the model's
     own is raised there again.
@@ -41,7 +41,7 @@ def translating() -> Iterator[None]:
 
 
 def said(error: Exception) -> str:
-    """What an error says, in one line."""
+    """Return an error in one line."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {words[:200]}"
 
@@ -228,7 +228,7 @@ class Code:
         return Value(joined, dtype, False)
 
     def any(self, which: Value) -> Value:
-        """Whether it is true of any of the vehicles that are in flight together."""
+        """True if it is true of any of the vehicles that are computed together."""
         if which.shared or self.lanes == 1:
             return which._replace(shared=True)
         name, vector = f"@llvm.vector.reduce.or.v{self.lanes}i1", self.vector("i1")
@@ -236,7 +236,7 @@ class Code:
         return self.made(f"call i1 {name}({vector} {which.operand})", which.dtype, True)
 
     def many(self, shared: bool) -> str:
-        """What stands before a type in an intrinsic's name."""
+        """Return the prefix of a type in an intrinsic's name."""
         return "" if shared or self.lanes == 1 else f"v{self.lanes}"
 
     def choose(self, which: Value, yes: Value, no: Value) -> Value:
@@ -255,7 +255,7 @@ class Code:
         return self.made(f"{name} {source} {value.operand} to {target}", dtype, value.shared)
 
     def remember_whole(self, value: Value, integer: Value) -> None:
-        """That a number with digits behind the point was made of an integer."""
+        """Remember that a floating-point number was made of an integer."""
         self._whole[value.operand] = integer
 
     def whole(self, value: Value) -> Value | None:
@@ -380,7 +380,7 @@ def at_place(code: Code, operand: Operand, at: tuple[Value, ...]) -> Value:
 
 
 def flat(code: Code, shape: tuple[int, ...], at: tuple[Value, ...]) -> Value:
-    """Where an element of an array that is stored row by row stands, counted from the first."""
+    """Return the position of an element in an array that is stored row by row."""
     flat = at[0]
     for length, index in zip(shape[1:], at[1:], strict=True):
         flat = code.operation("mul", flat, constant(length, INDEX))

@@ -37,7 +37,7 @@ class Argument(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What is compiled; jaxprs as `jax.make_jaxpr` gives them."""
+    """Program to compile; jaxprs as `jax.make_jaxpr` gives them."""
 
     step: Any
     """of (what stays, what is stored, carry, k, int32): the carry after the k-th step"""
@@ -223,7 +223,7 @@ def _store(code: Code, value: Value, row: str) -> None:
 
 
 def lanes_for(dtype: np.dtype, linear: bool = False) -> int:
-    """How many vehicles are in flight at once in one thread.
+    """Return the number of vehicles that one thread computes at once.
 
     Args:
         linear: whether a step is a product of matrices, whose sums wait for each other little.
@@ -309,7 +309,7 @@ def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argu
 
 @functools.cache
 def _features() -> frozenset[str]:
-    """What the processor at hand has."""
+    """Return the features of this processor."""
     import llvmlite.binding as llvm
 
     return frozenset(name for name, has in llvm.get_host_cpu_features().items() if has)
@@ -345,7 +345,7 @@ def _compiled(assembly: str) -> Any:
 
 
 def _address(name: str) -> int:
-    """Where a function of the C library is.
+    """Return the address of a function of the C library.
 
     Raises:
         UnsupportedError: it has none of this name.

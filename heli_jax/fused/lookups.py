@@ -69,7 +69,7 @@ def gathered(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
 
 
 def _filling(dtype: np.dtype, value: Any) -> Value:
-    """What stands for an element beyond the array, as JAX has it."""
+    """Return the value of an element beyond the array, as JAX has it."""
     if value is not None:
         return constant(value, dtype)
     if dtype.kind == "f":
@@ -166,7 +166,7 @@ def in_order(code: Code, inputs: list[Operand], params: dict[str, Any]) -> list[
 
 
 def _behind(code: Code, a: Value, b: Value) -> Value:
-    """Whether a number belongs behind another, as what is not a number does."""
+    """True if a number sorts behind another; NaN sorts last."""
     greater = OPERATIONS["gt"](code, a, b)
     if a.dtype.kind != "f":
         return greater
@@ -228,7 +228,7 @@ def updated(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operan
 def _put(
     code: Code, combined: Combined, old: Elements, starts: dict[int, Value], new: Elements
 ) -> Elements:
-    """With a window written, of as many axes as the array; nowhere if a part of it is beyond."""
+    """Write a window of as many axes as the array; nothing is written if a part of it is beyond."""
     result = np.array(old)
     known = {d: int(v.operand) for d, v in starts.items() if not v.operand.startswith("%")}
     places = [

@@ -1,4 +1,4 @@
-"""What the primitives of JAX are in LLVM, for one number of each vehicle at a time."""
+"""JAX primitives in LLVM, for one number of each vehicle at a time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -32,7 +32,7 @@ def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
 
 
 def _remainder(code: Code, a: Value, b: Value, **_: Any) -> Value:
-    """With the sign of the dividend."""
+    """Return the remainder with the sign of the dividend."""
     if a.dtype.kind == "f":
         return code.library("fmod", a, b)
     return _of_integers(code, "rem", a, b, a)
@@ -94,7 +94,7 @@ def _library(name: str) -> Operation:
 
 
 def _polynomial(code: Code, x: Value, *factors: Value, **_: Any) -> Value:
-    """Of rising powers, by Horner's rule."""
+    """Evaluate a polynomial of rising powers by Horner's rule."""
     total = factors[-1]
     for factor in reversed(factors[:-1]):
         total = OPERATIONS["add"](code, OPERATIONS["mul"](code, total, x), factor)

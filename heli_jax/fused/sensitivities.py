@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Sensitive(NamedTuple):
-    """What is differentiated."""
+    """Function that is differentiated."""
 
     run: Callable[[Any], Any]
     """of the unknowns (q,): a run of one step a sample, as `simulation.accumulate.Steps`"""
@@ -30,19 +30,19 @@ class Sensitive(NamedTuple):
 
 
 class Products:
-    """As `fused.traced.Making` has it: what is carried and what it gives.
+    """Carry and results with derivatives, as `fused.traced.Making` has them.
 
     The result holds the sums over all samples and rows of v[i] v[j], i >= j, of each row's numbers
     v, as a triangle row by row.
     """
 
     def __init__(self, of: Sensitive, unknowns: Any) -> None:
-        """With the unknowns (q,) of an element."""
+        """Take the unknowns (q,) of an element."""
         self._of, self._z = of, unknowns
 
     @property
     def carry(self) -> Any:
-        """What is carried, its derivatives, and the sums."""
+        """Carry, its derivatives, and the sums."""
         of = self._of
         first, push = jax.linearize(lambda z: of.run(z).carry, self._z)
         tangents = [push(self._unit(j)) for j in (*of.throughout, *of.at_first)]
@@ -54,7 +54,7 @@ class Products:
 
     @property
     def steps(self) -> int:
-        """How many: one less than samples."""
+        """Number of steps, one less than samples."""
         return self._of.steps
 
     def step(self, carry: Any, k: Any, /) -> Any:
@@ -71,7 +71,7 @@ class Products:
     def _pushed(
         self, function: Callable[[Any, Any], Any], now: Any, tangents: list[Any]
     ) -> tuple[Any, list[Any]]:
-        """What a function of unknowns and carry gives, and its derivatives."""
+        """Return a function of unknowns and carry, and its derivatives."""
         of = self._of
         result, of_both = jax.linearize(function, self._z, now)
         _, of_carry = jax.linearize(lambda c: function(self._z, c), now)

@@ -238,7 +238,7 @@ def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Opera
 
 
 def _products(code: Code, a: Elements, b: Elements, params: dict[str, Any]) -> Elements:
-    """Of batches, which come first in the result."""
+    """Multiply batches, which come first in the result."""
     (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
     a = np.moveaxis(a, batch_a, range(len(batch_a)))
     b = np.moveaxis(b, batch_b, range(len(batch_b)))
@@ -260,7 +260,7 @@ def _products(code: Code, a: Elements, b: Elements, params: dict[str, Any]) -> E
 
 
 def convolved(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
-    """Of small arrays, with padding, strides and dilations."""
+    """Convolve small arrays, with padding, strides and dilations."""
     if params["feature_group_count"] != 1 or params["batch_group_count"] != 1:
         raise UnsupportedError("a convolution in groups")
     of_a, of_b, of_result = params["dimension_numbers"]
@@ -298,7 +298,7 @@ def convolved(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Oper
 
 
 def _back(result: Elements, order: tuple[int, ...]) -> Elements:
-    """With the axes where the order says that they stand."""
+    """Return the result with its axes in the stated order."""
     return np.transpose(result, np.argsort(order))
 
 

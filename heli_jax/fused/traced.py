@@ -32,7 +32,7 @@ class Traced(NamedTuple):
 
     @property
     def varies(self) -> tuple[bool, ...]:
-        """Of what stays, whether each element has its own."""
+        """Return for each constant whether every element has its own."""
         return tuple(not argument.shared for argument in self.run.stays)
 
     def _before(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
@@ -41,12 +41,12 @@ class Traced(NamedTuple):
         return outputs[:n], outputs[n:]
 
     def own(self, shared: Any, records: Any, element: Any) -> tuple[list[Any], list[Any]]:
-        """What an element begins with: the carry, and what stays of its own. JAX can trace it."""
+        """Return an element's first carry, and its own constants. JAX can trace it."""
         carry, stay = self._before(shared, records, element)
         return carry, [v for v, varying in zip(stay, self.varies, strict=True) if varying]
 
     def common(self, shared: Any, records: Any, element: Any) -> list[Any]:
-        """What stays and is the same for all elements, of any of them."""
+        """Return the constants that all elements share, from any of them."""
         _, stay = self._before(shared, records, element)
         return [v for v, varying in zip(stay, self.varies, strict=True) if not varying]
 
@@ -85,7 +85,7 @@ def traced(
     parts: dict[str, Any] = {}
 
     def begin(shared: Any, inputs: Any, element: Any) -> Any:
-        """What is carried before the first sample, and what stays."""
+        """Return the carry before the first sample, and the constants."""
         run = making(shared, inputs, element)
         carry, parts["steps"] = run.carry, run.steps
         own = shared, element
@@ -142,7 +142,7 @@ def _check_numbers(jaxpr: Any, results: Sequence[Any]) -> None:
 
 
 def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:
-    """Of each result whether it depends on these arguments."""
+    """Return for each result whether it depends on these arguments."""
     own = set(arguments)
     for equation in jaxpr.eqns:
         # A literal has no hash, and depends on nothing.

@@ -1,4 +1,4 @@
-"""What JAX traced, line by line into LLVM.
+"""Translation of a jaxpr into LLVM, line by line.
 
 Small arrays are taken apart into their elements; long ones, such as the inputs of a record, stay in
 memory, and what is computed of them is computed of the elements that are asked for.
@@ -89,7 +89,8 @@ def translate(code: Code, jaxpr: Any, consts: Sequence[Any], operands: Sequence[
 
 
 def _at_hand(value: Any) -> Any:
-    """What is known now, as NumPy has it; keys of random numbers are JAX's alone."""
+    """Return a value that is known at compile time, as NumPy has it; random keys are JAX's
+    alone."""
     if jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended):
         return value
     return np.asarray(value)
@@ -163,7 +164,7 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
 
 
 def _combined(name: str, params: dict[str, Any]) -> Combined:
-    """How what is written into an array is joined with what stands there."""
+    """Return how an update combines with the array's element."""
     function, consts = params.get("update_jaxpr"), params.get("update_consts", ())
     if name != "scatter" or function is None:
         return COMBINED[name]
@@ -203,7 +204,7 @@ def _elementwise(
 def _repeated(
     own: tuple[int, ...], shape: tuple[int, ...], at: tuple[Value, ...]
 ) -> tuple[Value, ...]:
-    """Where in an array stands what is at a place of the shape that it is repeated to."""
+    """Return the place in an array that a broadcast shape's place repeats."""
     if not own:
         return ()
     zero = constant(0, INDEX)
@@ -230,7 +231,7 @@ def _branches(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list
 
 
 def _takes(code: Code, which: Value, i: int, count: int) -> Value:
-    """Whether a branch is the one: the first and the last also stand for what is beyond them."""
+    """True if a branch is selected; the first and the last also stand for indices beyond them."""
     if which.dtype.kind == "b":
         return which if i else code.operation("xor", which, constant(True, which.dtype))
     order = "sle" if i == 0 else "sge" if i == count - 1 else "eq"
@@ -272,7 +273,7 @@ def _scan(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Ope
 
 
 def _counts(params: dict[str, Any]) -> tuple[int, int]:
-    """How many of a scan's arguments stay, and how many are carried."""
+    """Return the number of a scan's constants and of its carries."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     # From JAX 0.12 on it keeps trees in their place.
@@ -382,7 +383,7 @@ def loop(
 
 
 def _vary(values: Elements) -> np.ndarray:
-    """Of each whether vehicles have numbers of their own."""
+    """Return for each value whether it differs between vehicles."""
     return np.vectorize(lambda v: not v.shared, otypes=[bool])(values)
 
 
@@ -437,7 +438,7 @@ _INSTALLED = re.compile(r"(?:site|dist)-packages[/\\]([^/\\.]+)")
 
 
 def place_of(equation: Any) -> str | None:
-    """As 'at model.py:12' or 'in diffrax'; None where nothing says so."""
+    """Return 'at model.py:12' or 'in diffrax'; None if unknown."""
     trace, library = equation.source_info.traceback, None
     # From the innermost call outwards, until somebody's own function is met. What a function of
     # JAX's is made of was traced once for all who call it, and knows no caller.

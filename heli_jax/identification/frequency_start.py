@@ -8,7 +8,8 @@ import dataclasses
 import time
 from typing import NamedTuple
 
-from heli_jax.identification.equation_error.start import StartValue
+from heli_jax.finding import Finding, found
+from heli_jax.identification.equation_error.start import StartValue, reasons_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status
@@ -30,33 +31,17 @@ class FrequencyErrorStart(NamedTuple):
     """no stepwise selection of terms"""
 
     @property
-    def _why(self) -> str:
-        return " and ".join(dict.fromkeys(v.reason for v in self.values.values() if v.reason))
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
+    def findings(self) -> list[Finding]:
         """What was taken from where."""
         taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
+        run = {"status": self.status, "seconds": self.seconds}
         if not taken:
-            return (
-                f"The start by frequency error failed ({self.status}, {self.seconds:.2g} s): all "
-                f"parameters begin as stated, since {self._why}.",
-            )
-        said = [
-            f"Start by frequency error of {', '.join(taken)} ({self.status}, "
-            f"{self.seconds:.2g} s): the fit begins there, they are not its result."
-        ]
-        if of_several := [n for n in taken if self.values[n].sd is None]:
-            said.append(
-                f"Start: {', '.join(of_several)} at one of the solutions that the spectra do not "
-                "tell apart."
-            )
-        grouped: dict[str, list[str]] = {}
-        for name, v in self.values.items():
-            if v.reason:
-                grouped.setdefault(v.reason, []).append(f"{name} {v.value:.4g}")
-        said += [f"Start: {', '.join(v)}, as stated: {why}." for why, v in grouped.items()]
-        return tuple(said)
+            reasons = list(dict.fromkeys(v.reason for v in self.values.values() if v.reason))
+            return [found("start.frequency-error-failed", "note", reasons=reasons, **run)]
+        out = [found("start.frequency-error", "note", names=taken, **run)]
+        if several := [n for n in taken if self.values[n].sd is None]:
+            out.append(found("start.several-solutions", "note", names=several))
+        return out + reasons_of(self.values)
 
 
 def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> FrequencyErrorStart:

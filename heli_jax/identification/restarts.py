@@ -25,7 +25,7 @@ from heli_jax.identification.validation.adequacy import is_unstable
 
 
 class SearchState(NamedTuple):
-    """How far a search has come."""
+    """State of a search."""
 
     problem: Problem
     search: Search
@@ -39,7 +39,7 @@ class SearchState(NamedTuple):
 
 
 class StartPoint(NamedTuple):
-    """Where a run of the optimiser begins."""
+    """Start of a run of the optimiser."""
 
     noise: Noise
     z: Float[Array, " q"]
@@ -84,7 +84,7 @@ def _diverges(at: SearchState) -> bool:
 
 
 def _by_windows(at: SearchState) -> list[StartPoint]:
-    """What the flights share, fitted to short windows."""
+    """Return the start that a fit to short windows gives, without the windows' initial states."""
     problem, guess = at.problem, at.guess
     dt = max(f.dt for f in problem.training)
     shortest = min(f.n_samples * f.dt for f in problem.training)
@@ -146,7 +146,7 @@ def left_stability(problem: Problem, search: Search, optimum: RelaxedOptimum) ->
 
 
 def _further_starts(at: SearchState) -> list[StartPoint]:
-    """What equation error makes of the record, where it can, and values drawn about the start."""
+    """Return the estimate of equation error, if it has one, and values drawn about the start."""
     problem, guess, layout = at.problem, at.guess, at.guess.layout
     points = np.array(draw(layout, problem, guess.z, 1 + _DRAWN, at.seed))
     try:

@@ -1,4 +1,4 @@
-"""What a fit gives: plain data."""
+"""Result of a fit, as plain data."""
 
 import warnings
 from dataclasses import dataclass, field
@@ -79,13 +79,13 @@ class Signals(NamedTuple):
         return self.measured[output] - self.simulated[output]
 
     def error(self, output: str) -> np.ndarray:
-        """What the fit makes white: the innovations with filter error, else the residual."""
+        """Return the errors that should be white: innovations with filter error, else residuals."""
         return self.residual(output) if self.innovations is None else self.innovations[output]
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What is known before any fit."""
+    """Result of `check`, before any fit."""
 
     verdict: Verdict
     noise: dict[str, float]
@@ -241,7 +241,8 @@ class Fit:
 
     @property
     def disturbable(self) -> bool:
-        """Whether filter error could be tried: its model has an axis to disturb and none yet."""
+        """True if filter error is an option: the model has an axis to disturb and no disturbance
+        yet."""
         return lacks_disturbance(self.reached.layout.model)
 
     # `unknowns` counts noise, disturbance and initial states too: models that differ in these are
@@ -259,7 +260,8 @@ class Fit:
 
     @property
     def overconfident(self) -> bool:
-        """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
+        """True if the intervals are too narrow: residuals are coloured and nothing allows for
+        it."""
         spectrum = objective_of(self.method).noise_model == "spectrum"
         return not self.white and not self.coloured and not spectrum
 
@@ -271,7 +273,7 @@ class Fit:
 
     @property
     def interval(self) -> str:
-        """What to call the intervals."""
+        """Name of the intervals."""
         if self.status != "not-converged" and self.coloured:
             return "95 % (autocorrelated residuals)"
         # Where no optimum was reached there are none.
@@ -280,7 +282,7 @@ class Fit:
 
     @property
     def white(self) -> bool:
-        """Whether all residuals look white, so that the intervals may be taken at their word."""
+        """True if all residuals look white."""
         return all(w.white for w in self.whiteness.values())
 
     # What prints and exports stands above this module in the order of imports, hence inside.

@@ -1,6 +1,5 @@
 """Model selection: likelihood, information criteria and nested tests of candidates in a table."""
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,14 +12,12 @@ import scipy.special
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Model, axes_of
-from heli_jax.finding import found
 from heli_jax.identification.diagnostics.search import STOPPED
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.methods import METHODS, objective_of
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.result import Estimate, Fit, Status
-from heli_jax.identification.validation.other_hold import likelier_hold
 from heli_jax.numbers import p_value
 
 
@@ -73,7 +70,7 @@ def alternatives(
     *,
     without_stand: Model | None = None,
 ) -> Alternatives:
-    """No disturbance, one pole and two poles on `axis`, all by filter error.
+    """List candidates by filter error: no disturbance, one pole and two poles on `axis`.
 
     Args:
         model: the model without disturbance.
@@ -138,8 +135,8 @@ def _by_filter_error(problem: Problem, model: Model, *, silent: bool = False) ->
 
 
 def _stand_may_vanish(problem: Problem) -> bool:
-    """Whether a stand without stiffness and damping is among those that are fitted: each of the two
-    is free to go to zero, or zero already."""
+    """True if a stand without stiffness and damping is among those fitted: each of the two is free
+    to reach zero, or zero already."""
     values = naming.asdict(problem.vehicle)
     for name in ("kappa", "zeta"):
         if name in problem.free:
@@ -386,7 +383,8 @@ def undisturbed_too(model: Model, names: Sequence[str]) -> tuple[str, ...]:
 def disturbed_sets(
     problem: Problem, model: Model, names: Sequence[str], stated: Sequence[str] = ()
 ) -> Alternatives:
-    """No disturbance, each one left out, all, and all with two poles; by filter error.
+    """List candidates by filter error: no disturbance, each one left out, all, and all with two
+    poles.
 
     As many candidates as disturbances and three: of four there would be sixteen sets, of six 64.
 
@@ -429,33 +427,6 @@ def disturbed_sets(
     return Alternatives(problems, tuple(nested))
 
 
-# What an input does between samples, by the record where the log leaves it open.
-
-
-def with_likelier_hold(
-    problem: Problem, fit: Fit, refit: Callable[[Problem], Fit]
-) -> tuple[Problem, Fit]:
-    """The fit, and what was fitted, with inputs held of which the log left that open, where the
-    record bears it out.
-
-    An input that moves at every sample may be a stick that was sampled on its way or a command that
-    is computed at each sample and held. The log looks the same; the answer is half a sample later.
-    """
-    if fit.status == "not-converged":
-        return problem, fit
-    # By how much the colour of the residuals widens intervals: the record is worth so much less.
-    wider = [e.sd / e.sd_white for e in fit.estimates.values() if e.sd and e.sd_white]
-    held = likelier_hold(problem, fit.reached, max(wider, default=1.0))
-    if held is None:
-        return problem, fit
-    again = refit(held.problem)
-    if again.status == "not-converged" or not again.log_likelihood > fit.log_likelihood:
-        return problem, fit
-    late = 0.5 * max(f.dt for f in problem.training)  # a held input is, by half a sample
-    taken = found("timing.likelier-hold", "note", *held.inputs, value=held.gain, late=1e3 * late)
-    return held.problem, dataclasses.replace(again, findings=(taken, *again.findings))
-
-
 # One problem by several methods, their estimates side by side.
 
 
@@ -464,7 +435,7 @@ APART = 2.0
 
 
 class MethodResult(NamedTuple):
-    """What one method makes of the problem."""
+    """Result of one method."""
 
     method: str
     fit: Fit | None
@@ -480,7 +451,7 @@ class MethodResult(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Its verdicts in short."""
+        """Verdicts in a few words."""
         if self.fit is None:
             return "refused"
         if self.fit.status == "not-converged":
@@ -500,8 +471,8 @@ class MethodComparison(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of what is compared: the free parameters, and the delay and the gains of inputs that
-        were free beside them."""
+        """Names compared: the free parameters, and the delay and the gains of inputs that were free
+        beside them."""
         main = self.results[0].fit
         if main is None:
             return ()
@@ -533,7 +504,7 @@ class MethodComparison(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What of the comparison has to be known."""
+        """Sentences on what agrees and what differs."""
         main, *others = self.results
         said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
         if main.fit is None:

@@ -1,4 +1,4 @@
-"""What a file of a linear model says beside its matrices, checked and in SI: `content_of`.
+"""Content of a linear model's file beside its matrices, checked and in SI: `content_of`.
 
 Every problem is an InputError of one sentence that begins with the place in the file.
 """

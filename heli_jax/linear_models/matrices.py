@@ -26,7 +26,7 @@ class Entry(NamedTuple):
 
 
 class _Unit(NamedTuple):
-    """What a row is in, or a column."""
+    """Unit of a row or a column."""
 
     dimension: Dimension
     scale: float
@@ -53,7 +53,7 @@ def matrices_of(mapping: Mapping[str, Any], content: Content) -> dict[str, tuple
 def not_possible(
     content: Content, matrices: Mapping[str, tuple[Entry, ...]], values: Mapping[str, float]
 ) -> str:
-    """What is wrong with a model's parameters, as a sentence; empty where all can be.
+    """Return a sentence on parameters that are impossible; empty if all are possible.
 
     Those that are positive have to be, every entry has to be a finite number, and E has to have an
     inverse.

@@ -71,7 +71,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def is_shipped(name: str) -> bool:
-    """Whether a text is a shipped model's name, rather than a path."""
+    """True if a text is the name of a shipped model, and no path."""
     return name in shipped()
 
 
@@ -111,7 +111,7 @@ def _read(text: str, path: str) -> LinearModel:
 
 
 def _text(file: str | Path, folder: Path) -> tuple[str, str]:
-    """What a file holds, and its name in sentences."""
+    """Return the text of a file, and its name in sentences."""
     name = str(file)
     # A shipped name goes before a file of the same name; a file is always meant by one with its
     # ending.
@@ -179,7 +179,7 @@ def _params(content: Content) -> type:
 
 
 class _Nothing(NamedTuple):
-    """No parameter yet."""
+    """Parameters of a model that has none."""
 
 
 class _Equations:

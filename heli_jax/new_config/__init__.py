@@ -162,8 +162,8 @@ def _seen(channel: Series) -> Series:
 
 
 def _late(series: Mapping[str, Series], signals: text.Signals | None) -> tuple[str, bool]:
-    """Which input an output precedes, in words, empty where none is; and whether it is no feedback
-    that looks like that."""
+    """Return, in words, the input that an output precedes (empty if none), and whether feedback is
+    excluded as the cause."""
     none = "", False
     if signals is None:
         return none
@@ -241,7 +241,8 @@ def _vehicle(
 def _free(
     chosen: text.Chosen, constants: Mapping[str, float], written: Mapping[Path, str]
 ) -> dict[str, float | str | None]:
-    """What is free and where it begins; None at the value of the vehicle file that is written."""
+    """Return the free parameters and their starts; None at the value of the vehicle file that is
+    written."""
     listed = tables.models()
     known = naming.names(chosen.model.Params)
     if not chosen.linear:

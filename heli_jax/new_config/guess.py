@@ -1,4 +1,4 @@
-"""Which channel of a log is which signal, in which unit: guesses, each with its reason."""
+"""Guesses of which channel of a log is which signal and in which unit, each with its reason."""
 
 import re
 import unicodedata
@@ -167,7 +167,7 @@ def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> s
 
 
 def is_excitation(name: str) -> bool:
-    """Whether a channel's name says that it is an excitation that an autopilot added to a stick."""
+    """True if a channel's name says that it is an excitation that an autopilot added to a stick."""
     return bool(_EXCITATIONS & set(words_of(name)))
 
 
@@ -183,7 +183,7 @@ def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
-    """Whether a channel's name and unit leave room for an output of the model."""
+    """True if a channel's name and unit allow an output of the model."""
     unit = series.unit or without_unit(name)[1]
     # A model that states no unit takes any.
     if unit and si != "1" and not units.fits(unit, si):
@@ -193,7 +193,7 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
 
 
 def may_move(name: str, series: Series, si: str) -> bool:
-    """Whether a channel's name and unit leave room for an input of the model."""
+    """True if a channel's name and unit allow an input of the model."""
     return not no_stick(name, series.unit or without_unit(name)[1], si)
 
 
@@ -232,7 +232,7 @@ def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
 
 
 def full_travel(sticks: Mapping[str, Series]) -> float | None:
-    """What a log's sticks count to at their stops, where one of them was there; None if not."""
+    """Return the count of a log's sticks at their stops, if one of them was there; else None."""
     for series in sticks.values():
         values = series.values[np.isfinite(series.values)]
         # Radios of the EdgeTX family count to 1024, in whole numbers.
@@ -242,5 +242,5 @@ def full_travel(sticks: Mapping[str, Series]) -> float | None:
 
 
 def are_whole(values: np.ndarray) -> bool:
-    """Whether samples (N,) are whole numbers."""
+    """True if samples (N,) are whole numbers."""
     return bool(np.all(values == np.rint(values)))

@@ -70,8 +70,8 @@ def chosen_model(
 
 
 def other_vehicle(log: ChannelLog | None) -> str:
-    """What an autopilot's log says its vehicle is, and by what; empty of a helicopter, and where
-    nothing says so.
+    """Return the vehicle type that an autopilot's log states, and where; empty for a helicopter or
+    an unknown type.
 
     Args:
         log: of an autopilot; None of a table.

@@ -82,8 +82,8 @@ def scaled(
 
 
 def _is_sbus(channel: str, values: np.ndarray) -> bool:
-    """Whether whole numbers are counts of S.BUS: by the name, or about their middle and away from
-    that of pulses."""
+    """True if whole numbers are counts of S.BUS: by the name, or by a centre and range that pulses
+    do not have."""
     low, high = float(np.min(values)), float(np.max(values))
     if not are_whole(values) or abs(low - high) <= 20 or not 0 <= low <= high < 2048:
         return False
@@ -105,8 +105,8 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
 
 
 def _about(channel: str, si: str, words: tuple[str, str, str], rest: float, stop: float) -> Guess:
-    """Of numbers that rest at one and end `stop` from it; `words`: what they are, their unit, and
-    one of them."""
+    """Return the scale of numbers that rest at one and end `stop` from it; `words`: what they are,
+    their unit, and one of them."""
     what, unit, one = words
     remark = f"GUESS: {what}, {rest:g}{unit} at rest"
     if si == "1":
@@ -115,7 +115,7 @@ def _about(channel: str, si: str, words: tuple[str, str, str], rest: float, stop
 
 
 def _are_counts(channel: str, values: np.ndarray, si: str) -> bool:
-    """Whether whole numbers far from zero are those of a converter, and no angle or rate."""
+    """True if whole numbers far from zero are counts of a converter, and no angle or rate."""
     low, high = float(np.min(values)), float(np.max(values))
     if not are_whole(values) or low < 0.1 * high or _ROTORS & set(words_of(channel)):
         return False

@@ -1,4 +1,4 @@
-"""Which channels of a log may be the inputs and outputs of a model."""
+"""Channels of a log that may be the inputs and outputs of a model."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -82,12 +82,12 @@ def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, 
 
 
 def names_of_output(name: str) -> list[str]:
-    """What people call an output of a model, words by blanks."""
+    """Return usual names of an output of a model, words separated by blanks."""
     return [words_of(name), *tables.names()["outputs"].get(model_outputs().get(name, name), [])]
 
 
 def names_of_input(name: str) -> list[str]:
-    """What people call an input of a model, words by blanks."""
+    """Return usual names of an input of a model, words separated by blanks."""
     stick, called = _stick(name), tables.names()
     if name == "Omega":
         return [words_of(name), *called["rotor_speed"]]
@@ -103,7 +103,7 @@ def _stick(name: str) -> str | None:
 
 
 def words_of(name: str) -> str:
-    """What the model calls a signal, as words."""
+    """Return the model's name of a signal, as words."""
     return " ".join(guess.words_of(name))
 
 
@@ -120,7 +120,7 @@ def outputs_called(log: Log, called: Sequence[str], si: str) -> list[str]:
 
 
 def that_move(log: Log, names: Sequence[str]) -> list[str]:
-    """Of the channels those that move."""
+    """Return the channels that move."""
     return [n for n in names if np.nanstd(log.series[n].values) > 0]
 
 
@@ -206,9 +206,8 @@ _PARTS, _DEGREES, _INTEGERS = 1.5, 180.0, 1e6
 
 
 def is_place(name: str, log: Mapping[str, Series]) -> bool:
-    """Whether a channel is a latitude or a longitude, by its name and its numbers, or by a `Lng`
-    that stands beside it.
-    """
+    """True if a channel is a latitude or a longitude, by its name and its numbers, or by a `Lng`
+    beside it."""
     words = words_in(name)
     if not words or words[-1] not in _CALLED:
         return False

@@ -1,4 +1,4 @@
-"""What `new` knows of models and of names, from the files beside it."""
+"""Tables of `new` on models and names, from the files beside it."""
 
 from importlib import resources
 from typing import Any
@@ -7,7 +7,7 @@ from heli_jax.yaml_file import parse_mapping
 
 
 def names() -> dict[str, Any]:
-    """What people call sticks, motions and clocks."""
+    """Return usual names of sticks, motions and clocks."""
     return _file("names.yaml")
 
 

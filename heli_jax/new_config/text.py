@@ -331,7 +331,7 @@ def _unknown(model: Any) -> list[str]:
 
 
 def _ranges(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """What the channels of a log are like, where only their numbers tell."""
+    """Return the ranges of a log's channels, if only their numbers tell."""
     moving = {n: r for n, r in ranges.items() if r[0] < r[1]}
     shown = list(moving.items())[:_MOST_LISTED]
     lines = [f"      #   {_comment(n)}: {low:.4g} to {high:.4g}" for n, (low, high) in shown]
@@ -362,7 +362,7 @@ def _instruments(excitations: Mapping[str, str]) -> list[str]:
         return []
     return [
         "      # What an autopilot added to the stick, by the channel's name. With it,",
-        "      # method: frequency-error is right in closed loop too (docs/frequency.md).",
+        "      # method: frequency-error is right in closed loop too (docs/frequency-fits.md).",
         "      # instruments:",
         *(f"      #   {n}: {{signal: {_value(c)}}}   # GUESS" for n, c in excitations.items()),
     ]

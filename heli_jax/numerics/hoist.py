@@ -1,4 +1,5 @@
-"""What a function makes of the parameters alone, computed once instead of at every step."""
+"""Hoisting: the parts of a function that depend on parameters alone are computed once, not at every
+step."""
 
 # Why not leave it to XLA: `experiments/benchmarks/helicopter.py` runs batches of vehicles, in which
 # each quotient of two parameters is an array. XLA moves few such operations out of the loop over
@@ -71,13 +72,13 @@ def hoisted(
 
 
 def _along(equation: Any) -> bool:
-    """Whether one number is repeated along a record, as one that is added to it: that costs nothing
-    where it is read, and a record's memory where it is kept."""
+    """True if one number is repeated along a record: that costs nothing if it is read, and a
+    record's memory if it is kept."""
     return _repeats(equation) and equation.outvars[0].aval.ndim == 1
 
 
 def _repeats(equation: Any) -> bool:
-    """Whether it makes a long array of one number."""
+    """True if an equation makes a long array of one number."""
     return (
         equation.primitive.name == "broadcast_in_dim"
         and equation.invars[0].aval.size == 1

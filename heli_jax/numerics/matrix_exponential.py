@@ -103,7 +103,7 @@ def _eye(X: Float[Array, "n n *L"]) -> Float[Array, "n n *one"]:
 
 
 def _halvings(X: Float[Array, "n n *L"]) -> Float[Array, "*L"]:
-    """How often to halve X for the polynomial to be exact."""
+    """Return how often to halve X for the polynomial to be exact."""
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(X), axis=0), axis=0))
     return jnp.ceil(jnp.log2(jnp.maximum(norm, _THETA) / _THETA))
 
@@ -120,7 +120,7 @@ def _doubled(s: Float[Array, ""], double: Callable[[Any], Any], first: PyTree) -
 
 
 class VanLoan(NamedTuple):
-    """What a step of x' = A x + f + g w does to x."""
+    """Step of x' = A x + f + g w."""
 
     Phi: Float[Array, "n n"]
     """e^{A h}"""

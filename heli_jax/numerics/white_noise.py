@@ -69,7 +69,7 @@ def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def wanders(signal: np.ndarray) -> bool:
-    """Whether what is fastest in a signal is no white noise, as of an angle integrated from a rate.
+    """True if a signal's fastest part is no white noise, as in an angle integrated from a rate.
 
     In third differences white noise has an autocorrelation of -3/4 at one sample, white noise that
     was summed once has -2/3, what was smoothed has more than that. Too few samples tell nothing.
@@ -99,8 +99,8 @@ def wanders(signal: np.ndarray) -> bool:
 
 
 def rises_when_slower(signal: np.ndarray, every: int) -> bool:
-    """Whether a signal has more noise below a lower rate than near its own, as noise has that went
-    through a low-pass, with white noise over it or without.
+    """True if a signal has more noise below a lower rate than near its own, as noise has behind a
+    low-pass.
 
     White noise has as much in the third differences of every n-th sample as in those of neighbours.
 
@@ -118,7 +118,8 @@ def rises_when_slower(signal: np.ndarray, every: int) -> bool:
 
 
 def _third_differences(signal: np.ndarray, every: int) -> np.ndarray:
-    """Of samples so far apart, NaN where one is missing; of white noise they have its sd."""
+    """Return third differences of every so-many-th sample, NaN if one is missing; white noise keeps
+    its sd."""
     y = signal
     for _ in range(3):
         y = y[every:] - y[:-every]
@@ -137,7 +138,7 @@ def _without_corners(d: np.ndarray, sd: float) -> np.ndarray:
 
 
 def without_noise(signal: np.ndarray) -> bool:
-    """Whether a signal has no noise of a sensor: it was smoothed, or simulated.
+    """True if a signal has no sensor noise: it was smoothed, or simulated.
 
     Args:
         signal: (N,), NaN where nothing is measured.

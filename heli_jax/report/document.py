@@ -19,7 +19,7 @@ from heli_jax import naming
 from heli_jax.analysis.attitude_responses import Handling, HandlingPair
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
 from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
-from heli_jax.finding import Distrust, Finding
+from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.identification.equation_error.regression import Step
@@ -290,7 +290,7 @@ class EquationErrorContent(TypedDict):
     not_measured: Annotated[list[str], "hidden"]
     """states that nothing measured shows"""
     stepwise: Annotated[Stepwise | None, "selection"]
-    sentences: list[str]
+    sentences: Annotated[list[str], lambda start: sentences(start.findings)]
 
 
 class FrequencyErrorContent(TypedDict):
@@ -299,7 +299,7 @@ class FrequencyErrorContent(TypedDict):
     status: Status
     seconds: float
     values: dict[str, StartValue]
-    sentences: list[str]
+    sentences: Annotated[list[str], lambda start: sentences(start.findings)]
     notes: list[str]
 
 

@@ -20,8 +20,8 @@ from heli_jax.analysis.operating_point import (
     operating_point,
 )
 from heli_jax.analysis.spectra import (
-    OWN,
-    leakage,
+    Spectra,
+    is_own,
     partial_coherence,
     segment_transforms,
     size_of,
@@ -278,7 +278,7 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     Suu, Syy, Suy = np.real(S[:, 0, 0]), np.real(S[:, 1, 1]), S[:, 0, 1]
     # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
     # are coherent as well; and of zero frequency the segments' straight lines left nothing.
-    own = (Suu > OWN * leakage(Suu)) & (Syy > OWN * leakage(Syy))
+    own = is_own(Suu) & is_own(Syy)
     useful = (omega > 0) & (omega >= _BELOW * segments.lowest) & own & (Suu > 0) & (Syy > 0)
     omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
     coherence = np.abs(Suy) ** 2 / (Suu * Syy)
@@ -335,34 +335,22 @@ def coherences(
         if isinstance(record, str):
             results |= {(u, y): record for u in moving}
             continue
+        spectra, lowest = record
         i = naming.names(model.Outputs).index(y)
         for u in moving:
             j = naming.names(model.Inputs).index(u)
-            H = held(matrices, i, j, dt, record.omega)
+            H = held(matrices, i, j, dt, spectra.omega)
             # What the model expects of the input as it was logged.
-            H = H * nuisance_factor(fit, u, record.omega)
-            results[u, y] = _coherence(record, moving.index(u), H)
+            H = H * nuisance_factor(fit, u, spectra.omega)
+            results[u, y] = _coherence(spectra, lowest, moving.index(u), H)
     return results
-
-
-class _Spectra(NamedTuple):
-    """Fourier transforms of the half-overlapping segments of a record."""
-
-    omega: np.ndarray
-    """(k,) [rad/s], above zero and below the Nyquist frequency"""
-    lowest: float
-    """rad/s, see `Segments`"""
-    inputs: np.ndarray
-    """(k, segments, inputs)"""
-    measured: np.ndarray
-    """(k, segments)"""
-    simulated: np.ndarray
-    """(k, segments)"""
 
 
 def _spectra(
     signals: Signals, moving: list[str], output: str, dt: float, memory: float
-) -> _Spectra | str:
+) -> tuple[Spectra, float] | str:
+    """Moving inputs, output and simulation at inner frequencies, and the lowest one, see
+    `Segments`."""
     y, model = signals.measured[output], signals.simulated[output]
     if np.isnan(y).any():
         return "samples are missing"
@@ -373,36 +361,34 @@ def _spectra(
     if isinstance(segments, str):
         return segments
     channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
-    omega, transforms = segment_transforms(channels, dt, segments.length)
+    spectra = segment_transforms(channels, dt, segments.length)
     # Without the mean, which was taken out, and Nyquist's frequency; two periods in a segment are
     # the second frequency above zero.
-    first = 2 if segments.lowest else 1
-    omega, transforms = omega[first:-1], transforms[first:-1]
-    inputs, measured, simulated = transforms[..., :-2], transforms[..., -2], transforms[..., -1]
-    return _Spectra(omega, segments.lowest, inputs, measured, simulated)
+    inner = slice(2 if segments.lowest else 1, -1)
+    return spectra._replace(omega=spectra.omega[inner], X=spectra.X[inner]), segments.lowest
 
 
-def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
+def _coherence(spectra: Spectra, lowest: float, j: int, H: np.ndarray) -> Coherence:
     """Of input j, whose expected response is H (k,)."""
-    others = np.delete(record.inputs, j, axis=2)
-    alone = without(others, record.inputs[:, :, j])
+    inputs, measured, simulated = spectra.X[..., :-2], spectra.X[..., -2], spectra.X[..., -1]
+    others = np.delete(inputs, j, axis=2)
+    alone = without(others, inputs[:, :, j])
     power = np.sum(np.abs(alone) ** 2, axis=1)
     # The power that the output owes to this input: where the model expects no response, noise may
     # have its way, and a plain mean over frequencies would be that of the noise.
     # Infinite where a pole lies on the unit circle at one of the frequencies: that one is left out.
     weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
     # Over its own size: the squares of a simulation that diverged would be no numbers.
-    size = size_of(record.simulated)
-    total = float(np.sum(np.abs(record.simulated / size) ** 2))
+    size = size_of(simulated)
+    total = float(np.sum(np.abs(simulated / size) ** 2))
     # By Parseval the sums over frequencies are powers, with the same factor above and below.
     share = float(np.sum(weights)) / size / size / total if total > 0 else 0.0
     # The simulated output has neither noise nor disturbance: its coherence is what could be seen.
     value, expected = (
-        _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)
-        for y in (record.measured, record.simulated)
+        _mean(partial_coherence(others, inputs[:, :, j], y), weights) for y in (measured, simulated)
     )
     _, segments, others_count = others.shape
-    return Coherence(value, expected, share, segments, others_count, record.lowest)
+    return Coherence(value, expected, share, segments, others_count, lowest)
 
 
 def _mean(coherence: np.ndarray, weights: np.ndarray) -> float:

@@ -352,16 +352,12 @@ def write_netcdf(path: Path, responses: FlightResponses, units: Mapping[str, str
     def stacked(name: str) -> np.ndarray:
         return np.stack([[getattr(o.pairs[i], name) for i in inputs] for o in outputs])
 
-    H, composite = stacked("H"), stacked("picture")
+    H = stacked("H")
     # NetCDF 3 has no complex numbers.
     of_pairs = {
         "real": (np.real(H), f"real part, {parts}", of_H),
         "imaginary": (np.imag(H), f"imaginary part, {parts}", of_H),
         "sd": (stacked("sd"), f"of the real and of the imaginary part, {parts}", of_H),
-        "composite_real": (np.real(composite), f"real part of several windows, {parts}", of_H),
-        "composite_imaginary": (
-            np.imag(composite), f"imaginary part of several windows, {parts}", of_H
-        ),
         "coherence": (stacked("coherence"), "partial coherence", {"units": "1"}),
     }  # fmt: skip
     of_outputs = {

@@ -34,7 +34,7 @@ from heli_jax.simulation.stepping import (
 
 
 class Accumulated(NamedTuple):
-    """What is left of a run."""
+    """Result of an accumulated run."""
 
     value: PyTree
     state: Record
@@ -82,7 +82,8 @@ def accumulated(
     limits: bool = False,
     **keywords: Any,
 ) -> Accumulated:
-    """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
+    """Accumulate as `accumulate` does, with the last state and, if `limits`, whether the model's
+    range was left.
 
     Args:
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
@@ -137,7 +138,7 @@ def in_steps(
     limits: bool = False,
     options: SimulationOptions = DEFAULT,
 ) -> "Steps":
-    """What `accumulated` does at each step, for a loop that somebody else makes.
+    """Return the steps of `accumulated`, for a loop that the caller makes.
 
     Args and exceptions are those of `accumulated`.
     """
@@ -197,7 +198,7 @@ def _prepared(
     limits: bool,
     options: SimulationOptions,
 ) -> "tuple[_Reducer, _Stepping, Record]":
-    """What is done at a sample, how it is stepped from one to the next, and the first State."""
+    """Return the work at a sample, the step to the next one, and the first State."""
     # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
@@ -225,7 +226,7 @@ def _block(reducer: "_Reducer", args: ZeroOrderHoldArgs, options: SimulationOpti
 
 
 class _Reducer(NamedTuple):
-    """What is done at a sample."""
+    """Reduction at a sample."""
 
     of: Reducing
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None

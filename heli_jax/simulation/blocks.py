@@ -115,7 +115,7 @@ def _powers(A: Array, m: int) -> tuple[Array, Array]:
 
 
 class Reducing(NamedTuple):
-    """What a run is reduced by."""
+    """Reduction of a run by blocks."""
 
     model: Model
     params: Record
@@ -190,7 +190,8 @@ class Blocks(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """How many; at least one sample is left over: the last has outputs, but no step after."""
+        """Number of steps; at least one sample is left over, since the last has outputs but no step
+        after it."""
         return (self.samples - 1) // self.m
 
     def step(self, carry: PyTree, k: Int[Array, ""], /) -> PyTree:
@@ -299,7 +300,7 @@ def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record
 
 
 def _sum(terms: list[tuple[Array, Array]]) -> Array:
-    """Of products, from the first to the last."""
+    """Add products from the first to the last."""
     total = terms[0][0] * terms[0][1]
     for a, b in terms[1:]:
         total = total + a * b

@@ -29,7 +29,7 @@ class Discrete(NamedTuple):
     Bn: Any = None
 
     def in_scalars(self) -> "Discrete":
-        """As nested tuples."""
+        """Return the matrices as nested tuples."""
         return _once(Discrete(*(None if M is None else scalars(M) for M in self)))
 
 
@@ -68,7 +68,7 @@ def discretize(
 
 
 class _Added(NamedTuple):
-    """What inputs add to the state over some time."""
+    """Effect of inputs on the state over a time."""
 
     held: Float[Array, "n m"]
     """those of 1"""

@@ -34,7 +34,7 @@ def rotor_speed(lowest: Scalar, highest: Scalar) -> Event:
 def any_over(
     events: Mapping[str, Event], params: Record, state: Record, inputs: Record
 ) -> Bool[Array, ""]:
-    """Whether one of the events has come."""
+    """True if one of the events has occurred."""
     return jnp.any(jnp.stack([event(params, state, inputs) <= 0 for event in events.values()]))
 
 

@@ -1,5 +1,5 @@
-"""What an input does between two samples: it stays (zero-order), follows a straight line, or is
-mixed, which stays until it jumps and follows straight lines elsewhere.
+"""Inputs between samples: constant (zero-order), on a straight line (linear), or mixed, which stays
+until it jumps and follows straight lines elsewhere.
 
 A stick that is commanded in steps stays; one that was sampled while it moved does not. To hold such
 an input delays it by half a sample on average.
@@ -43,7 +43,7 @@ class Delays(eqx.Module):
         return self.groups[i] if i < len(self.groups) else None
 
     def members(self, group: int | None) -> tuple[int, ...]:
-        """Which inputs belong to a group."""
+        """Return which inputs belong to a group."""
         return tuple(i for i, g in enumerate(self.groups) if g == group)
 
 
@@ -284,8 +284,8 @@ def segments(
 
 
 def _divided(delays: Delays) -> tuple[list[Any], list[Any]]:
-    """Where an interval is divided [samples], its two ends with it, and the place of each group
-    among the divisions."""
+    """Return the division points of an interval [samples] with its two ends, and the place of each
+    group among them."""
     if len(delays.rest) == 1:  # nothing to sort, and nothing that depends on a value
         return [0.0, delays.rest[0], 1.0], [0]
     rest = jnp.stack(delays.rest)

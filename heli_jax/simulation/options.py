@@ -1,4 +1,4 @@
-"""How a run is simulated: one record in place of a dozen arguments."""
+"""Options of a simulation in one record."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from heli_jax.simulation.hold import Hold
 
 
 class SimulationOptions(NamedTuple):
-    """How `simulate` and `accumulate` carry out a run; each field is also a keyword of theirs."""
+    """Options of `simulate` and `accumulate`; each field is also a keyword of theirs."""
 
     # Any, as a number that is never None once a run has begun: the Flight has one, or it is
     # refused.

@@ -26,7 +26,7 @@ type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
 
 
 class ZeroOrderHoldArgs(NamedTuple):
-    """What a step needs to know: the parameters and the inputs, sample by sample.
+    """Arguments of a step: the parameters, and the inputs sample by sample.
 
     `inputs` holds arrays (N,). `delays` is None, or by how many samples each of them acts later
     than given. `dt` [s] is the sample time.
@@ -39,7 +39,7 @@ class ZeroOrderHoldArgs(NamedTuple):
     discrete: Discrete | None
 
     def in_scalars(self) -> "ZeroOrderHoldArgs":
-        """As a solver steps with it."""
+        """Return the arguments as a solver steps with them."""
         if self.discrete is None:
             return self
         return self._replace(discrete=self.discrete.in_scalars())
@@ -60,15 +60,15 @@ class IntervalArgs(NamedTuple):
 
 
 class RampArgs(NamedTuple):
-    """As `IntervalArgs`, for inputs that move: those at the begin of a step, and their slope per
-    second."""
+    """Arguments as `IntervalArgs`, for inputs that move: at the begin of a step, and their slope
+    per second."""
 
     params: Record
     inputs: Record
     slope: Record
 
     def after(self, t: Time) -> "RampArgs":
-        """As of t [s] later."""
+        """Return the arguments t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
@@ -89,7 +89,7 @@ type Stepped = tuple[PyTree, dfx.RESULTS]
 
 
 class _Stateless(dfx.AbstractSolver):
-    """What all solvers here share: straight lines between samples, nothing kept between steps."""
+    """Base of the solvers here: straight lines between samples, nothing kept between steps."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (

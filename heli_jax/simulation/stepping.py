@@ -1,4 +1,4 @@
-"""From a model and its inputs to a solver that makes one step a sample."""
+"""Solvers that make one step a sample, from a model and its inputs."""
 
 from collections.abc import Callable
 from typing import Any

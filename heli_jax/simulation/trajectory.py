@@ -1,4 +1,4 @@
-"""What a simulation gives."""
+"""Result of a simulation."""
 
 import functools
 from typing import TYPE_CHECKING, NamedTuple
@@ -44,7 +44,7 @@ class Trajectory(NamedTuple):
 
     @property
     def valid(self) -> Bool[Array, " N"]:
-        """Where the run is within the model's range and finite."""
+        """True at samples within the model's range that are finite."""
         # Sample by sample: a run that diverges is of use up to where it does.
         finite = [jnp.isfinite(v) for v in jax.tree.leaves(self.states)]
         return functools.reduce(

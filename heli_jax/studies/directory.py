@@ -84,7 +84,7 @@ def _word(value: Any) -> str:
 
 
 def read_fit(place: Path) -> dict[str, Any] | None:
-    """What fit.json or failed.json in a fit's directory holds; None where there is neither.
+    """Return the content of fit.json or failed.json in a fit's directory; None if there is neither.
 
     Raises:
         InputError: it cannot be read.

@@ -18,7 +18,7 @@ compiled kernel takes some, and past them the process dies."""
 
 
 class Task(NamedTuple):
-    """What a worker needs to know of a fit; plain data, for JSON."""
+    """Task of a worker, as plain data for JSON."""
 
     path: str
     """of the configuration, which need not exist there: relative paths begin at its folder"""
@@ -33,7 +33,7 @@ class Task(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a fit."""
+    """Outcome of a fit."""
 
     files: dict[str, bytes]
     """by path within its directory"""
@@ -95,7 +95,7 @@ def _in_words(point: dict[str, Any]) -> str:
 
 # Any: a FitRun, whose module takes a second to import.
 def _write_plain(run: Any, place: Path) -> None:
-    """What `load_fit` and `heli-jax compare` read, without the page."""
+    """Write what `load_fit` and `heli-jax compare` read, without the page."""
     import time
 
     from heli_jax.config import resolved

@@ -64,7 +64,7 @@ class _Process:
             return None
 
     def last_words(self) -> str:
-        """How it ended, and the last line that it wrote on standard error."""
+        """Return how it ended, and the last line that it wrote on standard error."""
         code = self.process.wait()
         ended = f"by signal {-code}" if code < 0 else f"with {code}"
         self.errors.seek(0)

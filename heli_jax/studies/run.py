@@ -26,7 +26,7 @@ STORE = "study.zarr"
 
 
 class Options(NamedTuple):
-    """How a study is carried out; nothing of it changes a number."""
+    """Options of carrying out a study; none changes a number."""
 
     resume: bool = False
     """go on with what is in the directory; what failed is tried again"""
@@ -107,7 +107,7 @@ def run(study: Study, out: Path, options: Options) -> xr.Dataset:
 
 
 def _tasks(study: Study, reports: bool) -> list[Task]:
-    """What workers are told; a value that the configuration cannot have is refused now."""
+    """Return the workers' tasks; refuse a value that the configuration cannot have."""
     tasks = []
     path = str(study.path.absolute())
     for point in study.points():

@@ -1,4 +1,4 @@
-"""How a sweep is cut: into chunks, and those into elements that a device computes side by side."""
+"""Division of a sweep into chunks, and of chunks into elements computed side by side."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -38,8 +38,7 @@ def split_for(
     shares: int = 1,
     say: Callable[[str], None] = lambda _: None,
 ) -> Split:
-    """How to cut a sweep: into chunks that are written at once, and those into what a device
-    computes side by side.
+    """Divide a sweep into chunks that are written at once, and these into batches of the device.
 
     Args:
         devices: of JAX; those of this process unless given.

@@ -176,7 +176,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _answering() -> Iterator[None]:
-    """What dask says of lost schedulers and of workers that cannot compute, as a sentence."""
+    """Report dask's lost schedulers and failed workers as a sentence."""
     try:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
@@ -194,7 +194,7 @@ def _answering() -> Iterator[None]:
 
 
 def _versions() -> dict[str, str]:
-    """Of what computes; the versions of what reads and draws may differ."""
+    """Return the versions of the packages that compute; those that read and draw may differ."""
     return {n: v for n, v in versions().items() if n in ("heli_jax", "jax", "jaxlib")}
 
 
@@ -224,8 +224,8 @@ def _check_versions(client: Client, where: str) -> None:
 
 
 def split_there(client: Client, job: Job, **options: Any) -> Split:
-    """How a worker would cut the sweep, with `options` of `split_for`: it may have other devices
-    than this process."""
+    """Divide a sweep as a worker would, with `options` of `split_for`: its devices may be others
+    than this process's."""
     options["shares"] = _threads(client)
     with _answering():
         # Not pure: dask would give the answer that it remembers of an equal job, which may be of
@@ -374,7 +374,7 @@ def _received(job: Job) -> Job:
 
 
 def _chunk(job: Job, split: tuple[int, int], chunk: int, token: str) -> dict[str, np.ndarray]:
-    """In a worker process: a chunk, with the program compiled at the first."""
+    """Compute a chunk in a worker process; the first one compiles the program."""
     with _building:
         if token not in _workers:
             _workers.clear()  # of an earlier sweep: its programs would stay in memory

@@ -12,7 +12,7 @@ _ELEMENTS = 1 << 20
 
 
 def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Which elements, and what the variable has for them, (k, ...); all of them in turn."""
+    """Yield elements and the variable's values for them (k, ...), all in turn."""
     # Others may have stored the elements last; a slice of them is a slice of rows here.
     variable = variable.transpose("element", ...)
     for start in range(0, variable.sizes["element"], _ELEMENTS):

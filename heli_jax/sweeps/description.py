@@ -18,7 +18,8 @@ from heli_jax.sweeps.spec import Job, moving_inputs_of
 
 
 def described(job: Job) -> dict[str, Any]:
-    """What fixes the numbers of a sweep, as plain data; equal for two jobs that give the same."""
+    """Return what fixes the numbers of a sweep, as plain data; equal for two jobs with the same
+    numbers."""
     # Stored with each sweep and compared when it is resumed: another key, or another text for the
     # same thing, refuses all stores there are. Large arrays stand in it as a digest.
     model = job.model

@@ -131,7 +131,7 @@ def whole_seeds(values: np.ndarray) -> np.ndarray:
 
 @runtime_checkable
 class Design(Protocol):
-    """What `sweep` needs of a design."""
+    """Interface of a design for `sweep`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ class Design(Protocol):
 
     @property
     def size(self) -> int:
-        """How many elements there are."""
+        """Number of elements."""
         ...
 
     def values(self, start: int, stop: int) -> Columns:
@@ -398,7 +398,7 @@ def log_axes(design: Design) -> set[str]:
 
 
 def _geometric(values: np.ndarray) -> bool:
-    """Whether each value is the one before times the same, as those of a range in the logarithm."""
+    """True if each value is the one before times the same factor."""
     if values.size < 3 or not (np.all(values > 0) or np.all(values < 0)):
         return False
     steps = np.diff(np.log(np.abs(values)))

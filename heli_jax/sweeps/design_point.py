@@ -117,7 +117,7 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
 
 
 def _is_trimmed(trim: Trim) -> jax.Array:
-    """Whether it is a steady flight that the sticks' travel allows."""
+    """True if it is a steady flight within the sticks' travel."""
     # `trim` raises where there is none; one of a batch can only be flagged.
     sound = plausible(trim) & (trim.residual < _TRIMMED)
     for name, (low, high) in STICKS.items():
@@ -155,7 +155,7 @@ _FUSED_BLOCK_FITS = 8
 
 
 class ElementResults(NamedTuple):
-    """What the compiled part gives for an element."""
+    """Results of the compiled part for an element."""
 
     results: dict[str, Any]
     trajectories: dict[str, Any]
@@ -295,8 +295,8 @@ def _gained_and_offset(inputs: Any, special: Scalars) -> Any:
 
 
 def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """What all streaming reducers do at a sample, their values before the first, and the measured
-    signals (N,) that they compare with."""
+    """Return the streaming reducers' step at a sample, their first values, and the measured signals
+    (N,) to compare with."""
     dtype = numbers.dt.dtype
     signals = {n: r.signal for n, r in plan.reduce}
     streams = {n: s for n, r in plan.reduce if (s := reducers.streaming(r)) is not None}
@@ -333,7 +333,7 @@ def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int)
 
 
 def _of_function(name: str, function: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
-    """What a function of the user's gives for a run, by name."""
+    """Return the results of a user's function for a run, by name."""
     called = getattr(function, "__qualname__", str(function))
     try:
         results = {n: jnp.asarray(v) for n, v in _named(name, function(run)).items()}
@@ -389,7 +389,7 @@ def _streamed_options(
 def _of_reduced(
     plan: Plan, numbers: FlightNumbers, value: Any, state: Any, outside: dict[str, Any]
 ) -> _Run:
-    """What is left of a run that was not kept."""
+    """Return the results of a run that was not kept."""
     n = jax.tree.leaves(numbers.inputs)[0].shape[0]
     return _finished(plan, numbers, value, n), {}, state, list(outside.values())
 

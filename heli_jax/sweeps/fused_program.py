@@ -95,7 +95,7 @@ class FusedProgram:
 
 
 def _records(numbers: FlightNumbers) -> Any:
-    """What of a flight is read sample by sample, arrays (N,)."""
+    """Return the parts of a flight that are read sample by sample, arrays (N,)."""
     return numbers.inputs, {n: (m.values, m.seen) for n, m in numbers.measured.items()}
 
 
@@ -113,7 +113,7 @@ def _without(numbers: FlightNumbers) -> FlightNumbers:
 
 
 def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
-    """What one element is made of."""
+    """Return the numbers of one element."""
     plan, numbers = job.plan(index), flight_numbers(job, index)
     values = {n: v[0] for n, v in arguments(job, job.design.values(0, 1)).items()}
     trim = None

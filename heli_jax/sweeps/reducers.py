@@ -1,4 +1,4 @@
-"""What is kept of each run of a sweep: numbers that are gathered while the run goes on.
+"""Reducers: numbers that are gathered from each run of a sweep while it goes on.
 
 A reducer starts with some running values, updates them at every sample, and turns them into its
 result at the end, so that nothing of the run is stored. A function of a whole run may take its

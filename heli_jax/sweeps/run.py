@@ -33,7 +33,7 @@ _SAMPLED = 64  # elements on which float32 is compared with float64: enough to s
 
 
 class Progress(NamedTuple):
-    """How far a sweep is."""
+    """Progress of a sweep."""
 
     done: int
     """elements finished, those of earlier runs too"""
@@ -66,7 +66,7 @@ class Pace:
 
 
 class Options(NamedTuple):
-    """How a sweep is carried out; nothing of it changes a number, but how it is cut may change the
+    """Options of carrying out a sweep; none changes its numbers, but the division may change the
     last digit."""
 
     resume: bool = False
@@ -169,7 +169,7 @@ def run_sweep(
 
 
 def _notes(job: Job) -> list[Finding]:
-    """What of a sweep has no effect, or another than one might think."""
+    """Return notes on settings without effect, or with an unexpected one."""
     name = job.model.name
     without_effect = [
         note(
@@ -213,7 +213,7 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
 
 
 def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict[str, Any]]:
-    """How the sweep is cut, and the attributes of its store."""
+    """Return the division of the sweep and the attributes of its store."""
     for name in ("chunk", "lanes"):
         number = getattr(options, name)
         if number is not None and number < 1:
@@ -297,7 +297,7 @@ def _local(
 
 
 def float32_error(job: Job) -> dict[str, float | str]:
-    """How far the results in float32 are from those in float64, of the largest of each result, on
+    """Return the error of float32 against float64, relative to the largest of each result, on
     elements from all over the design."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return {"note": "not measured: float64 is switched off in JAX"}

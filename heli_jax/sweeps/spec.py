@@ -47,7 +47,7 @@ class Trimmed(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """How each run of a sweep is made; each field is also a keyword of `sweep`."""
+    """Options of each run of a sweep; each field is also a keyword of `sweep`."""
 
     solver: str | None = None
     """"exact" (linear models, the default there), "rk4", or a diffrax solver's name; steps are
@@ -66,7 +66,7 @@ class RunOptions(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What is compiled for a sweep; sweeps of the same plan share the program."""
+    """Compiled part of a sweep; sweeps of the same plan share the program."""
 
     # The key under which `program` remembers what it compiled: every field can be hashed, and no
     # number of a vehicle or a flight is among them.
@@ -84,7 +84,8 @@ class Plan(NamedTuple):
     """inputs that are linear or mixed between samples, with their holds; the others are held"""
 
     def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
-        """How a run is simulated; `numbers` are the fields that an element has of its own."""
+        """Return the simulation options of a run; `numbers` are the fields that differ between
+        elements."""
         return SimulationOptions(
             solver=solver_named(self.solver),
             substeps=self.substeps,
@@ -135,7 +136,7 @@ class Job(NamedTuple):
 
     @property
     def streamed(self) -> bool:
-        """Whether every run is reduced while it goes on, and nothing of it has to be kept."""
+        """True if every run is reduced while it goes on and none is kept."""
         how = [r.how for r in self.reduce.values()]
         whole = any(callable(h) and not isinstance(h, reducers.Streaming) for h in how)
         # `accumulate` has no delay, no noise and no feedback, which `simulate` has: such runs are
@@ -146,7 +147,7 @@ class Job(NamedTuple):
 
     @property
     def simulated(self) -> bool:
-        """Whether anything has to be simulated at all."""
+        """True if anything is simulated."""
         kept = [r for r in self.reduce.values() if r.how not in reducers.LINEAR]
         return bool(kept) or self.trajectories is not None
 

@@ -56,7 +56,7 @@ class Store:
         return set(self._arrays)
 
     def done(self) -> np.ndarray:
-        """Which chunks are finished, (number of chunks,)."""
+        """Finished chunks, (number of chunks,)."""
         # The first element of each tells: the status of a chunk is one file, which is there as a
         # whole or not at all.
         status = self._arrays["status"]
@@ -65,7 +65,7 @@ class Store:
         return np.asarray(firsts).reshape(-1) != NOT_RUN
 
     def whole(self) -> np.ndarray:
-        """Which chunks are finished, as `done`, and can be read; with no file of them missing.
+        """Return finished chunks as `done`, of which no file is missing or unreadable.
 
         Raises:
             InputError: one is, or the store cannot be read.
@@ -117,7 +117,7 @@ class Store:
 
 @contextlib.contextmanager
 def readable(where: str) -> Iterator[None]:
-    """What Zarr says of a damaged file, as a sentence."""
+    """Report Zarr's error on a damaged file as a sentence."""
     try:
         yield
     except InputError:
@@ -131,7 +131,7 @@ def readable(where: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _words(where: str) -> Iterator[None]:
-    """What the system says of a file that cannot be written, as a sentence."""
+    """Report the system's error on a file that cannot be written as a sentence."""
     try:
         yield
     except OSError as e:

@@ -1,4 +1,4 @@
-"""What a sweep came to, in a page of JSON."""
+"""Summary of a sweep, a page of JSON."""
 
 import contextlib
 import functools
@@ -95,7 +95,8 @@ def _ends(variable: xr.DataArray) -> dict[str, Any]:
 
 
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
-    """Of the finite values of the elements that are ok, and how many values are none.
+    """Return quantiles of the finite values of the elements that are ok, and the number of values
+    that are not finite.
 
     Over flights and modes too, where a result has them.
     """
@@ -138,7 +139,8 @@ def worst(dataset: xr.Dataset, job: Job, sign: float = 1.0) -> dict[str, np.ndar
 
 
 def _badness(part: np.ndarray, *, small_is_bad: bool, sign: float) -> np.ndarray:
-    """What is to be large (elements,) of a result (elements, ...)."""
+    """Return the measure (elements,) by which a result (elements, ...) is worst where it is
+    large."""
     values = part.astype(np.float64)  # a bool or an integer has no minus
     bad = -values if small_is_bad else np.abs(values)
     # The worst flight first, whichever end is looked for.

@@ -48,8 +48,8 @@ class Variable(NamedTuple):
 
 
 class Split(NamedTuple):
-    """How a sweep is cut: part of what the store remembers, so that a resumed sweep computes each
-    element in the same company."""
+    """Division of a sweep; the store remembers a part of it, so that a resumed sweep computes each
+    element in the same batch."""
 
     chunk: int
     """elements written at a time"""
@@ -60,7 +60,7 @@ class Split(NamedTuple):
     run"""
 
     def chunks(self, size: int) -> int:
-        """How many chunks a sweep of so many elements has."""
+        """Return the number of chunks of a sweep of `size` elements."""
         return -(-size // self.chunk)
 
 
@@ -137,7 +137,7 @@ def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:
 
 
 def _place(name: str, order: list[str]) -> int:
-    """Where a result stands: with the reducer that it is of, named alike or before a key."""
+    """Return the place of a result: at its reducer, named alike or before a key."""
     # A function of several numbers gives NAME_KEY.
     if name in order:
         return order.index(name)
@@ -267,7 +267,7 @@ class Worker:
         return results
 
     def _impossible(self, columns: dict[str, np.ndarray]) -> np.ndarray:
-        """Which elements are no machine that can be, by their parameters alone."""
+        """Return the elements whose parameters are impossible."""
         count = len(next(iter(columns.values())))
         # A model of one's own says itself what has to be positive; what a helicopter can be is
         # known here.

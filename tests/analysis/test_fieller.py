@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heli_jax.analysis.responses import responses
-from heli_jax.analysis.spectra import CrossSpectra
+from heli_jax.analysis.spectra import Spectra
 
 RESPONSE, WINDOWS, DRAWS = 2.0 - 1.0j, 20, 4000
 
@@ -20,8 +20,7 @@ def drawn(strength, seed=0):
     z, e = normal(), normal()
     u = strength * z + 0.8 * e + 0.6 * normal()
     signals = np.stack([u, RESPONSE * u + e, z])
-    S = np.einsum("awk,bwk->kab", np.conj(signals), signals) / WINDOWS
-    spectra = CrossSpectra(np.arange(1.0, DRAWS + 1.0), S, float(WINDOWS), 1.0)
+    spectra = Spectra(np.arange(1.0, DRAWS + 1.0), signals.T, float(WINDOWS), 1.0)
     return responses(spectra, [0], [1], instruments=[2])
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.analysis.responses import TooFewAveragesError, combined, responses, weights_by_output
+from heli_jax.analysis.responses import TooFewAveragesError, responses
 from heli_jax.analysis.spectra import cross_spectra
 
 DT = 0.02
@@ -31,7 +31,9 @@ def test_spectra_and_coherence_are_those_of_scipy(noise):
     same = {"fs": 1 / DT, "nperseg": 1000, "noverlap": 500, "detrend": "constant"}
     for a, b in ((0, 0), (0, 1), (2, 1)):
         theirs = scipy.signal.csd(noise[a], noise[b], **same)[1][4:60]
-        np.testing.assert_allclose(spectra.S[:, a, b], theirs, atol=1e-12 * np.max(np.abs(theirs)))
+        np.testing.assert_allclose(
+            spectra.density[:, a, b], theirs, atol=1e-12 * np.max(np.abs(theirs))
+        )
     theirs = scipy.signal.coherence(noise[0], noise[1], **same)[1][4:60]
     np.testing.assert_allclose(responses(spectra, [0], [1]).coherence[:, 0, 0], theirs, atol=1e-10)
 
@@ -112,17 +114,6 @@ def test_sticks_that_move_as_one_have_no_response_each(noise):
     assert np.isnan(found.coherence).all()
 
 
-def test_a_composite_has_low_frequencies_of_long_segments_and_high_ones_of_short(noise):
-    record = np.stack([noise[0], low_pass(noise[0]) + 0.3 * noise[1]])
-    omega = 2.0 * np.pi * np.geomspace(0.06, 10.0, 40)
-    several = [cross_spectra([record], DT, omega, s) for s in (5.0, 40.0)]
-    both = combined(several, weights_by_output(several, [0], [1])[:, :, 0])
-    np.testing.assert_allclose(both.S[0], several[1].S[0], rtol=1e-6)
-    assert both.averages[-1] > 0.8 * several[0].averages
-    with pytest.raises(ValueError, match="same frequencies"):
-        weights_by_output([several[0], cross_spectra([record], DT, omega[1:], 5.0)], [0], [1])
-
-
 @pytest.mark.parametrize("change", [{"seconds": 500.0}, {"omega": np.array([0.0, 1.0])}])
 def test_what_no_segment_can_show_is_refused(noise, change):
     arguments = {"records": [noise], "dt": DT, "omega": BAND, "seconds": 20.0} | change
@@ -140,5 +131,6 @@ def test_records_of_any_length_are_averaged_by_their_segments(noise):
     long, short = noise[:, :4000], noise[:, 4000:5500]
     whole = cross_spectra([long, short, noise[:, 5900:]], DT, BAND, 20.0)
     parts = [cross_spectra([r], DT, BAND, 20.0) for r in (long, short)]
-    np.testing.assert_allclose(whole.S, (7 * parts[0].S + 2 * parts[1].S) / 9, rtol=1e-12)
+    expected = (7 * parts[0].density + 2 * parts[1].density) / 9
+    np.testing.assert_allclose(whole.density, expected, rtol=1e-12)
     assert whole.averages == pytest.approx(parts[0].averages + parts[1].averages)

@@ -10,12 +10,12 @@ from heli_jax.analysis.spectra import ResponseOptions
 from heli_jax.identification.diagnostics.loop import inputs_follow_response
 from heli_jax.identification.diagnostics.search import band_unused
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.frequency_error import _weighed, projected
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
     following,
 )
 from heli_jax.identification.estimation.frequency_noise import smoothed
-from heli_jax.identification.estimation.frequency_slopes import _Sums, _weighed
 from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
@@ -80,9 +80,10 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
 
     def weighed(Z):
         # Parts of complex errors, of half their variance; derivatives of what is taken off.
-        r, z, j = (v / 2**0.5 for v in (e, -Z, -J))
-        sums = (r @ r, z @ r, z @ z.T, z @ j.T, r @ Q, (z @ Q).T, (j @ Q).T)
-        return [np.asarray(v) for v in _weighed(_Sums(*(jnp.asarray(v) for v in sums)).products())]
+        r, z, j = (v / 2**0.5 for v in (e[:, None], -Z.T, -J.T))
+        left, right = np.concatenate([z, r, Q], axis=1), np.concatenate([z, r, j], axis=1)
+        G = jnp.asarray(left.T @ right)
+        return [np.asarray(v) for v in _weighed(projected(G, jnp.eye(4)))]
 
     r, M = weighed(Z)
     # The same with the ends projected out of everything by hand.

@@ -7,9 +7,8 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from heli_jax import Flight, Free, Problem, fit, linear_model
+from heli_jax import Fit, Flight, Free, Problem, fit, linear_model
 from heli_jax.flights.holds import decide
-from heli_jax.identification.select import with_likelier_hold
 
 TRUTH = {"Lp": -5.0, "Lda": 30.0}
 RATE = """
@@ -43,25 +42,38 @@ def _flight(*, held: bool) -> Flight:
     )
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_an_input_is_held_where_the_record_says_so(tmp_path, held):
+def _fitted(tmp_path, flight: Flight) -> Fit:
     (tmp_path / "rate.yaml").write_text(RATE)
     rate = linear_model(tmp_path / "rate.yaml")
     free = {"Lp": Free(-2.0), "Lda": Free(10.0)}
-    problem = Problem(rate.model, rate.vehicle({}).params, [_flight(held=held)], free)
-    asked, found = with_likelier_hold(problem, fit(problem), fit)
-    taken = asked.flights[0].hold["da"]
-    assert taken == ("zero-order" if held else "linear")
-    assert ("timing.likelier-hold" in {f.code for f in found.findings}) is held
+    return fit(Problem(rate.model, rate.vehicle({}).params, [flight], free))
+
+
+def test_inputs_that_the_record_shows_to_be_held(tmp_path):
+    found = _fitted(tmp_path, _flight(held=True))
+    [doubt] = [f for f in found.findings if f.code == "timing.likelier-hold"]
+    assert found.exit_code == 3
+    assert set(doubt.distrusts) == set(found.untrusted) == set(TRUTH)
+    # The remedy is what the finding says: the hold, stated.
+    stated = dataclasses.replace(_flight(held=True), hold={"da": "zero-order"}, hold_reason={})
+    right = _fitted(tmp_path, stated)
+    assert right.exit_code == 0
+    assert right.log_likelihood - found.log_likelihood > 10.0
+    for name, e in right.estimates.items():
+        assert e.value == pytest.approx(TRUTH[name], abs=3.5 * e.sd)
+
+
+def test_inputs_on_straight_lines(tmp_path):
+    found = _fitted(tmp_path, _flight(held=False))
+    assert found.exit_code == 0
     for name, e in found.estimates.items():
         assert e.value == pytest.approx(TRUTH[name], abs=3.5 * e.sd)
-    if not held:
-        # As much as the other hold would change is told.
-        [note] = [f for f in found.findings if f.code == "timing.other-hold"]
-        other = dataclasses.replace(asked.flights[0], hold={"da": "zero-order"}, hold_reason={})
-        changed = fit(dataclasses.replace(asked, flights=[other])).estimates[note.subjects[1]]
-        e = found.estimates[note.subjects[1]]
-        assert abs(changed.value - e.value) / e.sd == pytest.approx(note.value, rel=0.2)
+    # As much as the other hold would change is told.
+    [note] = [f for f in found.findings if f.code == "timing.other-hold"]
+    other = dataclasses.replace(_flight(held=False), hold={"da": "zero-order"}, hold_reason={})
+    changed = _fitted(tmp_path, other).estimates[note.subjects[1]]
+    e = found.estimates[note.subjects[1]]
+    assert abs(changed.value - e.value) / e.sd == pytest.approx(note.value, rel=0.2)
 
 
 def _on_a_test_card(stepped: bool, chirped: bool, seed: int) -> Flight:
@@ -114,13 +126,3 @@ def test_the_delay_of_a_test_card(tmp_path, stepped, chirped, hold):
         e = found.estimates[name]
         assert e.value == pytest.approx(truth, abs=3.5 * e.sd)
     assert found.estimates["tau"].sd < 0.0006
-
-
-def test_what_was_stated_stays(tmp_path):
-    (tmp_path / "rate.yaml").write_text(RATE)
-    rate = linear_model(tmp_path / "rate.yaml")
-    stated = dataclasses.replace(_flight(held=True), hold_reason={})
-    free = {"Lp": Free(-2.0), "Lda": Free(10.0)}
-    problem = Problem(rate.model, rate.vehicle({}).params, [stated], free)
-    found = fit(problem)
-    assert with_likelier_hold(problem, found, fit) == (problem, found)

@@ -14,7 +14,13 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.diagnostics.adequacy import responses_explained
-from heli_jax.identification.validation.score_test import BROAD, NARROW, lines_of, strongest
+from heli_jax.identification.validation.score_test import (
+    BROAD,
+    NARROW,
+    Drive,
+    lines_of,
+    strongest,
+)
 from heli_jax.identification.validation.unmodelled import own_samples
 from heli_jax.naming import Scalar
 from tests.identification.lag import LAG, Inputs, Params, Rate, response
@@ -206,6 +212,9 @@ def test_nothing_is_missed_of_a_right_model(method, coloured):
     assert not [f for f in found.findings if f.code.startswith("dynamics.")]
 
 
+STICK = [Drive(0, "input", ("d",), NARROW)]
+
+
 def drawn(rng, noise):
     """Lines of a residual that knows nothing of its drive."""
     u = steps(rng)
@@ -225,7 +234,7 @@ def of_a_hump(rng):
 @pytest.mark.parametrize("noise", [of_lines, of_a_hump])
 def test_chance_makes_no_answer_whatever_the_spectrum(noise):
     rng = np.random.default_rng(11)
-    p = [strongest([drawn(rng, noise)], [0], NARROW).p_value for _ in range(60)]
+    p = [strongest([drawn(rng, noise)], STICK).p_value for _ in range(60)]
     # At 1 % six of sixty come in one case of a hundred thousand.
     assert np.sum(np.array(p) < 0.01) < 6
 
@@ -238,7 +247,7 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
     answer = scipy.signal.lfilter([1.0], [1.0, -2.0 * r * np.cos(turn), r * r], u)
     e = rng.standard_normal(N) + 0.15 * answer / answer.std()
     lines = lines_of(e, u[:, None], u[:, None])
-    found = strongest([lines], [0], NARROW)
+    found = strongest([lines], STICK)
     assert found.p_value < 0.01
     assert found.frequency / DT == pytest.approx(6.0, rel=0.1)
     assert found.damping == 0.1
@@ -248,7 +257,7 @@ def test_the_answer_through_a_filter_is_found_where_it_is():
     assert found.statistic == pytest.approx(N * np.log(less[0] / less[1]), rel=0.25)
     # Beside the same filter of the drive nothing of it is left to its cube.
     both = lines_of(e, u[:, None], np.stack([u, u**3], axis=1))
-    assert strongest([both], [1], BROAD, beside=[0], plain=True).p_value > 0.01
+    assert strongest([both], [Drive(1, "amplitude", (), BROAD, (0,))]).p_value > 0.01
 
 
 def wandering(rng):
@@ -267,8 +276,8 @@ def test_a_hole_in_the_record_makes_no_answer():
         # Two slow things that know nothing of each other: both jump where samples are missing.
         u, e = wandering(rng), wandering(rng)
         columns = [with_a_hole(v) for v in (e, np.arange(N)[:, None] / N, u[:, None])]
-        p.append(strongest([lines_of(*columns, [700])], [0], NARROW).p_value)
-        joined.append(strongest([lines_of(*columns)], [0], NARROW).p_value)
+        p.append(strongest([lines_of(*columns, [700])], STICK).p_value)
+        joined.append(strongest([lines_of(*columns)], STICK).p_value)
     assert np.sum(np.array(p) < 0.01) < 3
     # As if no sample were missing, most of them are answers.
     assert np.sum(np.array(joined) < 0.01) > 10
@@ -280,7 +289,7 @@ def test_an_answer_is_found_beside_a_hole():
     answer = scipy.signal.lfilter([1.0], [1.0, -1.95, 0.96], u)
     e = rng.standard_normal(N) + 0.4 * answer / answer.std()
     columns = [with_a_hole(v) for v in (e, u[:, None], u[:, None])]
-    assert strongest([lines_of(*columns, [700])], [0], NARROW).p_value < 0.001
+    assert strongest([lines_of(*columns, [700])], STICK).p_value < 0.001
 
 
 def test_where_samples_are_missing():

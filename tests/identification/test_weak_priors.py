@@ -12,7 +12,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.identification.unknowns.initial_guess import WeakUnknown
+from heli_jax.identification.unknowns.layout import FlightUnknown
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
@@ -154,7 +154,7 @@ def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
     for hold, identifiable in ((20.0, False), (2.0, True)):
         bare = np.array([[0.5]])
         without_weak = WithoutWeakPriors(
-            bare, np.array([[1.0]]), (WeakUnknown("flight 1/bias p", "bias", "the bias of p"),)
+            bare, np.array([[1.0]]), (FlightUnknown("flight 1/bias p", "bias", "p", 0),)
         )
         verdict = analyse(hold * bare, (offset,), without_weak=without_weak)
         assert verdict.identifiable is identifiable

@@ -38,11 +38,11 @@ def test_partial_coherence_is_that_of_scipys_spectra(count):
     y = sum(scipy.signal.lfilter([0.0, 0.3 + k], [1.0, -0.9], u) for k, u in
             enumerate(inputs.values())) + 3.0 * rng.standard_normal(n)  # fmt: skip
     s = Signals("f", False, np.arange(n) * dt, inputs, {"y": y}, {"y": y})
-    found = _spectra(s, list(inputs), "y", dt, 1.0)
+    found, _ = _spectra(s, list(inputs), "y", dt, 1.0)
     length = 2 * (found.omega.size + 1)
     for j in range(count):
-        others = np.delete(found.inputs, j, axis=2)
-        ours = partial_coherence(others, found.inputs[:, :, j], found.measured)
+        others = np.delete(found.X[..., :count], j, axis=2)
+        ours = partial_coherence(others, found.X[..., j], found.X[..., count])
         np.testing.assert_allclose(ours, by_scipy(inputs.values(), y, j, length, dt), rtol=1e-8)
 
 

@@ -8,7 +8,7 @@ of two parts together is the triangle of both, one above the other.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -57,22 +57,6 @@ def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivi
     count = layout.first_nuisance - len(unknowns)
     shared = np.hstack([rows.sensitivity, rows.nuisances[:, :count]])
     return Sensitivity(unknowns, shared, rows.nuisances[:, count:])
-
-
-# Any: of NumPy or of JAX.
-def own_unknowns(layout: Layout, z: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return by flight the initial states (windows, states), and the biases and offsets, in z.
-
-    Args:
-        layout: what stands where.
-        z: the unknowns (q,).
-    """
-    z, at, k, parts = np.asarray(z), layout.first_nuisance, len(layout.states), []
-    for (windows, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        first, size = at + windows * k, layout.constants(outputs)
-        parts.append((z[at:first].reshape(windows, k), z[first : first + size]))
-        at = first + size
-    return parts
 
 
 def triangle(s: Sensitivity) -> Float[np.ndarray, "s s"]:

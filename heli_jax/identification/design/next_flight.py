@@ -21,7 +21,6 @@ from heli_jax.identification.design.accuracy import (
     Sensitivity,
     expected_sd,
     not_determined,
-    own_unknowns,
     sensitivity_at,
     together,
     triangle,
@@ -30,7 +29,13 @@ from heli_jax.identification.design.windows import DETERMINES
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Solution, layout_of
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Solution,
+    flight_places,
+    layout_of,
+)
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
 TYPICAL = {"rad": 0.01, "rad/s": 0.01, "m": 0.5, "m/s": 0.1, "m/s^2": 0.3}
@@ -73,16 +78,15 @@ def look_at_missing(
     # The output of each row; what follows the samples belongs to every choice.
     numbers, named = signal_numbers(layout, data), np.array([n for _, n in signals(layout)])
     output = np.concatenate([named[numbers], np.full(len(s.shared) - numbers.size, "")])
-    columns = own_unknowns(layout, np.arange(layout.size) - layout.first_nuisance)
     shared, own = s.shared.copy(), s.own.copy()
     for name, sd in sds.items():
         shared[output == name] /= sd
         own[output == name] /= sd
-        for (_, constants), outputs, run in zip(columns, layout.outputs, e.simulated, strict=True):
-            if layout.bias:
-                # A weak prior of ten times the signal, as of the outputs that are measured.
-                rms = float(np.sqrt(np.mean(run[name] ** 2)))
-                own[:, constants[outputs.index(name)]] *= 10.0 * rms
+        each = zip(flight_places(layout), layout.outputs, e.simulated, strict=True)
+        for places, outputs, run in each if layout.bias else ():
+            # A weak prior of ten times the signal, as of the outputs that are measured.
+            bias = places.biases[outputs.index(name)] - layout.first_nuisance
+            own[:, bias] *= 10.0 * float(np.sqrt(np.mean(run[name] ** 2)))
     s = s._replace(shared=shared, own=own)
     used = ~np.isin(output, lacking)
     before, results = expected_sd(s.unknowns, triangle(s.part(used))), []
@@ -99,12 +103,10 @@ def look_at_missing(
 
 def _extended(problem: Problem, at: Solution, lacking: list[str]) -> tuple[Layout, Data, jax.Array]:
     """Layout, data and unknowns with further outputs, of which nothing is measured yet."""
-    dtype, flights, parts, z = at.z.dtype, [], [], [np.asarray(at.z)[: at.layout.first_nuisance]]
-    ones = {n: jnp.ones((), dtype) for n in lacking}
-    own = own_unknowns(at.layout, at.z)
-    for flight, numbers, (states, constants) in zip(
-        problem.training, at.data.flights, own, strict=True
-    ):
+    dtype, flights, parts, whole = at.z.dtype, [], [], np.asarray(at.z)
+    z, ones = [whole[: at.layout.first_nuisance]], {n: jnp.ones((), dtype) for n in lacking}
+    own = flight_places(at.layout)
+    for flight, numbers, places in zip(problem.training, at.data.flights, own, strict=True):
         zeros = np.zeros(flight.n_samples)
         flights.append(replace(flight, outputs={**flight.outputs, **dict.fromkeys(lacking, zeros)}))
         outputs = {**numbers.outputs, **{n: jnp.asarray(zeros, dtype) for n in lacking}}
@@ -115,7 +117,8 @@ def _extended(problem: Problem, at: Solution, lacking: list[str]) -> tuple[Layou
             )
         )
         # Biases are zero at the start values, so that only their number counts.
-        z += [states.ravel(), np.zeros(len(lacking) if at.layout.bias else 0), constants]
+        zero = np.zeros(len(lacking) if at.layout.bias else 0)
+        z += [whole[places.states.ravel()], zero, whole[places.constants]]
     layout = layout_of(problem, tuple(flights))
     data = at.data._replace(flights=tuple(parts))
     return layout, data, jnp.asarray(np.concatenate(z), dtype)
@@ -239,7 +242,7 @@ def _flown(
 ) -> list[Sensitivity]:
     """The rows of each candidate, a flight of m samples that begins as the i-th one does."""
     flight, numbers, model = problem.training[i], at.data.flights[i], problem.model
-    dtype, (states, constants) = at.z.dtype, own_unknowns(at.layout, at.z)[i]
+    dtype, whole, places = at.z.dtype, np.asarray(at.z), flight_places(at.layout)[i]
 
     def of_length(n: int) -> Layout:
         inputs, outputs = (dict.fromkeys(s, np.zeros(n)) for s in (flight.inputs, flight.outputs))
@@ -257,9 +260,8 @@ def _flown(
     # another begins in the state and with the sticks that the record begins with.
     moves = 0.0 if model.linear else 1.0
     rest = {k: np.full(n, moves * float(u[0])) for k, u in flight.inputs.items()}
-    begin = moves * states[0]
-    shared = np.asarray(at.z)[: at.layout.first_nuisance]
-    z = jnp.asarray(np.concatenate([shared, begin, 0.0 * constants]))
+    shared, begin = whole[: at.layout.first_nuisance], moves * whole[places.states[0]]
+    z = jnp.asarray(np.concatenate([shared, begin, np.zeros(places.constants.size)]))
     measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
     noise = at.noise._replace(sd=(at.noise.sd[i],))
     each = []

@@ -76,12 +76,12 @@ def diagnose(c: Context) -> tuple[Finding, ...]:
 
 
 def _counts(f: Finding) -> bool:
-    """Whether a finding changes what is concluded of a fit."""
+    """True if a finding changes what is concluded of a fit."""
     return f.denies or bool(f.distrusts)
 
 
 def _rank(f: Finding, c: Context) -> int:
-    """What ends a fit with an exit code comes first, then doubts, notes and what was found well."""
+    """Order: exit codes first, then doubts, notes and what is good."""
     if f.denies or f.severity == "refuse":
         return 0
     if distrusted([f], c.estimates):

@@ -23,7 +23,6 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
     if not c.fitted or c.adequacy.by_chance:
         return
     doubted = [o for o in c.adequacy.judged if not o.adequate or o.doubtful]
-    apart = len(doubted) < len(c.adequacy.judged)
     for output in doubted:
         yield found(
             _why(output, c.adequacy.ahead),
@@ -38,7 +37,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
             lag1=output.lag1,
             times=np.sqrt(output.against_disturbance or np.nan),
             seconds=c.adequacy.ahead or 0.0,
-            advice=advice_for(c.problem, output, c.records, c.adequacy.unstable, apart),
+            advice=advice_for(c.problem, output, c.records, c.adequacy.unstable),
         )
 
 

@@ -1,4 +1,4 @@
-"""What a diagnostic may ask of: one point of a problem, and what is known there."""
+"""Context of the diagnostics: one point of a problem, and everything computed there."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -77,7 +77,7 @@ from heli_jax.messages import sentence
 
 
 def no_disturbance(optimum: RelaxedOptimum) -> bool:
-    """Whether a disturbance was looked for and does not show.
+    """True if a disturbance was searched for and is not significant.
 
     Args:
         optimum: where the optimiser ended.
@@ -120,17 +120,17 @@ class Context:
 
     @property
     def fitted(self) -> bool:
-        """Whether the point is where a search ended."""
+        """True if the point is the end of a search."""
         return self.optimum is not None
 
     @property
     def arrived(self) -> bool:
-        """Whether it is an optimum."""
+        """True if the point is an optimum."""
         return self.optimum is not None and bool(self.optimum.best.converged)
 
     @property
     def finite(self) -> bool:
-        """Whether the sensitivities are numbers."""
+        """True if the sensitivities are finite."""
         return bool(np.all(np.isfinite(self.e.J)))
 
     @cached_property
@@ -157,7 +157,7 @@ class Context:
 
     @cached_property
     def excitation(self) -> Excitation:
-        """What the inputs excite, and which outputs follow them."""
+        """Frequencies that the inputs excite, and outputs that follow them."""
         return excitation_of(self.problem.training)
 
     # What is left of the record.
@@ -169,7 +169,7 @@ class Context:
 
     @cached_property
     def metrics(self) -> dict[str, Metrics]:
-        """Of the simulation, by output."""
+        """Metrics of the simulation, by output."""
         return pooled_metrics(self.signals)
 
     @cached_property
@@ -184,12 +184,12 @@ class Context:
 
     @property
     def white(self) -> bool:
-        """Whether the residuals, or innovations, of each output are white."""
+        """True if the residuals, or innovations, of each output are white."""
         return all(w.white for w in self.whiteness.values())
 
     @property
     def independent(self) -> bool:
-        """Whether they are white, and those of one output independent of another's."""
+        """True if they are white, and independent between outputs."""
         return self.white and not self.correlated
 
     # Who moves the inputs.
@@ -203,7 +203,7 @@ class Context:
 
     @property
     def follows(self) -> bool:
-        """Whether an input follows the response."""
+        """True if an input follows the response."""
         return any(one.present for one in self.feedback)
 
     @cached_property
@@ -228,7 +228,7 @@ class Context:
 
     @cached_property
     def loop(self) -> Loop:
-        """Who closes a loop, as far as it is known."""
+        """Feedback, instruments, and whether somebody holds an unstable vehicle."""
         wrong = self.astray and not self.nearly
         asked = bool(self.moved) and not (self.unrelated or wrong)
         held = asked and held_upright(self.at)
@@ -238,7 +238,7 @@ class Context:
 
     @cached_property
     def responses(self) -> ResponseAgreement | None:
-        """How the model's responses agree with the measured ones, where these are fitted."""
+        """Agreement of the model's responses with the measured ones, if these are fitted."""
         if not self.fitted:
             return None
         layout, data, noise, z = self.at
@@ -246,7 +246,7 @@ class Context:
 
     @cached_property
     def followed(self) -> dict[str, Followed]:
-        """In frequency, by output what of its residual follows the excitation."""
+        """In frequency: by output, the part of its residual that follows the excitation."""
         objective = self.at.layout.objective
         if objective.noise_model != "spectrum" or objective.fits_responses:
             return {}
@@ -254,26 +254,26 @@ class Context:
 
     @property
     def failed(self) -> dict[str, Followed]:
-        """Of `followed` what is more than chance makes."""
+        """Outputs of `followed` that follow by more than chance."""
         level = LEVEL / max(len(self.followed), 1)
         return {n: f for n, f in self.followed.items() if f.p_value < level}
 
     @property
     def left_record(self) -> list[str]:
-        """In frequency, the outputs whose simulation in time leaves the record."""
+        """In frequency: outputs whose simulation in time diverges from the record."""
         return [n for n, m in self.metrics.items() if self.followed and not m.vaf >= _DIVERGED]
 
     @property
     def astray(self) -> bool:
-        """In frequency, whether the residual follows the inputs and the simulation leaves the
-        record: of an unstable model that is excused only where nothing else speaks against it."""
+        """In frequency: True if the residual follows the inputs and the simulation diverges, with
+        no better explanation than a wrong optimum."""
         bad = any(not f.explained >= EXPLAINED for f in self.failed.values())
         return bool(self.left_record and self.failed) and not (bad or self.instruments)
 
     @property
     def nearly(self) -> bool:
-        """Whether nearly all that follows the excitation is explained, so that a wrong optimum is
-        the less likely cause."""
+        """True if nearly all that follows the excitation is explained, so that a wrong optimum is
+        unlikely."""
         return all(f.explained >= _NEARLY_ALL for f in self.failed.values())
 
     @cached_property
@@ -289,8 +289,8 @@ class Context:
 
     @cached_property
     def ahead(self) -> bool:
-        """Whether predictions some seconds ahead are judged, since no simulation follows the
-        record: the model is unstable, or gusts moved it beyond where it is nearly linear."""
+        """True if predictions some seconds ahead are judged in place of a simulation: the model is
+        unstable, or gusts moved it beyond where it is nearly linear."""
         expected = self.expected_error
         return expected is not None and (
             is_unstable(self.problem, self.params)
@@ -299,8 +299,8 @@ class Context:
 
     @cached_property
     def unmodelled(self) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
-        """What the residuals follow beyond chance, and other values that the inputs ask for; asked
-        of an optimum whose simulation follows the record, where no input follows the response."""
+        """Known drives that the residuals follow beyond chance, and the values that the inputs ask
+        for; empty unless an optimum follows the record and no input follows the response."""
         asked = self.arrived and self.explains and not (self.instruments or self.ahead)
         if not asked or self.follows:
             return [], (1.0, {})
@@ -310,16 +310,15 @@ class Context:
 
     @cached_property
     def adequacy(self) -> Adequacy:
-        """How well the fitted outputs are explained, in time; nothing of what is judged in
-        frequency."""
+        """Adequacy of the fitted outputs in time; empty for those judged in frequency."""
         if self.responses is not None or self.followed or self.unrelated:
             return Adequacy(by_chance=bool(self.unrelated))
         return assess(self.problem, self.params, self._evidence)
 
     @cached_property
     def unrelated(self) -> dict[str, float]:
-        """In frequency, by output the probability that it follows the excitation by chance, where
-        that is so of every output; else empty."""
+        """In frequency: by output, the probability that it follows the excitation by chance, if
+        that holds of every output; else empty."""
         if not (self.fitted and self.at.layout.noise_model == "spectrum"):
             return {}
         p_values = outputs_against_excitation(self.problem)
@@ -327,7 +326,7 @@ class Context:
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """What is compared by flight: measured with simulated, or with predicted ahead."""
+        """Records compared by flight: measured with simulated, or with predicted ahead."""
         return self._evidence.records
 
     @cached_property
@@ -397,8 +396,7 @@ class Context:
 
     @cached_property
     def errors(self) -> StandardErrors:
-        """How far off the estimates may be; where the model explains nothing they have no
-        intervals."""
+        """Standard errors of the estimates; none where the model explains nothing."""
         errors = self._by_likelihood
         if not self.arrived:
             return errors
@@ -411,12 +409,12 @@ class Context:
 
     @property
     def explains(self) -> bool:
-        """Whether the model explains anything of the record."""
+        """True if the model explains any part of the record."""
         return not self.adequacy.explains_nothing
 
     @property
     def verdict(self) -> Verdict:
-        """What the data determine at the point."""
+        """Verdict on what the data determine at the point."""
         return self.errors.verdict if self.fitted else self.before
 
     @property
@@ -426,7 +424,7 @@ class Context:
 
     @property
     def status(self) -> Status:
-        """Whether the search arrived, and whether the data determine what was asked."""
+        """Status of the fit: convergence, then identifiability."""
         if not self.arrived or not self.finite:
             return "not-converged"
         return "converged" if self.verdict.identifiable else "not-identifiable"
@@ -478,5 +476,5 @@ class Context:
 
     @cached_property
     def rounding(self) -> bool:
-        """Whether the numbers are rounding: a filter of too little noise."""
+        """True if the numbers are rounding, as of a filter with too little noise."""
         return self.at.layout.objective.ill_conditioned(self.problem, self.e, self.noise)

@@ -16,18 +16,18 @@ _CODES = {
 
 
 def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
-    """What the model lacks: a mode, an answer that depends on amplitude, or one that changes."""
+    """Unmodelled dynamics: a mode, a response that depends on amplitude, or one that changes."""
     for one in c.unmodelled[0]:
         yield found(
-            _CODES[one.kind],
+            _CODES[one.drive.kind],
             "doubt",
             one.output,
-            *one.of,
+            *one.drive.of,
             value=one.p_value,
             shifts=one.shifts,
             distrusts=one.far,
             output=one.output,
-            of=one.of,
+            of=one.drive.of,
             gain=one.gain,
             near=f"{one.frequency:.2g} rad/s" if one.frequency else "",
             lacks="a mode or a lag" if one.frequency else "dynamics",
@@ -36,7 +36,7 @@ def unmodelled_dynamics(c: Context) -> Iterator[Finding]:
 
 
 def inputs_ask_otherwise(c: Context) -> Iterator[Finding]:
-    """Whether the answer to the inputs alone asks for other values than the fit's."""
+    """Other values than the fit's that the response to the inputs alone asks for."""
     p, shifts = c.unmodelled[1]
     if shifts:
         yield found(

@@ -17,7 +17,7 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, lea
 
 @dataclass(frozen=True)
 class Limits:
-    """From which numbers on a record is doubted, and what is worth telling."""
+    """Limits from which a record is doubted, and from which a number is told."""
 
     nothing: float = 0.2
     """part of the power of each output below which inputs that no output follows over a band tell
@@ -46,7 +46,7 @@ LIMITS = Limits()
 
 
 def _explained(c: Context) -> bool:
-    """Whether a fit shows by itself that the inputs excite what is asked."""
+    """True if a fit shows by itself that the inputs excite what is asked."""
     return c.fitted and c.status == "converged" and not c.adequacy.denied
 
 

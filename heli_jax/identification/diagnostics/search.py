@@ -41,7 +41,7 @@ def search_stopped(c: Context) -> Iterator[Finding]:
 
 
 def search_told(c: Context) -> Iterator[Finding]:
-    """What the search and the method report of how the optimum was reached."""
+    """Notes of the search and the method on how the optimum was reached."""
     if c.optimum is not None:
         names = [label for label, _ in c.flights]
         yield from c.optimum.notes
@@ -71,7 +71,7 @@ def profile_intervals(c: Context) -> Iterator[Finding]:
 
 
 def log_cautions(c: Context) -> Iterator[Finding]:
-    """What the logs say of their signals that biases a fit to them; once where flights agree."""
+    """Cautions of the logs on signals that bias a fit to them; once where flights agree."""
     said: dict[str, Finding] = {}
     flights = tuple(c.problem.flights)
     for label, flight in zip(labels(flights), flights, strict=True):

@@ -15,7 +15,12 @@ from heli_jax.identification.validation.logging_rate import (
     power_between_samples,
     rates_against_modes,
 )
-from heli_jax.identification.validation.other_hold import moving_inputs, other_hold
+from heli_jax.identification.validation.other_hold import (
+    BEYOND_DOUBT,
+    likelihood_gain,
+    moving_inputs,
+    other_hold,
+)
 from heli_jax.identification.validation.shifts import (
     ANGLE,
     LEAD,
@@ -89,7 +94,7 @@ def inputs_shifted(c: Context) -> Iterator[Finding]:
         return
     one = input_shift(c.problem, c.at, c.e)
     # A lag that is missing shows in the residual too, and more closely.
-    if one is None or (one.late < 0 and any(x.kind == "input" for x in c.unmodelled[0])):
+    if one is None or (one.late < 0 and any(x.drive.kind == "input" for x in c.unmodelled[0])):
         return
     yield found(
         "timing.late-input" if one.late > 0 else "timing.late-response",
@@ -251,10 +256,13 @@ def hold_matters(c: Context) -> Iterator[Finding]:
         for n in f.inputs
         if n in moving_inputs(c.problem, f, in_doubt=c.fitted)
     }
-    # Nothing shows that the other hold is the right one: a note, whatever it moves.
+    # Autocorrelated residuals make the record worth fewer samples.
+    wider = max((e.sd / e.sd_white for e in c.estimates.values() if e.sd and e.sd_white), default=1)
+    gain = likelihood_gain(c.problem, c.at, c.e) / wider**2 if c.fitted else 0.0
+    contradicted = gain > BEYOND_DOUBT
     yield found(
-        "timing.other-hold",
-        "note",
+        "timing.likelier-hold" if contradicted else "timing.other-hold",
+        "doubt" if contradicted else "note",
         *taken,
         *large,
         value=changes[large[0]][1],
@@ -262,6 +270,8 @@ def hold_matters(c: Context) -> Iterator[Finding]:
         holds=list(dict.fromkeys(taken.values())),
         names=large[:_NAMED],
         sds=[changes[n][1] for n in large[:_NAMED]],
+        gain=gain,
+        distrusts=large if contradicted else (),
     )
 
 

@@ -7,7 +7,7 @@ the least squares; else its first step is the regression.
 """
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -104,13 +104,7 @@ def _of_flight(
     initial = [scipy.linalg.block_diag(*(free[i] for _, free in pairs)) for i in range(e)]
     constants = np.broadcast_to(np.eye(e)[:, None, :], (e, n, e))
     nuisances = weight * np.concatenate([np.array(initial), constants], axis=-1)
-    return projected((weight * residual).reshape(e * n, c), nuisances.reshape(e * n, -1))
-
-
-def projected(
-    x: Float[np.ndarray, "n c"], away: Float[np.ndarray, "n b"]
-) -> Float[np.ndarray, "n c"]:
-    """Return what of the columns of x the columns of `away` cannot give."""
+    x, away = (weight * residual).reshape(e * n, c), nuisances.reshape(e * n, -1)
     size = np.linalg.norm(away, axis=0)
     away = away[:, size > 0] / size[size > 0]
     # Dependent columns, as a very slow free motion beside the constant, add nothing but rounding.
@@ -134,7 +128,7 @@ def _residual(
     f = np.einsum("hkc,kN->Nhc", both[np.ix_(hidden, columns)], known)
 
     def integrated(f: np.ndarray) -> np.ndarray:
-        return recurrence(phi, np.concatenate([0.0 * f[:1], first @ f[:-1] + second @ f[1:]]))
+        return _recurrence(phi, np.concatenate([0.0 * f[:1], first @ f[:-1] + second @ f[1:]]))
 
     h = integrated(f[..., :1])
     # A derivative by a parameter has the same dynamics, and is driven by what the parameter moves.
@@ -144,7 +138,7 @@ def _residual(
     residual[..., 1:] -= np.einsum("ehq,Nh->eNq", through[..., 1:], h[..., 0])
     impulse = np.zeros((known.shape[1], len(hidden), len(hidden)))
     impulse[0] = np.eye(len(hidden))
-    return residual, np.einsum("eh,Nhj->eNj", through[..., 0], recurrence(phi, impulse))
+    return residual, np.einsum("eh,Nhj->eNj", through[..., 0], _recurrence(phi, impulse))
 
 
 def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
@@ -160,7 +154,7 @@ def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndar
     return whole[:h, :h], whole[:h, h : 2 * h] - second, second
 
 
-def recurrence(
+def _recurrence(
     phi: Float[np.ndarray, "h h"], f: Float[np.ndarray, "N h c"]
 ) -> Float[np.ndarray, "N h c"]:
     """Return x(0) = f(0), x(k) = phi x(k-1) + f(k), by doubling."""
@@ -221,7 +215,7 @@ def search(
     return values(end), at(tuple(end)) or first
 
 
-# Standard errors and partial F-ratios of a regression whose residuals are autocorrelated.
+# Standard errors of a regression whose residuals are autocorrelated.
 #
 # Smoothed residuals are alike over many samples, and so are gusts: ordinary formulas would take
 # each sample for news. The products of regressor and residual are summed over neighbouring instants
@@ -238,33 +232,6 @@ def covariance(rows: Rows) -> Float[np.ndarray, "q q"]:
     # residuals have it. Where these are white it becomes the ordinary formula.
     bread = np.linalg.pinv(rows.J.T @ rows.J, hermitian=True)
     return bread @ _long_run(rows.J * rows.r[:, None], rows.times) @ bread
-
-
-def partial_f(
-    others: Float[np.ndarray, "n k"],
-    y: Float[np.ndarray, " n"],
-    x: Float[np.ndarray, " n"],
-    times: np.ndarray,
-) -> float:
-    """Return the F-ratio of one more regressor: the square of its estimate over its standard error.
-
-    Args:
-        others: the regressors that are in (n, k).
-        y: what is regressed (n,).
-        x: the one more (n,).
-        times: which rows belong to one instant, as `Rows.times`.
-    """
-    size = np.linalg.norm(x)
-    # The estimate of one more regressor beside others is that of what they leave of both signals
-    # (Frisch and Waugh, 1933).
-    x, y = projected(np.stack([x, y], axis=1), others).T
-    power = float(x @ x)
-    # What the others give already has nothing of its own to say.
-    if power <= (1e-6 * size) ** 2:
-        return 0.0
-    left = y - x * (x @ y) / power
-    variance = float(_long_run((x * left)[:, None], times)[0, 0])
-    return float((x @ y) ** 2 / variance) if variance > 0 else float("inf")
 
 
 def _long_run(scores: Float[np.ndarray, "n k"], times: np.ndarray) -> Float[np.ndarray, "k k"]:
@@ -330,30 +297,32 @@ def select(
     # linear regression that F-ratios are defined for.
     X, y = -rows.J, rows.r - rows.J @ values
 
-    def ratios(terms: Iterable[int]) -> dict[int, float]:
-        beside = {j: [i for i in inside if i != j] for j in terms}
-        return {j: partial_f(X[:, i], y, X[:, j], rows.times) for j, i in beside.items()}
+    def regressed(terms: list[int]) -> tuple[np.ndarray, float]:
+        """F-ratio of each term beside the others, and R2."""
+        theta = np.linalg.lstsq(X[:, terms], y)[0]
+        left = y - X[:, terms] @ theta
+        variances = np.diag(covariance(rows._replace(r=left, J=X[:, terms])))
+        with np.errstate(divide="ignore"):
+            return theta**2 / variances, 1.0 - float(left @ left / (y @ y))
 
-    def step(j: int, ratio: float, *, entered: bool) -> Step:
-        left = projected(y[:, None], X[:, inside])
-        return Step(names[j], entered, ratio, 1.0 - float(np.sum(left**2) / np.sum(y**2)))
-
-    inside, steps, every = list(range(len(names))), [], range(len(names))
-    entering, leaving = {}, {}
+    inside, steps = list(range(len(names))), []
+    leaving, entering = {}, {}
     # At most each term out and in a few times: rounding must not turn in a circle.
     for _ in range(4 * len(names)):
-        leaving = ratios(j for j in inside if names[j] not in forced)
-        entering = ratios(j for j in every if j not in inside)
+        ratios = dict(zip(inside, regressed(inside)[0], strict=True))
+        leaving = {j: float(f) for j, f in ratios.items() if names[j] not in forced}
+        outside = [j for j in range(len(names)) if j not in inside]
+        entering = {j: float(regressed([*inside, j])[0][-1]) for j in outside}
         # Out before in: the limit to remove is at most that to enter, so a term that has just come
         # in is not thrown out by the same number.
         worst = min(leaving, key=leaving.__getitem__, default=None)
         best = max(entering, key=entering.__getitem__, default=None)
         if worst is not None and leaving[worst] < limits[1]:
             inside.remove(worst)
-            steps.append(step(worst, leaving[worst], entered=False))
+            steps.append(Step(names[worst], False, leaving[worst], regressed(inside)[1]))
         elif best is not None and entering[best] >= limits[0]:
             inside.append(best)
-            steps.append(step(best, entering[best], entered=True))
+            steps.append(Step(names[best], True, entering[best], regressed(inside)[1]))
         else:
             break
     final = {**entering, **leaving}

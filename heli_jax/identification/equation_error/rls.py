@@ -6,6 +6,7 @@ samples when old data are forgotten. Functions follow the shape init, step -> (s
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from heli_jax import naming
 from heli_jax.analysis.lti import d2c
 from heli_jax.dynamics.model import Model, reads
 from heli_jax.dynamics.roll import ratios_from_denominator
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.metrics import NO_METRICS, Metrics, metrics, whiteness
 from heli_jax.numbers import terse
@@ -221,26 +223,55 @@ class Baseline:
     order: int
     forgetting: float
     dt: float
-    theta: np.ndarray
-    """(2n + 1,) final [-a1 ... -an, b0 ... bn]"""
-    num: np.ndarray
-    den: np.ndarray
-    """of Hd(z), highest power first"""
-    poles: np.ndarray
     history: np.ndarray
-    """(N, 2n + 1)"""
+    """(N, 2n + 1) [-a1 ... -an, b0 ... bn] after each sample"""
     continuous_num: np.ndarray | None
     continuous_den: np.ndarray | None
-    exact: bool
-    """whether the continuous form gives Hd back when it is sampled"""
     note: str
+    """why the continuous form is another system than Hd, or there is none; empty where Hd is what a
+    zero-order hold makes of it"""
     combinations: dict[str, float]
-    times: np.ndarray
-    measured: np.ndarray
     simulated: np.ndarray
+    """Hd over the whole record, from its first measured outputs"""
     metrics: Metrics
-    trusted: bool
-    sentences: tuple[str, ...]
+    """of that simulation"""
+    findings: tuple[Finding, ...]
+    """what speaks against it"""
+
+    @property
+    def theta(self) -> np.ndarray:
+        """The final coefficients (2n + 1,)."""
+        return self.history[-1]
+
+    @property
+    def num(self) -> np.ndarray:
+        """Numerator of Hd(z), highest power first."""
+        return self.theta[self.order :]
+
+    @property
+    def den(self) -> np.ndarray:
+        """Denominator of Hd(z), highest power first."""
+        return np.r_[1.0, -self.theta[: self.order]]
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Poles of Hd(z)."""
+        return np.roots(self.den)
+
+    @property
+    def exact(self) -> bool:
+        """True if the continuous form gives Hd back when it is sampled."""
+        return not self.note
+
+    @property
+    def trusted(self) -> bool:
+        """True if nothing speaks against it."""
+        return not self.findings
+
+    @property
+    def sentences(self) -> list[str]:
+        """What speaks against it, in words."""
+        return [f.sentence for f in self.findings]
 
 
 def baseline(
@@ -257,7 +288,7 @@ def baseline(
     Raises:
         ValueError: too few samples in a row.
     """
-    output, part, sentences = _samples(model, flight, _PER_ORDER * order)
+    output, part, findings = _samples(model, flight, _PER_ORDER * order)
     if part.stop - part.start < _PER_ORDER * order:
         raise ValueError(
             f"{output}: expected at least {_PER_ORDER * order} samples in a row for order {order}, "
@@ -277,19 +308,16 @@ def baseline(
     )
     # Coefficients of past outputs have no unit, those of inputs that of y over u.
     back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
-    history, errors = np.asarray(run.history) * back, np.asarray(run.error)[order:] * y_scale
+    history = np.asarray(run.history) * back
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(history[-1])))
-    poles = np.roots(den)
     simulated = _simulate(num, den, u, y)
     diverges = not np.abs(simulated).max() <= 1e6 * np.abs(y).max()
     agreement = NO_METRICS if diverges else metrics(y, simulated)
-    continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
-    combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
-    if (size := float(np.max(np.abs(poles)))) >= 1.0:
-        sentences.append(
-            f"It has a pole of size {size:.4f}, outside the unit circle: its simulation diverges."
-        )
-    sentences += [*([note] if note else []), *doubts, *_bias(errors, y, agreement)]
+    if (size := float(np.max(np.abs(np.roots(den))))) >= 1.0:
+        findings.append(found("rls.unstable", value=size))
+    continuous, not_exact = _continuous(num, den, flight.dt)
+    combinations, doubts = _combinations(model, params, flight, output, continuous[1], order)
+    errors = np.asarray(run.error)[order:] * y_scale
     return Baseline(
         flight=flight.name or "flight 1",
         output=output,
@@ -297,26 +325,18 @@ def baseline(
         order=order,
         forgetting=forgetting,
         dt=flight.dt,
-        theta=history[-1],
-        num=num,
-        den=den,
-        poles=poles,
         history=history,
-        continuous_num=continuous_num,
-        continuous_den=continuous_den,
-        exact=exact,
-        note=note,
+        continuous_num=continuous[0],
+        continuous_den=continuous[1],
+        note=not_exact[0].sentence if not_exact else "",
         combinations=combinations,
-        times=flight.times[part],
-        measured=y,
         simulated=simulated,
         metrics=agreement,
-        trusted=not sentences,
-        sentences=tuple(sentences),
+        findings=(*findings, *not_exact, *doubts, *_bias(errors, y, agreement)),
     )
 
 
-def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list[str]]:
+def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list[Finding]]:
     """The first output with `least` samples in a row (else the first), its longest part without a
     missing sample, and what is to be said of both."""
     # An angle before its rate: eq. 23, which physical parameters are read from, is of an angle.
@@ -329,17 +349,15 @@ def _samples(model: Model, flight: Flight, least: int) -> tuple[str, slice, list
         parts[name] = slice(*max(edges.tolist(), key=lambda e: e[1] - e[0], default=(0, 0)))
     output = next((n for n in names if parts[n].stop - parts[n].start >= least), names[0])
     part, missing = parts[output], int(np.isnan(flight.outputs[output]).sum())
-    sentences = []
+    findings = []
     if output != names[0]:
-        sentences.append(
-            f"It needs samples in a row, which {names[0]} has too few of, so it is of {output}."
-        )
+        findings.append(found("rls.other-output", "doubt", output, instead=names[0]))
     if missing:
-        sentences.append(
-            f"It needs every sample: {missing} of {output} are missing, so it saw only the "
-            f"{part.stop - part.start} samples from {part.start * flight.dt:.4g} s on."
+        samples, begin = part.stop - part.start, part.start * flight.dt
+        findings.append(
+            found("rls.part", "doubt", output, value=float(missing), samples=samples, begin=begin)
         )
-    return output, part, sentences
+    return output, part, findings
 
 
 def _simulate(
@@ -360,86 +378,69 @@ def _simulate(
     return simulated
 
 
-def _continuous(
-    num: np.ndarray, den: np.ndarray, dt: float
-) -> tuple[np.ndarray | None, np.ndarray | None, bool, str]:
-    """H(s), whether it is the inverse of the zero-order hold, and why not."""
+type _Polynomials = tuple[np.ndarray | None, np.ndarray | None]
+
+
+def _continuous(num: np.ndarray, den: np.ndarray, dt: float) -> tuple[_Polynomials, list[Finding]]:
+    """H(s), and why it is not the inverse of the zero-order hold."""
     try:
-        return *d2c(num, den, dt, "zoh"), True, ""
+        return d2c(num, den, dt, "zoh"), []
     except ValueError as e:
         # Only what is wrong: the remedy behind the semicolon is what follows here.
         refused = str(e).split(";")[0]
     try:
-        continuous = d2c(num, den, dt, "real-log")
+        return d2c(num, den, dt, "real-log"), [found("rls.real-logarithm", reason=refused)]
     except ValueError as e:
-        return None, None, False, f"It has no continuous form: {e}."
-    return (
-        *continuous,
-        False,
-        f"Its continuous form is the real part of a matrix logarithm, which is another system: "
-        f"{refused}.",
-    )
+        return (None, None), [found("rls.no-continuous-form", reason=str(e))]
 
 
 def _combinations(
     model: Model, params: Any, flight: Flight, output: str, den: np.ndarray | None, order: int
-) -> tuple[dict[str, float], list[str]]:
+) -> tuple[dict[str, float], list[Finding]]:
     """a/Ixx and a/If where the structure of eq. 23 allows to read them off, and doubts."""
     angle = output in ("roll", "pitch")
     if not (angle and of_helicopter(model.Params) and len(naming.names(model.State)) == 4):
-        return {}, [
-            "Physical parameters cannot be computed from its coefficients for this model and "
-            f"output ({output})."
-        ]
+        return {}, [found("rls.no-parameters", "doubt", output)]
+    if order != 4:
+        return {}, [found("rls.other-order", value=float(order))]
     if den is None:
         return {}, []
-    if order != 4:
-        return {}, [
-            f"Order {order} is not the fourth order of eq. 23: no physical parameters "
-            "can be read from it."
-        ]
     p = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
     # The vehicle may state a stand that this model does not stand on.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
     values, doubts = {n: float(v) for n, v in ratios.values.items()}, []
-    wrong = [f"{n} = {terse(v)}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]
+    wrong = [n for n, v in values.items() if not (math.isfinite(v) and v > 0)]
     if wrong:
-        doubts.append(f"It gives {' and '.join(wrong)}, which no helicopter has.")
+        shown = [f"{n} = {terse(values[n])}" for n in wrong]
+        doubts.append(found("rls.impossible", "doubt", *wrong, values=shown))
     # The ratios do not use p2, so that it can contradict them.
     p2, expected = float(ratios.p2), float(ratios.p2_expected)
     if abs(p2 / expected - 1.0) > _MEANT:
-        doubts.append(
-            f"Its coefficient of s^2 is {terse(p2)} where its other coefficients and the rotor "
-            f"speed ask for {terse(expected)}: it does not have the structure of eq. 23, and its "
-            "physical parameters mean little."
-        )
+        doubts.append(found("rls.other-structure", value=p2, expected=expected))
     return values, doubts
 
 
 def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
-) -> list[str]:
+) -> Iterator[Finding]:
     """What shows that noise biases least squares on past measured outputs."""
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
-        return []  # no noise: the rest is rounding
-    sentences = []
+        return  # no noise: the rest is rounding
     if math.isnan(agreement.rmse):
-        sentences.append("Its simulation diverges from the measured output; no metrics are given.")
+        yield found("rls.diverges")
     # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
-        sentences.append(
-            f"Its rms error is {terse(one_step, 2)} one sample ahead but "
-            f"{terse(agreement.rmse, 2)} in simulation: least squares on past measured outputs is "
-            "biased by their noise."
+        yield found(
+            "rls.biased",
+            value=agreement.rmse / one_step,
+            limit=_WORSE,
+            ahead=one_step,
+            simulated=agreement.rmse,
         )
     if not whiteness(errors).white:
-        sentences.append(
-            "Its one-step errors are not white: noise on the measured output or disturbances bias "
-            "its coefficients."
-        )
-    return sentences
+        yield found("rls.not-white")

@@ -13,6 +13,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model, require_constants
+from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error.records import (
     coefficients,
@@ -31,7 +32,7 @@ from heli_jax.identification.equation_error.regression import (
     search,
     select,
 )
-from heli_jax.identification.free import Free
+from heli_jax.identification.free import Free, Sign
 from heli_jax.vehicle import of_helicopter
 
 F_ENTER = 20.0
@@ -79,30 +80,34 @@ class EquationErrorStart(NamedTuple):
     selection: Selection | None = None
 
     @property
-    def sentences(self) -> tuple[str, ...]:
+    def findings(self) -> list[Finding]:
         """What was taken from where."""
-        taken = [n for n, v in self.values.items() if v.origin == "equation error"]
-        fits = ", ".join(f"{e.name} {100 * e.r_squared:.0f} %" for e in self.equations)
-        sentences = [
-            f"Start by equation error of {', '.join(taken) or 'nothing'} (variance explained in "
-            f"the equations of {fits}; smoothed over {self.half_width:.2g} s to either side). "
-            "Noise and gusts bias these values: the fit begins there, they are not its result."
+        out = [
+            found(
+                "start.equation-error",
+                "note",
+                names=[n for n, v in self.values.items() if v.origin == "equation error"]
+                or ["nothing"],
+                equations=[e.name for e in self.equations],
+                explained=[e.r_squared for e in self.equations],
+                half_width=self.half_width,
+            )
         ]
         if self.hidden:
-            sentences.append(
-                f"Start: {', '.join(self.hidden)} are not measured and were integrated by their "
-                "own equations."
-            )
-        # One sentence for all that have the same reason: of a whole helicopter there are many.
-        grouped: dict[tuple[str, str], list[str]] = {}
-        for name, v in self.values.items():
-            if v.reason:
-                grouped.setdefault((v.origin, v.reason), []).append(f"{name} {v.value:.4g}")
-        sentences += [
-            f"Start: {', '.join(values)}, {_WHERE[origin]}: {reason}."
-            for (origin, reason), values in grouped.items()
-        ]
-        return tuple(sentences)
+            out.append(found("start.hidden-states", "note", names=self.hidden))
+        return out + reasons_of(self.values)
+
+
+def reasons_of(values: Mapping[str, StartValue]) -> list[Finding]:
+    """Return findings on the values that were not found, one for all of one reason."""
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for name, v in values.items():
+        if v.reason:
+            grouped.setdefault((v.origin, v.reason), []).append(f"{name} {v.value:.4g}")
+    return [
+        found("start.not-found", "note", values=shown, where=_WHERE[origin], reason=reason)
+        for (origin, reason), shown in grouped.items()
+    ]
 
 
 _WHERE = {
@@ -137,7 +142,8 @@ def equation_error_start(
     """
     flights = [f for f in flights if not f.hold_out]
     regression, half, reasons = _regression(model, vehicle, flights, free)
-    optimum = _optimum(regression, free)
+    keep = {n for n in regression.names if _keeps_sign(model, n, free[n].sign, regression.base[n])}
+    optimum = _optimum(regression, keep)
     # One parameter at a time is left out, and the rest regressed again: of two that are
     # exchangeable only one has to go, and the other is determined as soon as the first is held.
     while (out := _undetermined(regression, optimum.rows)) is not None:
@@ -146,16 +152,16 @@ def equation_error_start(
         regression = regression._replace(names=tuple(n for n in regression.names if n != name))
         if not regression.names:
             raise _nothing("the equations determine none of the free parameters")
-        optimum = _optimum(regression, free)
+        optimum = _optimum(regression, keep)
     selection = None
     if stepwise is not None:
-        forced = _forced(regression, free, optimum)
+        forced = _forced(regression, keep, optimum)
         selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
         # Terms that are out are zero from here on, and the others are regressed again: where
         # regressors are correlated the values of those that stay move.
         out = dict.fromkeys(set(regression.names) - set(selection.selected), 0.0)
         regression = regression._replace(names=selection.selected, base={**regression.base, **out})
-        optimum = _optimum(regression, free) if selection.selected else optimum
+        optimum = _optimum(regression, keep) if selection.selected else optimum
     sd = np.sqrt(np.maximum(np.diag(covariance(optimum.rows)), 0.0))
     estimates = dict(zip(regression.names, zip(optimum.values, sd, strict=False), strict=False))
     return EquationErrorStart(
@@ -236,20 +242,17 @@ class _Optimum(NamedTuple):
     weights: dict[str, float]
 
 
-def _keeps_sign(regression: Regression, free: Mapping[str, Free]) -> np.ndarray:
-    """True for parameters of a known sign."""
-    model, keeps = regression.model, []
-    for name in regression.names:
-        sign, at_hand, positive = free[name].sign, regression.base[name], name in model.positive
-        known = positive or (math.isfinite(at_hand) and at_hand != 0)
-        default = positive or of_helicopter(model.Params)
-        keeps.append(known and (sign == "keep" or (sign is None and default)))
-    return np.array(keeps, bool)
+def _keeps_sign(model: Model, name: str, sign: Sign | None, at_hand: float) -> bool:
+    """True for a parameter of a known sign."""
+    positive = name in model.positive
+    known = positive or (math.isfinite(at_hand) and at_hand != 0)
+    by_default = positive or of_helicopter(model.Params)
+    return known and (sign == "keep" or (sign is None and by_default))
 
 
-def _optimum(regression: Regression, free: Mapping[str, Free]) -> _Optimum:
+def _optimum(regression: Regression, keep_sign: set[str]) -> _Optimum:
     """The regression with the equations weighted by their own residuals."""
-    keep = _keeps_sign(regression, free)
+    keep = np.array([n in keep_sign for n in regression.names], bool)
     # Equations differ in unit and noise, and share parameters. Before there are residuals each is
     # weighted by the size of its left-hand side; then by its own residuals, which least squares of
     # several equations asks for.
@@ -327,13 +330,13 @@ def _undetermined(regression: Regression, rows: Rows) -> tuple[str, str] | None:
     return names[first], f"the equations do not tell it from {others}"
 
 
-def _forced(regression: Regression, free: Mapping[str, Free], optimum: _Optimum) -> list[str]:
+def _forced(regression: Regression, keep_sign: set[str], optimum: _Optimum) -> list[str]:
     """The parameters that cannot be zero: of a known sign, or something is divided by them."""
-    keeps, forced = _keeps_sign(regression, free), []
+    forced = []
     for i, name in enumerate(regression.names):
         values = optimum.values.copy()
         values[i] = 0.0
-        if keeps[i] or regression.rows(values, optimum.weights) is None:
+        if name in keep_sign or regression.rows(values, optimum.weights) is None:
             forced.append(name)
     return forced
 

@@ -1,4 +1,4 @@
-"""Whether there is a disturbance, and the optimum with or without it."""
+"""Search for significant disturbances, and the optimum with or without them."""
 
 import jax.numpy as jnp
 import numpy as np

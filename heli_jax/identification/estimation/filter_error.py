@@ -71,7 +71,7 @@ from heli_jax.simulation.simulate import simulate
 
 
 def noiseless(outputs: Mapping[str, np.ndarray]) -> list[str]:
-    """Which outputs (N,) have no noise of a sensor; NaN is missing."""
+    """Return the outputs (N,) without sensor noise; NaN is missing."""
     return [n for n, y in outputs.items() if without_noise(y)]
 
 
@@ -110,7 +110,7 @@ def disturbed_records(reached: Solution, u: Unknowns, i: int, keys: Array) -> di
 
 
 def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
-    """Of a key the State at the first sample, with what is random there drawn."""
+    """Return a function of a key that draws the State at the first sample."""
     model, params = layout.model, drive.params
     first = drive.state if drive.state is not None else model.initial_state(params)
     names = naming.names(model.State)
@@ -160,9 +160,10 @@ class FilterError(Objective):
         return tags
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """With every sigma_w and sigma_y unknown their common factor is concentrated out, and every
-        output but the first has a factor of its own; with one given, or process noise of the
-        model's own, all outputs have one."""
+        """Return the outputs with a noise factor of their own, and whether the common factor is
+        concentrated out. It is if every sigma_w and sigma_y is unknown; every output but the first
+        then has a factor. With one given, or process noise of the model's own, all outputs have
+        one."""
         if "sigma_y" in problem.fixed_noise:
             return (), False
         # Only with all of them unknown: a factor common to noises of which one is given is none.
@@ -173,8 +174,8 @@ class FilterError(Objective):
         return outputs[concentrated:], concentrated
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """With a derivative by each scale error that is free and by the noise of what is
-        integrated, which no relaxation has found yet."""
+        """Add the derivatives by free scale errors and by the noise of integrated signals, zero
+        before the first relaxation."""
         noise = with_own_noise(problem, noise)
         scales = free_scales(problem.model.input_scales, problem.free)
         if not scales:
@@ -226,8 +227,8 @@ class FilterError(Objective):
         return bool(fell > _FELL) or attenuates or own_changed(before, after)
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Of the innovations (Schweppe, 1965), at the scale of the greatest likelihood where that
-        is concentrated out."""
+        """Return the log-likelihood of the innovations (Schweppe, 1965), at the scale that
+        maximises it if that is concentrated out."""
         n = measured_count(data)
         squares, logs = innovation_sums(e, noise)
         # The sums hold log(s / sd^2): the sd bring the units of the outputs back.
@@ -287,7 +288,8 @@ class FilterError(Objective):
         }
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Whether the filter has lost its digits: variances that are none, or beyond all digits."""
+        """True if the filter has lost its digits: variances below zero, or too large for
+        float64."""
         ratios = np.concatenate(
             [
                 np.asarray(s) / sd[f"{label}/{n}"] ** 2
@@ -309,7 +311,7 @@ class FilterError(Objective):
     def findings(
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
-        """What is wrong with the filter, and the remedy."""
+        """Return findings on the filter."""
         if ill:
             return [found("search.ill-conditioned")]
         if at.layout.concentrated:
@@ -322,8 +324,8 @@ class FilterError(Objective):
 
 
 def _is_far(before: Noise, after: Noise) -> bool:
-    """Whether the rows had another variance than 1 by far: what they tell of variances, whose rows
-    have no such factor, then had another weight beside them, and a search may have ended early."""
+    """True if the rows' variance was far from 1, so that a search weighed them wrongly against the
+    rows of variances and may have ended early."""
     ratios = [
         float(sd[n] / old[n]) for sd, old in zip(after.sd, before.sd, strict=True) for n in sd
     ]
@@ -342,8 +344,8 @@ def filtered_flights(
     together: dict[int, Innovations] = {}
     small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
-        # One record of a small model: written out in rows the exact filter takes as long, and two
-        # seconds less to compile.
+        # One record of a small model (5 states): written out in rows the exact filter takes four
+        # fifths of the time for a fit, with its compilation (4.9 s for 6.0) or without.
         if not (small and len(group) == 1):
             innovations = innovations_together(layout, data, noise, u, group)
             together |= dict(zip(group, innovations, strict=True))
@@ -361,7 +363,8 @@ def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> 
 def filter_arguments(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int
 ) -> tuple[tuple[Model, Any, Any, dict[str, Array], dict[str, Any]], SimulationOptions]:
-    """Of `kalman.innovations` for the i-th flight; arguments as of `filtered_flights`."""
+    """Return the arguments of `kalman.innovations` for the i-th flight; arguments as of
+    `filtered_flights`."""
     drive = driven(layout, data, u, i)
     measured = {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()}
     sd = {n: measurement_sd(u, n, s) for n, s in noise.sd[i].items()}
@@ -427,7 +430,7 @@ def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
 
 
 def _root_mean_square(y: Array | np.ndarray) -> float:
-    """Of what is measured (N,), never zero."""
+    """Return the root mean square of a measured signal (N,), never zero."""
     y = np.asarray(y)
     return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
 

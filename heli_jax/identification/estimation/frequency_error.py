@@ -17,11 +17,13 @@ are weighed by the response to what of the input follows it: then feedback does 
 Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight
@@ -34,12 +36,28 @@ from heli_jax.identification.estimation.frequency_instrument import (
 )
 from heli_jax.identification.estimation.frequency_lines import (
     FlightFacts,
+    Matrices,
+    Record,
+    Resolved,
+    Signals,
+    alike,
+    at_lines,
+    by_flight,
     cut_notes,
     errors_of_lines,
+    errors_of_some,
     lines_of,
+    machines_of,
+    measured,
     other_outputs,
     parts_of,
+    parts_of_group,
+    real,
     records_of,
+    resolved,
+    shared_of,
+    stacked,
+    with_shared,
     without_parts,
 )
 from heli_jax.identification.estimation.frequency_noise import (
@@ -48,7 +66,6 @@ from heli_jax.identification.estimation.frequency_noise import (
     whitening_by,
     whitening_without_model,
 )
-from heli_jax.identification.estimation.frequency_slopes import rows_of_lines
 from heli_jax.identification.estimation.linearised_flights import (
     cannot_linearise,
     condition_of,
@@ -194,7 +211,7 @@ class FrequencyError(Objective):
         """
         return [
             *cut_notes(at.layout, at.data, names),
-            *linearisation_notes(at, e, names),
+            *linearisation_notes(at, e),
             *instrument_notes(at.data),
         ]
 
@@ -224,3 +241,270 @@ def first_spectrum(noise: Noise, flights: Sequence[Flight]) -> Noise:
 
 
 OBJECTIVE = FrequencyError()
+
+
+# The rows that frequency error makes small: as many as unknowns, and one for what is left.
+#
+# With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
+# solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
+# covariance, and their derivative $R^{-T} Z^T J$ the information of the estimate, $M^T (Z^T Z)^{-1}
+# M$ with $M = Z^T J$. Directly $Z = J$, and with the row $|e - J J^+ e|$ beside them the sum of
+# squares is that of all errors: maximum likelihood, in a few rows. By instrument $Z$ are the
+# derivatives of the response to what of the inputs follows the instruments.
+#
+# Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon
+# and Schoukens (2012), chapter 9.
+
+
+_NOTHING = 100.0
+"""times the machine's precision: what of the information, of columns of one size, is rounding"""
+
+
+class Products(NamedTuple):
+    """Of whitened errors e (of white noise of variance 1), their derivatives J by the unknowns and
+    instruments Z, all without what the ends of the records may add."""
+
+    ee: Float[Array, ""]
+    Ze: Float[Array, " q"]
+    ZZ: Float[Array, "q q"]
+    ZJ: Float[Array, "q q"]
+
+
+def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
+    """Those rows, with the derivative that a step of Gauss and Newton needs.
+
+    Args:
+        noise: with the whitening of each record, and whether instruments are used.
+        u: the unknowns, in the units of the model.
+    """
+    v = shared_of(layout, u)
+    at, rest = jax.lax.stop_gradient((v, u))
+    made = products_of_lines(layout, data, noise, at, lambda v: with_shared(layout, rest, v))
+    r, M = _weighed(made)
+    left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
+    left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
+    r, M, left = jax.lax.stop_gradient((r, M, left))
+    # The derivative is exactly M, whatever else moves with the unknowns.
+    return jnp.append(r + M @ (v - at), left)
+
+
+def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
+    # Of one size: units do not decide what is rounding.
+    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
+    kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    along = root[:, None] * vectors.T * over[None, :]
+    return along @ of.Ze, along @ of.ZJ
+
+
+# Products of errors, their derivatives by the unknowns, and instruments, over all lines.
+#
+# With $H = W C (zI - A_d)^{-1}$ the derivative of the whitened response is
+# $H (dA_d X + dB\,U) + W (dC X + dD\,U)$: one product for each line and unknown in place of a
+# solution, of which all unknowns share the first factor.
+#
+# Source: Pintelon and Schoukens (2012), chapter 9.
+
+
+def products_of_lines(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    v: Float[Array, " q"],
+    unknowns: Callable[[Array], Unknowns],
+) -> Products:
+    """Over all records. Directly Z = J; by instrument the derivatives of the response to the inputs
+    by instrument.
+
+    Args:
+        noise: with the whitening of each record, and whether instruments are used.
+    """
+    total = []
+    for members in alike(layout, data):
+        parts = parts_of_group(layout, noise, members)
+        machines, slopes = differentiated(
+            lambda v, members=members: machines_of(layout, data, unknowns(v), members), v
+        )
+
+        def ready(matrices: Any, parts: Any = parts) -> Any:
+            return matrices, [resolved(matrices[0], record, W) for record, W in parts]
+
+        def of_some(common: Any, some: Any, parts: Any = parts) -> Products:
+            matrices, ats = common
+            made = [
+                _of_record(at, matrices, record, noise.by_instrument, *some)
+                for at, (record, _) in zip(ats, parts, strict=True)
+            ]
+            return jax.tree.map(lambda *v: sum(v), *made)
+
+        direct = (machines.signals, slopes.signals)
+        by = None if machines.by is None else (machines.by, slopes.by)
+        each = (direct, by, measured(layout, data, members))
+        common = (machines.matrices, slopes.matrices)
+        made = by_flight(data, members, ready, of_some, common, each)
+        total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
+    return jax.tree.map(lambda *v: sum(v), *total)
+
+
+class _Driven(NamedTuple):
+    """The states at some lines, what drives them, and the derivatives of that."""
+
+    X: Complex[Array, "... k n"]
+    lines: Signals
+    slopes: Signals
+    """(..., k, c, q); None for those that do not move"""
+
+
+def _of_record(
+    at: Resolved,
+    matrices: tuple[Matrices, Matrices],
+    record: Record,
+    by_instrument: Array,
+    direct: tuple[Signals, Signals],
+    by: tuple[Signals, Signals] | None,
+    y: Float[Array, "f N p"],
+) -> Products:
+    """Of one record of a few flights, with a leading axis.
+
+    Args:
+        direct: what drives the machines, and its derivatives by the unknowns.
+        by: the same by instrument.
+    """
+    (m, dm), blocks = matrices, at.blocks
+    e = errors_of_some(at, m, record, direct[0], y, None if by is None else by[0])
+
+    def driven(X: Array, signals: Signals, slopes: Signals) -> _Driven:
+        def lines(v: Array) -> Array:
+            flat = at_lines(record, v.reshape(*v.shape[:2], -1))
+            return blocks.cut(flat.reshape(*flat.shape[:2], *v.shape[2:]), axis=1)
+
+        return _Driven(X, *jax.tree.map(lines, (signals, slopes)))
+
+    own = (e.rows, driven(e.X, *direct), None if by is None else driven(e.X_by, *by))
+    # What passes a machine by, without its states, hangs on no unknown of most.
+    passes = any(v is not None for v in (dm.C, dm.D, direct[1].acting))
+
+    # Block by block: the derivatives at all lines would leave every cache.
+    def gram(b: Any) -> Float[Array, "f r c"]:
+        H, W = real(at.H[b]), real(at.W[b]) if passes else None
+        Q = at.basis(b)
+
+        def of_one(one: tuple[Array, _Driven, _Driven | None]) -> Array:
+            e, direct, by = one
+            J = _slopes(H, W, matrices, direct)
+            if by is None:
+                Z, right = J, [J, e[:, None]]
+            else:
+                # One program for both: the direct estimate is where the search begins.
+                Z = jax.lax.cond(
+                    by_instrument > 0.5, lambda: _slopes(H, W, matrices, by), lambda: J
+                )
+                right = [Z, e[:, None], J]
+            # One product of tall matrices in place of several: each is read once.
+            left = jnp.concatenate([Z, e[:, None], Q], axis=1)
+            return left.T @ jnp.concatenate(right, axis=1)
+
+        return jax.lax.map(of_one, jax.tree.map(lambda v: v[b], own))
+
+    shape = jax.eval_shape(gram, 0)
+    G = blocks.over(lambda b, total: total + gram(b), jnp.zeros(shape.shape, shape.dtype))
+    return jax.vmap(lambda one: projected(one, at.S))(G)
+
+
+def projected(G: Float[Array, "r c"], S: Float[Array, "m m"]) -> Products:
+    """Products with what the ends may add projected out of them: only they change (Kaufman).
+
+    Args:
+        G: of the columns [Z, e, Q], with Q what the ends may add, and [Z, e, J], all minus the
+            derivatives; or [J, e, Q] and [J, e] where Z = J.
+        S: makes an orthonormal basis of Q.
+    """
+    m = len(S)
+    q = len(G) - m - 1
+    along = S.T @ G[-m:]
+    # Of a complex normal error each part has half of the variance.
+    P = 2.0 * (G[:-m] - along[:, : q + 1].T @ along)
+    ZZ = P[:q, :q]
+    return Products(P[q, q], -P[:q, q], ZZ, P[:q, q + 1 :] if P.shape[1] > q + 1 else ZZ)
+
+
+def _slopes(
+    H: Float[Array, "k p2 n2"],
+    W: Float[Array, "k p2 p2"] | None,
+    matrices: tuple[Matrices, Matrices],
+    of: _Driven,
+) -> Float[Array, "s q"]:
+    """The derivatives of the whitened response, real parts and imaginary ones."""
+    m, dm = matrices
+    driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
+    passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
+    pairs = ((H, driving), (W, passing))
+    made = sum(M @ v for M, v in pairs if M is not None and v is not None)
+    return made.reshape(-1, made.shape[-1])  # pyright: ignore
+
+
+def _moved(
+    X: Complex[Array, "K n"],
+    u: Complex[Array, "K r"],
+    slopes: tuple[Any, Any],
+    of_signals: tuple[Array, Any],
+) -> Any:
+    """dF X + dG u + G du (K, 2a, q), real parts and imaginary ones; None where all are zero.
+
+    Args:
+        slopes: dF (a, n, q) and dG (a, r, q), None where zero.
+        of_signals: G (a, r) and du (K, r, q), None where zero.
+    """
+    total, K = None, X.shape[0]
+    pairs = [(v, d) for v, d in zip((X, u), slopes, strict=True) if d is not None]
+    if pairs:
+        # One product of large real matrices: real and imaginary parts are rows of the first.
+        v = stacked(jnp.concatenate([v for v, _ in pairs], axis=1)).reshape(2 * K, -1)
+        d = jnp.concatenate([d for _, d in pairs], axis=1)
+        a, c, q = d.shape
+        total = (v @ jnp.swapaxes(d, 0, 1).reshape(c, a * q)).reshape(K, 2 * a, q)
+    G, du = of_signals
+    if du is not None:
+        part = jnp.einsum("ar,ksrq->ksaq", G, stacked(du)).reshape(K, 2 * G.shape[0], -1)
+        total = part if total is None else total + part
+    return total
+
+
+def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
+    """Arrays in tuples and their derivatives by v, a last axis; None in place of those that are
+    zero.
+
+    Args:
+        v: where.
+    """
+
+    moving: list[bool] = []
+
+    # Called beside `make`: which derivatives are zero shows as they are made, and to trace a model
+    # once more for it takes as long as to differentiate it.
+    @jax.custom_jvp
+    def look(*leaves: Array) -> Array:
+        return jnp.zeros((), v.dtype)
+
+    def rule(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+        zero = jax.custom_derivatives.SymbolicZero
+        moving[:] = [not isinstance(t, zero) for t in tangents]
+        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+
+    look.defjvp(rule, symbolic_zeros=True)
+
+    def looked_at(v: Array) -> T:
+        made = make(v)
+        look(*jax.tree.leaves(made))
+        return made
+
+    def along(direction: Array) -> tuple[T, T]:
+        return jax.jvp(looked_at, (v,), (direction,))
+
+    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    leaves, structure = jax.tree.flatten(slopes)
+    kept = [d if moves else None for d, moves in zip(leaves, moving, strict=True)]
+    return value, jax.tree.unflatten(structure, kept)

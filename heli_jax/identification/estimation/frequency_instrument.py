@@ -8,7 +8,7 @@ Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,12 +18,10 @@ from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
-from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.frequency_lines import in_time_of, lines_of
-from heli_jax.identification.estimation.frequency_noise import AVERAGES, smoothed, smoothed_with
-from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.frequency_noise import smoothed
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Solution
+from heli_jax.identification.unknowns.layout import Data
 
 PART = 0.05
 """sd of the Gaussian that smooths the inputs' spectra, as a part of the frequency"""
@@ -125,50 +123,20 @@ def _parts(
 ) -> list[Float[np.ndarray, "N u"]]:
     """By flight what of some columns follows signals, about the columns' means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
-    responses = {}
-    for S, with_them in zip(smoothed(R, PART), smoothed_with(U, R, PART), strict=True):
-        if len(S) in responses:
+    responses, u = {}, U[0].shape[1]
+    for joint in smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART):
+        if len(joint) in responses:
             continue
+        S, with_them = joint[:, u:, u:], joint[:, :u, u:]
         size = np.sqrt(np.real(np.einsum("kii->ki", S)))
         size = np.where(size > 0, size, 1.0)[:, None, :]
         # In coherences, so that units do not count; two signals that move as one share an effect.
         shared = S / (size.swapaxes(1, 2) * size) + _ALONE * np.eye(S.shape[1])
         # From the right, which the transposes have on their left.
         turned = np.linalg.solve(shared.swapaxes(1, 2), (with_them / size).swapaxes(1, 2))
-        responses[len(S)] = turned.swapaxes(1, 2) / size
+        responses[len(joint)] = turned.swapaxes(1, 2) / size
     made = [np.einsum("kur,kr->ku", responses[len(lines)], lines) for lines in R]
     return [in_time_of(v, len(w)) + w.mean(axis=0) for v, w in zip(made, of, strict=True)]
-
-
-class Strength(NamedTuple):
-    """What the instruments tell of one unknown."""
-
-    share: float
-    """of the information that the inputs hold, the part that follows the instruments: their
-    coherence where that information lies"""
-    F: float
-    """of a regression with that coherence; below 16.4 an instrument is weak"""
-
-
-def strengths(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Strength]:
-    """By unknown of interest what the instruments tell of it.
-
-    Args:
-        at: where a fit by instrument ended.
-    """
-    layout, data, noise, z = at
-    # The same program, and the same weights.
-    direct = noise._replace(by_instrument=np.zeros(()))
-    of_inputs = np.asarray(residual_and_jacobian(layout, data, direct, z).J)
-    sds, at_best = (deviations(v)[: len(layout.of_interest)] for v in (J, of_inputs))
-    with np.errstate(all="ignore"):
-        shares = np.clip(np.nan_to_num((at_best / sds) ** 2), 0.0, 1.0)
-    # Each instrument takes its part of them.
-    n = AVERAGES * len(data.flights) / max(len(inputs_by_instrument(data)), 1)
-    return {
-        name: Strength(float(share), float(n * share / max(1.0 - share, 1e-12)))
-        for name, share in zip(layout.of_interest, shares, strict=True)
-    }
 
 
 def inputs_by_instrument(data: Data) -> tuple[str, ...]:

@@ -310,6 +310,35 @@ def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f 
     return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])
 
 
+# The unknowns that all flights share, as a vector, and what hangs on them with its derivatives.
+
+
+def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
+    """Parameters, gains and the time shift: all but initial states, biases and offsets.
+
+    Args:
+        u: the unknowns, in the units of the model.
+    """
+    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
+    shift = [] if u.shift is None else [u.shift]
+    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
+
+
+def with_shared(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
+    """The unknowns with those of a vector in place.
+
+    Args:
+        v: as `shared_of` orders them.
+    """
+    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
+    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
+    return u._replace(
+        params={n: values[n] for n in layout.free},
+        gains={n: values[n] for n in layout.gains},
+        shift=None if u.shift is None else v[-1],
+    )
+
+
 # The lines of a record so many at a time: what is made for one block stays in the caches.
 
 
@@ -514,13 +543,13 @@ def errors_of_some(
     record: Record,
     signals: Signals,
     y: Float[Array, "f N p"],
-    by: tuple[Signals, Array] | None = None,
+    by: Signals | None = None,
 ) -> Errors:
     """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
         signals: over the whole flights.
-        by: the inputs by instrument, and whether their states are asked for: zero if not.
+        by: the inputs by instrument.
     """
     blocks, f = at.blocks, y.shape[0]
     lines = Signals(*(at_lines(record, v) for v in signals))
@@ -528,7 +557,7 @@ def errors_of_some(
     beyond = at_lines(record, y - signals.acting @ m.D.T)
     # By instrument the states are those of the inputs alone: such a record has no ends.
     inputs = blocks.cut(
-        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by[0].U)]), axis=1
+        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by.U)]), axis=1
     )
     left = blocks.cut(beyond, axis=1)
 
@@ -548,19 +577,10 @@ def errors_of_some(
     d = (along @ at.S) @ at.S.T
     of_ends = d.reshape(f, at.ends.shape[2], -1).astype(at.z.dtype)
 
-    def asked_for(b: Any, driven: Array) -> Array:
-        if by is None:
-            return states(at, b, driven)
-
-        def direct(v: Array) -> Array:
-            return jnp.concatenate([states(at, b, v[:f]), jnp.zeros_like(v[f:])])
-
-        return jax.lax.cond(by[1], lambda v: states(at, b, v), direct, driven)
-
     def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, X = made
         driven = by_real(inputs[b], m.B.T).at[:f].add(at.ends[b][None] @ of_ends)
-        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(asked_for(b, driven))
+        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
 
     X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
     rows, X = blocks.over(without_ends, (white, X))

@@ -2,8 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -47,84 +46,33 @@ def smoothed(
         part: sd of the Gaussian as a part of the frequency.
         least: the same in lines, at least.
     """
-    p = lines[0].shape[1]
-    # The half that lies below the diagonal: a spectrum is Hermitian.
-    below = _below(p)
-
-    def half(v: np.ndarray) -> np.ndarray:
-        # Of a session in single precision too: the view is of double numbers.
-        power = np.ascontiguousarray(summed_powers(v)[:, below[0], below[1]], dtype=complex)
-        return power.view(float)
-
+    p, counts = lines[0].shape[1], Counter(len(v) for v in lines)
+    # Records of one length have one spectrum and one kernel: their powers are added first. A
+    # spectrum is Hermitian: the half that lies below the diagonal will do.
+    below = np.tril_indices(p)
+    sums = {}
+    for K in counts:
+        power = summed_powers(np.stack([v for v in lines if len(v) == K]))[:, below[0], below[1]]
+        # In single precision too: the view is of double numbers.
+        sums[K] = np.ascontiguousarray(power, dtype=complex).view(float)
     spectra = {}
-    for K, of_half in _over_lines(lines, half, part, least).items():
-        made, S = of_half.view(complex), np.empty((K, p, p), complex)
-        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(made), made
+    for K in counts:
+        kernels = {other: _kernel(K, other, part, least) for other in counts}
+        total = sum(kernels[other][0] @ power for other, power in sums.items())
+        weight = sum(counts[other] * of_one for other, (_, of_one) in kernels.items())
+        half = _between_knots(total / np.asarray(weight)[:, None], K, part, least).view(complex)
+        S = np.empty((K, p, p), complex)
+        S[:, below[1], below[0]], S[:, below[0], below[1]] = np.conj(half), half
         own = np.einsum("kii->ki", S)
         own += _ROUNDING * np.mean(np.real(own), axis=0)
         spectra[K] = S
     return [spectra[len(v)] for v in lines]
 
 
-def smoothed_with(
-    lines: Sequence[Complex[np.ndarray, "K p"]],
-    others: Sequence[Complex[np.ndarray, "K r"]],
-    part: float = PART,
-) -> list[Complex[np.ndarray, "K p r"]]:
-    """By record the cross-spectrum E e r^H with other signals, smoothed likewise.
-
-    Args:
-        part: sd of the Gaussian as a part of the frequency.
-    """
-    p, r = lines[0].shape[1], others[0].shape[1]
-
-    def products(v: np.ndarray) -> np.ndarray:
-        made = v[:, :, :p].transpose(1, 2, 0) @ np.conj(v[:, :, p:].transpose(1, 0, 2))
-        return np.ascontiguousarray(made.reshape(len(made), -1), dtype=complex).view(float)
-
-    both = [np.concatenate(v, axis=1) for v in zip(lines, others, strict=True)]
-    made = _over_lines(both, products, part, LEAST)
-    spectra = {K: v.view(complex).reshape(K, p, r) for K, v in made.items()}
-    return [spectra[len(v)] for v in lines]
-
-
-@functools.cache
-def _below(p: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.tril_indices(p)
-
-
 def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
     """The sum of e e^H over records."""
     at_line = v.transpose(1, 2, 0)
     return at_line @ np.conj(at_line.transpose(0, 2, 1))
-
-
-def _over_lines(
-    lines: Sequence[Complex[np.ndarray, "K p"]],
-    numbers: Callable[[Complex[np.ndarray, "f K p"]], Float[np.ndarray, "K m"]],
-    part: float,
-    least: float,
-) -> dict[int, Float[np.ndarray, "K m"]]:
-    """By length of the record the mean of some powers, smoothed over frequency.
-
-    Args:
-        numbers: of records of one length the sum of these powers.
-        part: as that of `smoothed`.
-    """
-    # Records of one length have one spectrum and one kernel: their powers are added first.
-    of_length = {len(v): [w for w in lines if len(w) == len(v)] for v in lines}
-    sums = {K: numbers(np.stack(v)) for K, v in of_length.items()}
-    made = {}
-    for K in sums:
-        _, (low, share) = knots_of(K, part, least)
-        total, weight = 0.0, 0.0
-        for other, power in sums.items():
-            kernel, of_one = _kernel(K, other, part, least)
-            total = total + kernel @ power
-            weight = weight + len(of_length[other]) * of_one
-        at_knots = total / np.asarray(weight)[:, None]
-        made[K] = at_knots[low] + share[:, None] * np.diff(at_knots, axis=0)[low]
-    return made
 
 
 def whitening_alone(
@@ -135,17 +83,13 @@ def whitening_alone(
     Raises:
         numpy.linalg.LinAlgError: a signal is zero throughout.
     """
-
-    def own(v: np.ndarray) -> np.ndarray:
-        return np.sum(np.real(v) ** 2 + np.imag(v) ** 2, axis=0)
-
     made = {}
-    # Flights held out may have other outputs.
+    # The records of a bootstrap may have other outputs.
     for p in {v.shape[1] for v in lines}:
-        alike = [v for v in lines if v.shape[1] == p]
-        for K, power in _over_lines(alike, own, PART, LEAST).items():
-            root = _positive(power + _ROUNDING * np.mean(power, axis=0)) ** -0.5
-            made[K, p] = root[:, :, None] * np.eye(p, dtype=complex)
+        for S in smoothed([v for v in lines if v.shape[1] == p]):
+            if (len(S), p) not in made:
+                own = _positive(np.real(np.einsum("kii->ki", S)))
+                made[len(S), p] = own[:, :, None] ** -0.5 * np.eye(p, dtype=complex)
     return tuple(made[v.shape] for v in lines)
 
 
@@ -168,6 +112,13 @@ def knots_of(
     low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
     share = (np.arange(K) - at[low]) / np.maximum(at[low + 1] - at[low], 1)
     return at, (low, share)
+
+
+def _between_knots(at_knots: np.ndarray, K: int, part: float, least: float) -> np.ndarray:
+    """Straight lines (K, ...) between what is known at the knots (knots, ...)."""
+    _, (low, share) = knots_of(K, part, least)
+    share = share.reshape(-1, *(1 for _ in at_knots.shape[1:]))
+    return at_knots[low] + share * np.diff(at_knots, axis=0)[low]
 
 
 @functools.lru_cache(maxsize=32)
@@ -278,8 +229,8 @@ _STEPS = 24
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
-_UNSEEN = 1e-10
-"""part of the largest effect of a state below which outputs do not show one"""
+_UNSEEN = 1e-20
+"""part of the largest power of a state's effect below which outputs do not show one"""
 
 
 @eqx.filter_jit
@@ -293,128 +244,91 @@ def whitening_by(
     machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array."""
-    size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
-    size = np.where(size > 0, size, 1.0)
-    scaled = [e / size for e in errors]
-    before = _before(machine, scaled, size)
+    counts = Counter(len(e) for e in errors)
+    before = _prewhitening(machine, errors, list(counts))
     left = smoothed(
-        [np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], GUST_PART, least=GUST_LEAST
+        [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
-    counts = tuple(Counter(len(e) for e in errors).items())
     p, made = errors[0].shape[1], {}
-    for e, W in zip(errors, whitening_of(left), strict=True):
-        K = len(e)
-        if K not in made:
-            n = np.maximum(averages(K, counts, GUST_PART, GUST_LEAST), p + 1.0)
-            made[K] = ((n - p) / n)[:, None, None] * (W @ before[K]) / size[None, None, :]
+    for W in whitening_of(left):
+        if (K := len(W)) not in made:
+            n = np.maximum(averages(K, tuple(counts.items()), GUST_PART, GUST_LEAST), p + 1.0)
+            made[K] = ((n - p) / n)[:, None, None] * (W @ before[K])
     return tuple(made[len(e)] for e in errors)
 
 
-class _Cells(NamedTuple):
-    """Lines that are taken together, of records of every length."""
-
-    f: Float[np.ndarray, " c"]
-    """in cycles a sample"""
-    H: Complex[np.ndarray, "c p n"]
-    power: Complex[np.ndarray, "c p p"]
-    """mean of e e^H"""
-    lines: Float[np.ndarray, " c"]
-
-
-def _before(
-    machine: Machine,
-    errors: Sequence[Complex[np.ndarray, "K p"]],
-    size: Float[np.ndarray, " p"],
+def _prewhitening(
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
     """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
-    p = errors[0].shape[1]
-    lengths = dict.fromkeys(len(e) for e in errors)
-    flat = {K: np.broadcast_to(np.eye(p, dtype=complex), (K, p, p)) for K in lengths}
-    with np.errstate(all="ignore"):
-        of_length = {K: [e for e in errors if len(e) == K] for K in lengths}
-        at = {K: _cells(machine, of_length[K], size) for K in lengths}
-        cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
-        corners = corners_of(cells.f)
-        # A line on a mode that does not decay has no finite response.
-        cells = _Cells(*(v[np.isfinite(cells.H).all((1, 2))] for v in cells))
-        if not cells.f.size:
-            return flat
-        parameters = _described(cells, corners)
-    if not all(np.isfinite(v).all() for v in parameters):
-        return flat
-    q, r = parameters
-    made = {}
-    for K, of in at.items():
-        S0 = _spectrum(np.nan_to_num(of.H), q @ shapes_of(of.f, corners), r)
-        root = inverse_roots(S0)
-        _, (low, share) = knots_of(K, *_CELLS)
-        made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
-    return made
-
-
-def _cells(
-    machine: Machine,
-    errors: Sequence[Complex[np.ndarray, "K p"]],
-    size: Float[np.ndarray, " p"],
-) -> _Cells:
-    """A cell around each knot of records of one length."""
-    K = len(errors[0])
-    at, _ = knots_of(K, *_CELLS)
-    edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
-    power = summed_powers(np.stack(errors)) / len(errors)
-    count = np.diff(np.append(edges, K)).astype(float)
-    power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
-    f = (at + 1) / (2 * K + 1)
     Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
-    n = len(Ad)
-    z = np.exp(2j * np.pi * f)[:, None, None]
-    H = (C / size[:, None]) @ np.linalg.inv(z * np.eye(n) - Ad)
+    cells = []
+    for K in lengths:
+        of_length = np.stack([e for e in errors if len(e) == K])
+        at, _ = knots_of(K, *_CELLS)
+        edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
+        count = np.diff(np.append(edges, K)).astype(float)
+        power = np.add.reduceat(summed_powers(of_length), edges, axis=0)
+        lines = count * len(of_length)
+        cells.append(((at + 1) / (2 * K + 1), power / lines[:, None, None], lines))
+    f, power, lines = (np.concatenate(v) for v in zip(*cells, strict=True))
+    with np.errstate(all="ignore"):
+        h = C @ np.linalg.inv(np.exp(2j * np.pi * f)[:, None, None] * np.eye(len(Ad)) - Ad)
+        h = np.swapaxes(h, 1, 2)
+        S0 = gust_spectrum(h[:, :, :, None] * np.conj(h[:, :, None, :]), f, power, lines)
+    if S0 is None:
+        return {
+            K: np.broadcast_to(np.eye(len(C), dtype=complex), (K, *power.shape[1:]))
+            for K in lengths
+        }
+    roots = np.split(inverse_roots(S0), np.cumsum([len(v[0]) for v in cells])[:-1])
+    return {K: _between_knots(root, K, *_CELLS) for K, root in zip(lengths, roots, strict=True)}
+
+
+def gust_spectrum(
+    ways: Complex[np.ndarray, "c n p p"],
+    f: Float[np.ndarray, " c"],
+    power: Complex[np.ndarray, "c p p"],
+    lines: Float[np.ndarray, " c"],
+) -> Complex[np.ndarray, "c p p"] | None:
+    """The spectrum S0 that is the most likely for complex normal errors; None where there is none.
+
+    Args:
+        ways: by cell and state what a gust of power 1 at the state makes of the outputs.
+        f: of the cells, in cycles a sample.
+        power: mean of e e^H over the lines of a cell.
+        lines: of each cell.
+    """
+    size = np.sqrt(np.average(np.real(np.einsum("cii->ci", power)), axis=0, weights=lines))
+    # A line on a mode that does not decay has no finite response.
+    fine = np.flatnonzero(np.isfinite(ways).all((1, 2, 3)))
+    if not (fine.size and np.isfinite(size).all() and (size > 0).all()):
+        return None
+    scale = size[:, None] * size[None, :]
+    corners = 0.5 * 0.5 ** np.arange(1.0, np.log2(0.5 / np.min(f)), _OCTAVES)
+    # A gust's spectrum is a sum of a white one and first-order lags.
+    shapes = [np.ones((1, fine.size)), 1.0 / (1.0 + (f[fine] / corners[:, None]) ** 2)]
+    shapes, ways = np.concatenate(shapes), ways[fine] / scale
     # What rounding leaves of a state that no output shows would pass for the way of a huge gust,
     # and the spectrum would jump with the last digit of the parameters.
-    effects = np.max(np.where(np.isfinite(H), np.abs(H), 0.0), axis=(0, 1))
-    seen = effects > _UNSEEN * np.max(effects)
-    return _Cells(f, np.where(seen, H, 0.0), power, count * len(errors))
+    effects = np.max(np.real(np.einsum("cnii->cni", ways)), axis=(0, 2))
+    ways = np.where((effects > _UNSEEN * np.max(effects))[:, None, None], ways, 0.0)
+    q, r = _powers_of_gusts(ways, shapes, power[fine] / scale, lines[fine])
+    S = (np.einsum("cn,cnij->cij", (q @ shapes).T, ways) + np.diag(r)) * scale
+    if not np.isfinite(S).all():
+        return None
+    return S[np.clip(np.searchsorted(fine, np.arange(len(f))), 0, fine.size - 1)]
 
 
-def corners_of(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
-    """Of first-order lags, from half of the rate down to the lowest of some frequencies."""
-    first, last = float(np.min(f)), 0.5
-    return last * 0.5 ** np.arange(1.0, np.log2(last / first), _OCTAVES)
-
-
-def shapes_of(
-    f: Float[np.ndarray, " c"], corners: Float[np.ndarray, " b"]
-) -> Float[np.ndarray, "b1 c"]:
-    """Spectra that a gust's is a sum of: a white one and first-order lags."""
-    return np.concatenate([np.ones((1, f.size)), 1.0 / (1.0 + (f / corners[:, None]) ** 2)])
-
-
-def _spectrum(
-    H: Complex[np.ndarray, "c p n"], Q: Float[np.ndarray, "n c"], r: Float[np.ndarray, " p"]
-) -> Complex[np.ndarray, "c p p"]:
-    return (H * Q.T[:, None, :]) @ np.conj(np.swapaxes(H, 1, 2)) + np.diag(r)
-
-
-def _described(
-    cells: _Cells, corners: Float[np.ndarray, " b"]
-) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
-    """Powers of the gusts, by state and shape, and of the outputs' own noise."""
-    h = np.swapaxes(cells.H, 1, 2)
-    ways = h[:, :, :, None] * np.conj(h[:, :, None, :])
-    return powers_of(ways, shapes_of(cells.f, corners), cells.power, cells.lines)
-
-
-def powers_of(
+def _powers_of_gusts(
     ways: Complex[np.ndarray, "c n p p"],
     shapes: Float[np.ndarray, "b1 c"],
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
-    """Powers of gusts, by state and shape, and of the outputs' own white noise, that are the most
-    likely for complex normal errors.
+    """Powers of gusts, by state and shape, and of the outputs' own white noise.
 
     Args:
-        ways: by cell and state what a gust of power 1 at the state makes of the outputs.
         shapes: spectra that a gust's is a sum of; the first is white.
     """
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
@@ -429,50 +343,23 @@ def powers_of(
     powers[0, n:], least[0, n:] = np.maximum(0.3 * np.median(own, axis=0), _NOTHING), _NOTHING
     alone = np.eye(p)[:, :, None] * np.eye(p)[:, None, :]
     ways = np.concatenate([ways, np.broadcast_to(alone, (c, p, p, p))], axis=1)
-    by_shape, told = shapes * lines, (_told_by_one if p == 1 else _told_by_several)(ways, power)
+    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
+    # then products of real matrices.
+    ways = np.ascontiguousarray(ways.reshape(c, n + p, -1), complex).view(float)
+    by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
+    by_shape = shapes * lines
     # With a quarter of them a peak of gusts stayed at the flybar's mode where there were none, and
     # a third more in the interval of If.
     for _ in range(_STEPS):
-        # Without the root that would make sure that each step gains: half as many are enough.
-        of_ways = (by_shape @ told(shapes.T @ powers)).reshape(-1, 2, n + p)
-        shown, due = of_ways[:, 0], of_ways[:, 1]
+        S = ((shapes.T @ powers)[:, None, :] @ ways).view(complex).reshape(c, p, p)
+        matrices[:, 1] = np.linalg.inv(S)
+        matrices[:, 0] = matrices[:, 1] @ power @ matrices[:, 1]
+        # By shape and way what of it the errors show, and what they should. Without the root that
+        # would make sure that each step gains: half as many are enough.
+        told = (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
+        shown, due = np.moveaxis((by_shape @ told).reshape(-1, 2, n + p), 1, 0)
         powers = np.maximum(powers * (shown / np.where(due > 0, due, 1.0)), least)
     return powers[:, :n].T, powers[0, n:]
-
-
-_Told = Callable[[Float[np.ndarray, "c m"]], Float[np.ndarray, "c 2m"]]
-"""by cell and way what of it the errors show, and what they should, of the ways' powers"""
-
-
-def _told_by_several(
-    ways: Complex[np.ndarray, "c m p p"], power: Complex[np.ndarray, "c p p"]
-) -> _Told:
-    # By cell and way its numbers in a row: sums over ways, and what of a matrix comes by each, are
-    # then products of real matrices.
-    c, m, p, _ = ways.shape
-    ways = np.ascontiguousarray(ways.reshape(c, m, -1), complex).view(float)
-    by_way, matrices = np.swapaxes(ways, 1, 2).copy(), np.empty((c, 2, p, p), complex)
-
-    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
-        inverse = np.linalg.inv((powers[:, None, :] @ ways).view(complex).reshape(c, p, p))
-        matrices[:, 0], matrices[:, 1] = inverse @ power @ inverse, inverse
-        return (matrices.view(float).reshape(c, 2, -1) @ by_way).reshape(c, -1)
-
-    return told
-
-
-def _told_by_one(
-    ways: Complex[np.ndarray, "c m 1 1"], power: Complex[np.ndarray, "c 1 1"]
-) -> _Told:
-    # Of one output they are numbers, and real ones.
-    ways, power = np.real(ways[:, :, 0, 0]), np.real(power[:, :, 0])
-
-    def told(powers: Float[np.ndarray, "c m"]) -> Float[np.ndarray, "c 2m"]:
-        over = 1.0 / np.sum(powers * ways, axis=1, keepdims=True)
-        of_ways = ways * over
-        return np.concatenate([of_ways * (power * over), of_ways], axis=1)
-
-    return told
 
 
 _ALONE = 1e-9

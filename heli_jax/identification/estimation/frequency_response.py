@@ -44,8 +44,9 @@ from heli_jax.identification.estimation.frequency_lines import (
     alike,
     by_flight,
     machines_of,
+    shared_of,
+    with_shared,
 )
-from heli_jax.identification.estimation.frequency_slopes import shared_of, with_shared
 from heli_jax.identification.estimation.objective import Objective, RowTags, untagged
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.output_error import in_time
@@ -417,9 +418,6 @@ class FrequencyResponse(Objective):
         Args:
             u: the unknowns, in the units of the model.
         """
-        # A flight held out that is shorter than a window has no responses.
-        if noise.whitening == ():
-            return Residuals(jnp.zeros(0), None)
         return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
@@ -439,18 +437,8 @@ class FrequencyResponse(Objective):
         return None
 
     def first_noise(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """The weights to begin with, of what is measured.
-
-        Args:
-            flights: those fitted, or held out: of these too short ones have no responses.
-        """
-        try:
-            weights = first_weights(problem, flights)
-        except ValueError:
-            if not all(f.hold_out for f in flights):
-                raise
-            return noise
-        return noise._replace(whitening=on_device(weights))
+        """The weights to begin with, of what is measured."""
+        return noise._replace(whitening=on_device(first_weights(problem, flights)))
 
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]

@@ -53,7 +53,7 @@ class Drive(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """What a step of the filter needs of a model; `samples` is a pytree of arrays (N, ...)."""
+    """Functions of the model at a step of the filter; `samples` is a pytree of arrays (N, ...)."""
 
     samples: Any
     measure: Callable[[Array, Any], tuple[Array, Array]]
@@ -322,8 +322,8 @@ def begun(
     sd: Mapping[str, Scalar],
     options: SimulationOptions,
 ) -> tuple[Drive, Estimate, Float[Array, "N p"], Float[Array, " p"]]:
-    """What drives a filter, its first estimate, what is measured and the variances of its noise;
-    arguments as of `innovations`."""
+    """Return the drive of a filter, its first estimate, the measurements and the variances of their
+    noise; arguments as of `innovations`."""
     options = _checked(options)
     model, inputs, linear = between_samples(model, inputs, inputs, options.hold)
     begin = options.initial_state
@@ -338,7 +338,7 @@ def begun(
 
 
 def by_name(names: Iterable[str], errors: Array, variances: Array) -> Innovations:
-    """Of arrays (N, p)."""
+    """Name the columns of arrays (N, p)."""
     names = list(names)
     return Innovations(
         dict(zip(names, errors.T, strict=True)), dict(zip(names, variances.T, strict=True))

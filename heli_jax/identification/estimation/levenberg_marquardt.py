@@ -129,7 +129,7 @@ shrink by a fifth each take ten more to come to a thousandth"""
 
 
 class _Region(NamedTuple):
-    """How far the next step may go."""
+    """Trust region of the next step."""
 
     step_size: Float[Array, ""]
     """one over the damping"""
@@ -146,7 +146,7 @@ class _TrustRegion(optx.ClassicalTrustRegion):
     """
 
     def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
-        """As optimistix: a `_Region` without a radius."""
+        """Return a `_Region` without a radius (interface of optimistix)."""
         begin = super().init(y, f_info_struct)
         return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
 
@@ -159,7 +159,8 @@ class _TrustRegion(optx.ClassicalTrustRegion):
         f_eval_info: Any,
         state: Any,
     ) -> Any:
-        """As optimistix: next step size, whether the step counts, and two records of its own."""
+        """Return the next step size, whether the step is accepted, and two records of its own
+        (interface of optimistix)."""
         size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         cost, gain = f_info.as_min(), self.predict_reduction(y_eval - y, f_info)
         change = f_eval_info.as_min() - cost
@@ -196,7 +197,7 @@ def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:
 
 
 def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]:
-    """What a full Gauss-Newton step would take off the sum of squares, as the parabola has it.
+    """Return the decrease of the sum of squares that a full Gauss-Newton step predicts.
 
     That gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations.
     Unlike the length of a step it asks for no unit, and a direction that the data leave all but
@@ -218,7 +219,7 @@ def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]
 
 
 class Constants(NamedTuple):
-    """What stays the same throughout one run."""
+    """Constants of one run."""
 
     z0: Float[Array, " q"]
     scaling: Scaling
@@ -237,7 +238,7 @@ class _Rows(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where a run stands."""
+    """State of a run."""
 
     xi: Float[Array, " q"]
     """the last point that was accepted, in the optimiser's units"""
@@ -343,7 +344,7 @@ BATCHED = Compiled(*(jax.jit(jax.vmap(f)) for f in _ARITHMETIC))
 
 
 class Optimum(NamedTuple):
-    """Where one run of the optimiser ended."""
+    """Optimum of one run."""
 
     z: Float[Array, " q"]
     cost: Float[Array, ""]
@@ -403,7 +404,7 @@ class _Run(NamedTuple):
 
 
 class _Standing(NamedTuple):
-    """How far a run is that evaluates its residuals itself; what it goes on from."""
+    """State of a run that evaluates its residuals itself, and from which it continues."""
 
     k: Array
     """steps done; of none the rest means nothing"""
@@ -420,7 +421,7 @@ class _Loop(NamedTuple):
 
 
 class _End(NamedTuple):
-    """Where it ended, or was interrupted."""
+    """End of a run, or of a part of it."""
 
     z: Float[Array, " q"]
     standing: _Standing
@@ -479,7 +480,7 @@ def _before_the_loop(
 
 @functools.cache
 def _not_begun(q: int, dtype: np.dtype) -> _Standing:
-    """What a run of q unknowns goes on from before its first step: of the shapes of what it will.
+    """Return the state of a run of q unknowns before its first step, with the shapes of later ones.
 
     An argument like any other, so that going on takes the program that began.
     """
@@ -602,7 +603,7 @@ def optimise(
 
 
 class _Limits(NamedTuple):
-    """Of one run."""
+    """Limits of one run."""
 
     steps: int
     """that are left"""

@@ -35,6 +35,7 @@ from heli_jax.identification.unknowns.layout import (
     Layout,
     Noise,
     Solution,
+    flight_places,
     unpack,
 )
 from heli_jax.numerics.cores import cores
@@ -172,30 +173,9 @@ def _with(data: Data, i: int, records: Any, samples: tuple[int, ...]) -> Data:
     return data._replace(flights=tuple(flights))
 
 
-class _Columns(NamedTuple):
-    """The unknowns that a flight feels, by their places in z."""
-
-    throughout: list[int]
-    at_first: list[int]
-    biases: list[int]
-
-
-def _columns(layout: Layout, i: int) -> _Columns:
-    at = layout.first_nuisance
-    for j in range(i):
-        at += len(layout.states) + layout.constants(layout.outputs[j])
-    states, outputs = len(layout.states), len(layout.outputs[i]) if layout.bias else 0
-    first, offsets = at + states, at + states + outputs
-    return _Columns(
-        [*range(len(layout.of_interest)), *range(offsets, offsets + len(layout.offsets))],
-        list(range(at, first)),
-        list(range(first, offsets)),
-    )
-
-
 def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
     """The i-th flight as `fused.traced.Making`."""
-    columns, names = _columns(layout, i), layout.outputs[i]
+    places, names = flight_places(layout)[i], layout.outputs[i]
 
     def making(shared: Any, records: Any, z: Any) -> Products:
         data, sd = _with(shared[0], i, records, samples), shared[1][i]
@@ -235,8 +215,8 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
             made = []
             for k, name in enumerate(names):
                 r, seen = value[k]
-                by_bias = [jnp.zeros_like(r)] * len(columns.biases)
-                if columns.biases:
+                by_bias = [jnp.zeros_like(r)] * places.biases.size
+                if layout.bias:
                     # In the order of the outputs, and felt by no state.
                     by_bias[k] = -flight.bias_scale[name] / sd[name] * seen
                 made.append([r, *(d[k][0] for d in derivatives), *by_bias])
@@ -247,8 +227,8 @@ def _making(layout: Layout, i: int, samples: tuple[int, ...]) -> Any:
             Sensitive(
                 run,
                 samples[i] - 1,
-                columns.throughout,
-                columns.at_first,
+                [*range(len(layout.of_interest)), *places.offsets.tolist()],
+                places.states.ravel().tolist(),
                 lambda carry: carry[1][0],
                 lambda z, carry: run(z).last(carry).value,
                 rows,
@@ -289,8 +269,9 @@ def _part(
     run = traced(_making(layout, i, samples), shared, records, z, each)
     if (size := _size(run.run.step.jaxpr)) > _MOST:
         raise UnsupportedError(f"a sample of {size} operations, more than {_MOST}")
-    columns = _columns(layout, i)
-    places = np.array([0, *(1 + j for part in columns for j in part)])
+    its, interest = flight_places(layout)[i], np.arange(len(layout.of_interest))
+    order = [interest, its.offsets, its.states.ravel(), its.biases]
+    places = np.r_[0, 1 + np.concatenate(order)]
     return _Part(
         Kernel(run.run, lanes_for(np.dtype(np.float64))),
         run,
@@ -363,7 +344,6 @@ def optimise_many(
     starts: Float[Array, "k q"],
     each: Any,
     *,
-    hold: int | None = None,
     batch: int = 8,
     say: Callable[[str], None] = lambda _: None,
 ) -> Optimum:
@@ -374,7 +354,6 @@ def optimise_many(
         data: makes the numbers of one run out of its slice of `each`.
         starts: where each run begins.
         each: what differs between the runs, a pytree of arrays (k, ...).
-        hold: the unknown that stays at its start, by its number.
         say: called with a sentence where many runs are no programs of machine code.
     """
     layout, noise = reached.layout, reached.noise
@@ -382,9 +361,6 @@ def optimise_many(
     fused = _fused(reached, data, each, say) if starts.shape[0] >= _MANY else None
     if fused is not None:
         batch = _SIDE_BY_SIDE
-    if hold is not None:
-        # What has no unit stays, see `scaling`.
-        units = units._replace(unit=units.unit.at[hold].set(0.0))
     k, batch = starts.shape[0], min(batch, starts.shape[0])
     optima = []
     for i in range(0, k, batch):

@@ -24,7 +24,7 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknown
 
 
 def free_scales(model_scales: tuple[str, ...], free: Container[str]) -> tuple[str, ...]:
-    """Those of a model's `input_scales` that are estimated.
+    """Return those of a model's `input_scales` that are estimated.
 
     Args:
         model_scales: `Model.input_scales`.
@@ -33,7 +33,7 @@ def free_scales(model_scales: tuple[str, ...], free: Container[str]) -> tuple[st
 
 
 def not_attenuating(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
-    """What the sum of log s has of the scale errors, to be taken off.
+    """Return the derivative of the sum of log s by the scale errors, which is taken off.
 
     Args:
         noise: with the derivatives of the last relaxation; none yet: zero.
@@ -128,7 +128,7 @@ def _own(problem: Problem) -> tuple[str, ...]:
 
 
 def taken_up(noise: Noise, u: Unknowns) -> Array | float:
-    """What log det J'J adds to minus twice the log-likelihood, near where its derivatives are of.
+    """Return the term log det J'J of minus twice the restricted log-likelihood, to first order.
 
     Args:
         u: the unknowns, in the units of the model.
@@ -173,7 +173,7 @@ def _log_det(layout: Layout, noise: Noise, J: np.ndarray, measured: int) -> floa
 
 
 def own_changed(before: Noise, after: Noise) -> bool:
-    """Whether the derivatives changed by as much as moves the noise."""
+    """True if the derivatives changed by as much as moves the noise."""
     if not after.own:
         return False
     old, new = (np.array([float(at[0]) for at in n.own.values()]) for n in (before, after))

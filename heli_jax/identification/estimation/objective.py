@@ -33,7 +33,7 @@ NoiseModel = Literal["white", "disturbance", "spectrum"]
 
 
 class RowTags(NamedTuple):
-    """What each row of the measurements is, (n,) each; -1 where it is of no single one."""
+    """Meaning of each row of the measurements, (n,) each; -1 where it belongs to no single one."""
 
     flight: np.ndarray
     signal: np.ndarray

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run, SimulatedOutputs, outputs_of
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, flight_places, unpack
 from heli_jax.numerics.jitted import jitted
 
 
@@ -60,32 +60,27 @@ def _columns(layout: Layout) -> _Columns:
     states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
     # Parameters have an effect in every row: each has its own direction.
-    colour = list(range(shared))
-    window, bias, flight = [-1] * shared, [-1] * shared, [-1] * shared
+    colour = np.arange(layout.size)
+    window, bias, flight = np.full((3, layout.size), -1)
     number, first_bias = 0, 0
-    for f, ((count, _), names) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
-        for k in range(count):
-            # A defect hangs on the window before it and the one after: two sets of directions.
-            side = k % 2 if layout.continuity is not None else 0
-            colour += [shared + side * states + i for i in range(states)]
-            window += [number] * states
-            bias += [-1] * states
-            flight += [-1] * states
-            number += 1
+    each = zip(flight_places(layout), layout.outputs, strict=True)
+    for f, (places, names) in enumerate(each):
+        k = np.arange(len(places.states))[:, None]
+        # A defect hangs on the window before it and the one after: two sets of directions.
+        side = k % 2 if layout.continuity is not None else 0
+        colour[places.states] = shared + side * states + np.arange(states)
+        window[places.states] = number + k
         # Windows and outputs of other flights share these directions: no row hangs on both.
         if layout.bias:
-            colour += [shared + 2 * states + outputs.index(n) for n in names]
-            window += [-1] * len(names)
-            bias += [first_bias + j for j in range(len(names))]
-            flight += [-1] * len(names)
-        first_bias += len(names)
-        offsets = len(layout.offsets)
-        colour += [shared + 2 * states + len(outputs) + j for j in range(offsets)]
-        window += [-1] * offsets
-        bias += [-1] * offsets
-        flight += [f] * offsets
+            colour[places.biases] = (
+                shared + 2 * states + np.array([outputs.index(n) for n in names])
+            )
+            bias[places.biases] = first_bias + np.arange(len(names))
+        colour[places.offsets] = shared + 2 * states + len(outputs) + np.arange(len(layout.offsets))
+        flight[places.offsets] = f
+        number, first_bias = number + len(k), first_bias + len(names)
     _, packed = np.unique(colour, return_inverse=True)
-    return _Columns(packed, np.array(window), np.array(bias), np.array(flight))
+    return _Columns(packed, window, bias, flight)
 
 
 class _Reach(NamedTuple):

@@ -41,10 +41,8 @@ from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_noise import (
-    corners_of,
+    gust_spectrum,
     machine_of,
-    powers_of,
-    shapes_of,
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout
@@ -577,8 +575,6 @@ def back(weights: ResponseWeights) -> ResponseWeights:
 
 _APART = 0.04
 """part of the frequency within which lines are taken together"""
-_UNSEEN = 1e-20
-"""part of the largest power of a state's effect below which outputs do not show one"""
 _OFFSETS = np.arange(-1.875, 2.0, 0.25)
 """from a line to the frequencies that a window brings to it, in lines: its main lobe. None of them
 is zero, where integrations have no finite response"""
@@ -596,55 +592,26 @@ def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed
     return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
 
 
-class _Cells(NamedTuple):
-    """Lines that are taken together."""
-
-    first: np.ndarray
-    """(c,) index of the first of each"""
-    lines: np.ndarray
-    """(c,) how many"""
-    at: np.ndarray
-    """(c,) their mean, in periods of a window"""
-
-
 def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
     """The shape that a machine gives to the noise."""
-    cells = _cells(w.lines)
-    # A line on a mode that does not decay has no finite response.
+    # Each line by itself at first, then those within a part of the frequency.
+    first = [0]
+    while (
+        end := np.searchsorted(w.lines, w.lines[first[-1]] * (1.0 + _APART), "right")
+    ) < w.lines.size:
+        first.append(int(end))
+    count = np.diff(np.append(first, w.lines.size)).astype(float)
+    at = np.add.reduceat(w.lines.astype(float), first) / count
     with np.errstate(all="ignore"):
-        ways = ways_of(Ad, C, cells.at, w.length)
+        ways = ways_of(Ad, C, at, w.length)
 
     def of(raw: Complex[np.ndarray, "k q q"], outputs: list[int]) -> np.ndarray | None:
-        size = np.sqrt(np.mean(np.real(np.einsum("kii->ki", raw)), axis=0))
-        if not (np.isfinite(size).all() and (size > 0).all()):
-            return None
-        scale = size[:, None] * size[None, :]
-        seen = ways[:, :, outputs][:, :, :, outputs] / scale
-        fine = np.isfinite(seen).all((1, 2, 3))
-        if not fine.any():
-            return None
-        # What rounding leaves of a state that no output shows would pass for a huge gust's way.
-        effects = np.max(np.real(np.einsum("cnii->cni", seen[fine])), axis=(0, 2))
-        seen = seen * (effects > _UNSEEN * np.max(effects))[:, None, None]
-        power = np.add.reduceat(raw / scale, cells.first, axis=0) / cells.lines[:, None, None]
-        f = cells.at / w.length
-        shapes = shapes_of(f, corners_of(f))
+        power = np.add.reduceat(raw, first, axis=0) / count[:, None, None]
         with np.errstate(all="ignore"):
-            q, r = powers_of(seen[fine], shapes[:, fine], power[fine], cells.lines[fine])
-            S = np.einsum("nb,bc,cnij->cij", q, shapes[:, fine], seen[fine])
-        S = (S + np.diag(r)) * scale
-        return _between(S, cells.at[fine], w.lines) if np.isfinite(S).all() else None
+            S = gust_spectrum(ways[:, :, outputs][:, :, :, outputs], at / w.length, power, count)
+        return None if S is None else _between(S, at, w.lines)
 
     return of
-
-
-def _cells(lines: np.ndarray) -> _Cells:
-    """Each line by itself at first, then those within a part of the frequency."""
-    first = [0]
-    while (end := np.searchsorted(lines, lines[first[-1]] * (1.0 + _APART), "right")) < lines.size:
-        first.append(int(end))
-    counts = np.diff(np.append(first, lines.size)).astype(float)
-    return _Cells(np.array(first), counts, np.add.reduceat(lines.astype(float), first) / counts)
 
 
 def ways_of(

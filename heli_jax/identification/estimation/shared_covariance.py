@@ -65,7 +65,7 @@ class Gaussian(NamedTuple):
 
 
 class _Gain(NamedTuple):
-    """How a sample is used."""
+    """Use of a sample."""
 
     G: Float[Array, "n p"]
     """what an innovation adds to the next predicted state: Ad times the Kalman gain"""
@@ -203,8 +203,8 @@ def _riccati(
 
 @riccati.defjvp
 def _riccati_jvp(primals: Any, tangents: Any) -> Any:
-    """With G = Ad K and F = Ad - G C: dP+ = F dP F' + dQ + G dR G' + W + W', where
-    W = dAd (P corrected) Ad' - G dC P F'. The gain is the best there is, so that no dK enters."""
+    """Differentiate: with G = Ad K and F = Ad - G C, dP+ = F dP F' + dQ + G dR G' + W + W', where W
+    = dAd (P corrected) Ad' - G dC P F'. The gain is optimal, so that no dK enters."""
     Ad, C, _, _, P = primals
     dAd, dC, dQ, dR, dP = tangents
     following, gain, (K, corrected) = _riccati(*primals)

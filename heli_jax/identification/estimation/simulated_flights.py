@@ -19,7 +19,7 @@ from heli_jax.simulation.simulate import Trajectory, simulate
 
 
 class Drive(NamedTuple):
-    """What moves the model through one flight."""
+    """Drive of the model through one flight."""
 
     params: Any
     """the model's Params, SI"""
@@ -32,7 +32,7 @@ class Drive(NamedTuple):
 
 
 def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
-    """What moves the model through the i-th flight: inputs are (logged + offset) * gain."""
+    """Return the drive of the i-th flight: inputs are (logged + offset) * gain."""
     flight, offsets = data.flights[i], u.offsets[i]
     # The later wins: what was known of this flight alone stands above what is estimated of all.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
@@ -44,7 +44,7 @@ def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
 
 
 class SimulatedOutputs(NamedTuple):
-    """What is simulated."""
+    """Simulated outputs of the flights."""
 
     outputs: tuple[Float[Array, "p N"], ...]
     """by flight, SI, as `Layout.outputs` orders them, without the bias"""
@@ -205,14 +205,14 @@ def joined_biases(u: Unknowns) -> Array:
 
 
 def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
-    """What reports show of the simulated flights."""
+    """Return the simulated outputs with their biases, as reports show them."""
     rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
     return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
 
 
 @jitted
 def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
-    """What is simulated at z, without any derivative."""
+    """Simulate the flights at z, without derivatives."""
     u = unpack(layout, data, z)
     return outputs_of(u, predict(layout, data, u))
 
@@ -236,12 +236,12 @@ innovation, which an initial state makes zero, would have no variance, and the l
 
 
 def signals(layout: Layout) -> list[tuple[int, str]]:
-    """What is measured, as (flight, output), in the order of the rows."""
+    """Return the measured signals, as (flight, output), in the order of the rows."""
     return [(i, n) for i, names in enumerate(layout.outputs) for n in names]
 
 
 def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
-    """Of every measured number its signal."""
+    """Return the signal of every measured number."""
     # From shapes alone: a constant to whatever is traced.
     sizes = [data.flights[i].outputs[n].shape[0] for i, n in signals(layout)]
     return np.repeat(np.arange(len(sizes)), sizes)
@@ -269,7 +269,7 @@ def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
 
 
 def measured_count(data: Data) -> int:
-    """How many measured numbers there are."""
+    """Return the count of measured numbers."""
     return int(measured_counts(data))
 
 

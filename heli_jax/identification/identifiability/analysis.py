@@ -44,8 +44,8 @@ from heli_jax.identification.identifiability.verdict import (
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import WeakUnknown, can_be_off, weak_unknowns
-from heli_jax.identification.unknowns.layout import Layout
+from heli_jax.identification.unknowns.initial_guess import labels
+from heli_jax.identification.unknowns.layout import FlightUnknown, Layout, flight_unknowns
 
 # From the residual's Jacobian to relative coordinates.
 
@@ -194,7 +194,7 @@ def verdict_of(
     held = np.vstack([N, rows.weak])
     shown = np.linalg.norm(held, axis=0) > _NO_EFFECT
     sensitivity = projected(np.vstack([S, np.zeros((len(rows.weak), q))]), held[:, shown])
-    named = weak_unknowns(problem, layout)
+    named = flight_unknowns(layout, labels(problem.training))
     to_relative = np.asarray(e.slopes, np.float64) * [u.sign / u.reference for u in unknowns]
     if around.reported is not None:
         reported = around.reported * np.outer(to_relative, to_relative)
@@ -207,19 +207,21 @@ def verdict_of(
     known = naming.names(problem.model.Params)
     remedies = {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
     # Initial states of a chance optimum may tell what no input does: at rest they would not.
-    kinds = {n.kind for n in named} if around.valley else ()
+    kinds = {n.kind for n in named} if around.valley else set()
+    # Windows need their initial states.
+    kinds -= {"initial_state"} if problem.window is not None else set()
     return analyse(
         sensitivity,
         unknowns,
         without_weak=_without_weak_priors(named, S, N),
         around=around,
         remedies=remedies | dict.fromkeys(around.aliased, _WITHOUT_ALIASES),
-        switches=(kind for kind in kinds if can_be_off(problem, kind)),
+        switches=kinds,
     )
 
 
 def _without_weak_priors(
-    named: tuple[WeakUnknown, ...], S: np.ndarray, N: np.ndarray
+    named: tuple[FlightUnknown, ...], S: np.ndarray, N: np.ndarray
 ) -> WithoutWeakPriors:
     """Return what the data (S by the unknowns, N by the nuisances) say without the weak priors of
     the last columns of N, which are `named`."""

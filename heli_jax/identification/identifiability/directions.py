@@ -13,7 +13,7 @@ import numpy as np
 
 from heli_jax.identification.estimation.evaluation import NULL
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Combination, Unknown
-from heli_jax.identification.unknowns.initial_guess import WeakUnknown
+from heli_jax.identification.unknowns.layout import FlightUnknown
 
 TAKES_PART = 0.1
 """of a unit direction: less is not worth naming"""
@@ -148,10 +148,10 @@ class WithoutWeakPriors(NamedTuple):
     compensation: np.ndarray
     """(k, q) by how much the nuisances move, in sds of their weak priors, to make up for a unit of
     each unknown"""
-    nuisances: tuple[WeakUnknown, ...]
+    nuisances: tuple[FlightUnknown, ...]
     """(k,)"""
 
-    def exchanged(self, v: np.ndarray, sensitivity: np.ndarray) -> tuple[WeakUnknown, ...]:
+    def exchanged(self, v: np.ndarray, sensitivity: np.ndarray) -> tuple[FlightUnknown, ...]:
         """Return the nuisances that a direction v (q,) of the unknowns is exchanged with; none
         where weak priors do not hold it.
 

@@ -27,8 +27,7 @@ from heli_jax.identification.identifiability.equivalents import (
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.initial_guess import weak_unknowns
-from heli_jax.identification.unknowns.layout import Solution, value_of
+from heli_jax.identification.unknowns.layout import Solution, flight_places, value_of
 
 _REACHES = (3.0, 9.0)
 """standard deviations to either side of a profile that is asked for; the second only where the
@@ -283,9 +282,9 @@ def _open_at_rest(
     layout = at.layout
     if layout.noise_model == "spectrum" or any(count > 1 for count, _ in layout.windows):
         return []
-    kinds = np.array([w.kind for w in weak_unknowns(problem, layout)])
     held = np.zeros(layout.size, bool)
-    held[layout.first_nuisance :] = kinds == "initial_state"
+    for places in flight_places(layout):
+        held[places.states] = True
     z = np.asarray(at.z, np.float64)
     if not (np.abs(z[held]) > _REST).any():
         return []

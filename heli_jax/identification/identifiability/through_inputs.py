@@ -19,7 +19,7 @@ import numpy as np
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.unknowns.layout import FlightData, Solution
-from heli_jax.messages import listed
+from heli_jax.messages import sentence
 
 _LEFT = 10.0
 """of a signal's variance, from which on the error of its simulation says that it left the record"""
@@ -109,23 +109,14 @@ def remarks(told: ByDisturbance, names: Sequence[str], *, counts: bool, white: b
     """Return sentences on parameters that rest on the model of the disturbance."""
     lines = []
     if names and not white:
-        lines.append(
-            f"What the colour of the innovations tells of {listed(tuple(names))} does not count, "
-            "since they are not white: disturbance or noise are not what the model says."
-        )
+        lines.append(sentence("verdict.colour-does-not-count", names=list(names)))
     elif names:
-        they = "it" if len(names) == 1 else "they"
-        rest = f"rest{'s' * (len(names) == 1)}" if counts else "would rest"
-        lines.append(
-            f"By the inputs alone the data do not determine {listed(tuple(names), 'or')}: {they} "
-            f"{rest} on the model of the disturbance{'' if counts else ', which does not count'}."
-        )
+        numbers = {"names": list(names), "counts": counts, "ignored": not counts}
+        lines.append(sentence("verdict.rests-on-disturbance", **numbers))
     if white and not counts and told.mostly:
+        times = max(told.mostly.values())
         lines.append(
-            "How the disturbance goes through the machine would tell more of "
-            f"{listed(tuple(told.mostly))} than the inputs do (intervals "
-            f"{max(told.mostly.values()):.2g} times as narrow), but only as far as the model of "
-            "the disturbance is right: the intervals are those of the inputs alone."
+            sentence("verdict.disturbance-tells-more", names=list(told.mostly), times=times)
         )
     return lines
 

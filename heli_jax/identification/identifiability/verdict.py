@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from heli_jax.identification.unknowns.initial_guess import WeakUnknown
+from heli_jax.identification.unknowns.layout import FlightUnknown
 
 # Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
@@ -111,7 +111,7 @@ class Group(NamedTuple):
     count: int
     combinations: tuple[Combination, ...]
     """what is determined of them all the same"""
-    exchanged: tuple[WeakUnknown, ...] = ()
+    exchanged: tuple[FlightUnknown, ...] = ()
     """nuisances that they are exchanged with, where weak priors alone hold them"""
 
 

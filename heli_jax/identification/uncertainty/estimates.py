@@ -333,13 +333,13 @@ def flight_nuisances(
             numbers = (None, None, None)
         unit = naming.unit(layout.model.Params, name) or ""
         estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)
-    called = labels(problem.training)
-    for i, u in enumerate(flight_unknowns(layout), layout.first_nuisance):
+    unknowns = flight_unknowns(layout, labels(problem.training))
+    for i, u in enumerate(unknowns, layout.first_nuisance):
         scale = u.scale(at.data)
         value, sd, reach = (float(v * scale) for v in (at.z[i], sds[i], reaches[i]))
         # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
         share = min(1.0, float(whites[i]) ** 2)
-        estimates[f"{called[u.flight]}/{u.name}"] = Estimate(
+        estimates[u.label] = Estimate(
             value, sd, value - reach, value + reach, _unit_of(problem, u), 0.0, share, False
         )
     return estimates

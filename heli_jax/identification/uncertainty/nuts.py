@@ -210,8 +210,8 @@ def _posterior(
     nuisance |= {name: u.noise[name] for name in layout.noises}
     nuisance |= {f"noise factor {name}": u.scales[name] for name in layout.scaled}
     fitted = [s.flight for s in fit.signals if not s.hold_out]
-    for i, one in enumerate(flight_unknowns(layout), layout.first_nuisance):
-        nuisance[f"{fitted[one.flight]}/{one.name}"] = np.asarray(z[..., i]) * one.scale(data)
+    for i, one in enumerate(flight_unknowns(layout, fitted), layout.first_nuisance):
+        nuisance[one.label] = np.asarray(z[..., i]) * one.scale(data)
     # In the optimiser's coordinates, in which the posterior is nearest to a normal distribution.
     named = z[:, :, : len(layout.free)]
     rhat = np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named))

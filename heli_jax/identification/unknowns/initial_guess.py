@@ -1,6 +1,6 @@
-"""Initial states, biases and offsets: which there are, their names, and where z begins."""
+"""Where z begins, and what flights are called."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,35 +14,12 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
-from heli_jax.identification.unknowns.layout import Data, FlightData, Layout, flight_unknowns
-
-# What the nuisance unknowns are called: initial states, biases, input offsets of every flight.
-
-
-class WeakUnknown(NamedTuple):
-    """An unknown of one flight that has a weak prior of ten times the signal."""
-
-    label: str
-    """as the fit names it: 'flight 1/bias p'"""
-    kind: str
-    """the switch in `Nuisance` that it belongs to"""
-    words: str
-    """as a sentence names it, whichever flight it belongs to: 'the bias of p'"""
-
-
-def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
-    """Return the unknowns from `layout.first_nuisance` on, with their names."""
-    called, words = labels(problem.training), {"initial_state": "initial ", "bias": "bias of "}
-    words["input_offset"] = "offset of "
-    return tuple(
-        WeakUnknown(f"{called[u.flight]}/{u.name}", u.kind, f"the {words[u.kind]}{u.of}")
-        for u in flight_unknowns(layout)
-    )
-
-
-def can_be_off(problem: Problem, kind: str) -> bool:
-    """Whether the problem would be one without this kind of nuisance: windows need their states."""
-    return bool(kind) and not (kind == "initial_state" and problem.window is not None)
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    FlightData,
+    Layout,
+    flight_places,
+)
 
 
 def labels(flights: tuple[Flight, ...]) -> list[str]:
@@ -87,27 +64,22 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray) -> None:
     """Enter the model's own initial state (of a whole helicopter its hover), or for one that is not
     linear the nearest that shows the measured outputs at the first sample of the window."""
-    at, names = layout.first_nuisance, naming.names(layout.model.State)
+    names, places = naming.names(layout.model.State), flight_places(layout)
     values = {n: np.asarray(f.start, z.dtype) for n, f in problem.free.items()}
-    for i, flight in enumerate(data.flights):
-        count, m = layout.windows[i]
+    for flight, own, (_, m) in zip(data.flights, places, layout.windows, strict=True):
         # What is known of this flight alone stands over what is free in all of them.
         params = layout.model.Params(**{**data.base, **values, **flight.known})
         by_model = own_start(layout.model, params)
         first = np.array([by_model[n] for n in names])
-        for k in range(count):
+        # Coordinates of states are in units of their weak priors' sds.
+        scales = np.array([float(flight.state_scale[n]) for n in layout.states])
+        for k, at in enumerate(own.states):
             x0 = first
             # The residual of a linear model is linear in its initial states: one step finds them
             # from anywhere. Of others a far start can lie in the valley of another solution.
             if not layout.model.linear:
                 x0 = _state_that_shows(layout, params, flight, k * m, first)
-            for j, name in enumerate(layout.states):
-                value = x0[names.index(name)]
-                # Coordinates of states are in units of their weak priors' sds.
-                scale = float(flight.state_scale[name])
-                z[at + j] = value / scale
-            at += len(layout.states)
-        at += layout.constants(layout.outputs[i])
+            z[at] = x0[[names.index(n) for n in layout.states]] / scales
 
 
 def own_start(model: Model, params: Any) -> dict[str, float]:

@@ -7,12 +7,13 @@ and the offsets of the inputs.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, sensor_noise, with_sensor_noise
@@ -164,14 +165,7 @@ class Layout(eqx.Module):
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        windows, flights = sum(count for count, _ in self.windows), len(self.outputs)
-        biases = sum(map(len, self.outputs)) if self.bias else 0
-        of_flights = windows * len(self.states) + biases + flights * len(self.offsets)
-        return self.first_nuisance + of_flights
-
-    def constants(self, outputs: tuple[str, ...]) -> int:
-        """The biases and input offsets of a flight with these outputs."""
-        return (len(outputs) if self.bias else 0) + len(self.offsets)
+        return self.first_nuisance + sum(places.every.size for places in flight_places(self))
 
     def hold(self, i: int) -> dict[str, str]:
         """What the inputs of the i-th flight do between samples, by name."""
@@ -190,13 +184,19 @@ class Layout(eqx.Module):
 class FlightUnknown(NamedTuple):
     """An unknown of one flight, whose weak prior has an sd of ten times the signal."""
 
-    name: str
-    """without the flight: 'initial p of window 2', 'bias p', 'offset lat'"""
+    label: str
+    """as the fit names it: 'flight 1/bias p', 'flight 1/initial p of window 2'"""
     kind: str
     """the switch in `Nuisance` that it belongs to"""
     of: str
     """the state, output or input"""
     flight: int
+
+    @property
+    def words(self) -> str:
+        """As a sentence names it, whichever flight it belongs to: 'the bias of p'."""
+        kinds = {"initial_state": "initial", "bias": "bias of", "input_offset": "offset of"}
+        return f"the {kinds[self.kind]} {self.of}"
 
     def scale(self, data: "Data") -> Any:
         """Return the sd of its prior, by which z is multiplied [SI]."""
@@ -209,19 +209,49 @@ class FlightUnknown(NamedTuple):
         return scales[self.kind][self.of]
 
 
-def flight_unknowns(layout: Layout) -> list[FlightUnknown]:
-    """Return the unknowns from `layout.first_nuisance` on, in the order of z."""
+class FlightPlaces(NamedTuple):
+    """Where in z the unknowns of one flight stand."""
+
+    states: Int[np.ndarray, "windows k"]
+    biases: Int[np.ndarray, " p"]
+    offsets: Int[np.ndarray, " i"]
+
+    @property
+    def constants(self) -> Int[np.ndarray, " c"]:
+        """The biases and the offsets."""
+        return np.concatenate([self.biases, self.offsets])
+
+    @property
+    def every(self) -> Int[np.ndarray, " q"]:
+        """All of them, in the order of z."""
+        return np.concatenate([self.states.ravel(), self.constants])
+
+
+def flight_places(layout: Layout) -> list[FlightPlaces]:
+    """Return the places of each flight's unknowns in z."""
+    places, at, k = [], layout.first_nuisance, len(layout.states)
+    for (windows, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        sizes = windows * k, len(outputs) if layout.bias else 0, len(layout.offsets)
+        states, biases, offsets = np.split(at + np.arange(sum(sizes)), np.cumsum(sizes)[:2])
+        places.append(FlightPlaces(states.reshape(windows, k), biases, offsets))
+        at += sum(sizes)
+    return places
+
+
+def flight_unknowns(layout: Layout, called: Sequence[str]) -> tuple[FlightUnknown, ...]:
+    """Return the unknowns from `layout.first_nuisance` on, in the order of z.
+
+    Args:
+        called: the label of each flight.
+    """
     unknowns = []
     for i, ((count, _), outputs) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
-        for k in range(count):
-            ending = f" of window {k + 1}" if count > 1 else ""
-            unknowns += [
-                FlightUnknown(f"initial {n}{ending}", "initial_state", n, i) for n in layout.states
-            ]
-        biased = outputs if layout.bias else ()
-        unknowns += [FlightUnknown(f"bias {n}", "bias", n, i) for n in biased]
-        unknowns += [FlightUnknown(f"offset {n}", "input_offset", n, i) for n in layout.offsets]
-    return unknowns
+        ends = [f" of window {k + 1}" if count > 1 else "" for k in range(count)]
+        names = [(f"initial {n}{end}", "initial_state", n) for end in ends for n in layout.states]
+        names += [(f"bias {n}", "bias", n) for n in outputs if layout.bias]
+        names += [(f"offset {n}", "input_offset", n) for n in layout.offsets]
+        unknowns += [FlightUnknown(f"{called[i]}/{name}", kind, n, i) for name, kind, n in names]
+    return tuple(unknowns)
 
 
 class Noise(NamedTuple):
@@ -399,7 +429,6 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     """Names for the entries of z.
 
     Args:
-        layout: what stands where.
         z: all unknowns (q,), without units.
     """
     q = len(layout.free)
@@ -417,11 +446,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     noise = {
         name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noises)
     }
-    at = layout.first_nuisance
-    flights = []
-    for i, flight in enumerate(data.flights):
-        flights.append(_of_flight(layout, i, flight, z, at))
-        at += layout.windows[i][0] * len(layout.states) + layout.constants(layout.outputs[i])
+    flights = [_of_flight(layout, i, flight, z) for i, flight in enumerate(data.flights)]
     states, biases, offsets = zip(*flights, strict=True)
     scales = scales_of(layout, z)
     return Unknowns(params, noise, scales, gains, shift, states, biases, offsets)
@@ -431,7 +456,6 @@ def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
     """Factors on the guess of the measurement noise, by output that has one of its own.
 
     Args:
-        layout: what stands where.
         z: all unknowns (q,), without units.
     """
     first = layout.first_nuisance - len(layout.scaled)
@@ -442,21 +466,24 @@ def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
 
 
 def _of_flight(
-    layout: Layout, i: int, flight: FlightData, z: Array, at: int
+    layout: Layout, i: int, flight: FlightData, z: Array
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """The i-th flight's initial state, biases and input offsets, which begin at z[at]."""
-    count, outputs, state = layout.windows[i][0], layout.outputs[i], None
+    """The i-th flight's initial state, biases and input offsets."""
+    places, outputs, state = flight_places(layout)[i], layout.outputs[i], None
     if layout.initial_state:
-        k = len(layout.states)
-        initial = z[at : at + count * k].reshape(count, k)
-        initial = initial[0] if count == 1 else initial
+        every = places.states.ravel().tolist()
+        initial = z[every[0] : every[-1] + 1] if every else z[:0]
+        initial = initial.reshape(places.states.shape)
+        initial = initial[0] if len(initial) == 1 else initial
         # States that are random at the first sample begin at their mean, zero.
-        values = dict.fromkeys(naming.names(layout.model.State), jnp.zeros_like(initial[..., 0]))
+        values = dict.fromkeys(
+            naming.names(layout.model.State), jnp.zeros(initial.shape[:-1], z.dtype)
+        )
         values |= {n: initial[..., j] * flight.state_scale[n] for j, n in enumerate(layout.states)}
-        state, at = layout.model.State(**values), at + count * k
-    bias = {n: jnp.zeros_like(z[0]) for n in outputs}
+        state = layout.model.State(**values)
+    bias = dict.fromkeys(outputs, jnp.zeros_like(z[0]))
     if layout.bias:
-        bias = {n: z[at + j] * flight.bias_scale[n] for j, n in enumerate(outputs)}
-        at += len(outputs)
-    offset = {n: z[at + j] * flight.offset_scale[n] for j, n in enumerate(layout.offsets)}
-    return state, bias, offset
+        each = zip(outputs, places.biases.tolist(), strict=True)
+        bias = {n: z[k] * flight.bias_scale[n] for n, k in each}
+    each = zip(layout.offsets, places.offsets.tolist(), strict=True)
+    return state, bias, {n: z[k] * flight.offset_scale[n] for n, k in each}

@@ -23,20 +23,17 @@ import scipy.special
 from heli_jax import naming
 from heli_jax.analysis.operating_point import modes_of_flight
 from heli_jax.dynamics.disturbance import disturbable
-from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
 from heli_jax.identification.validation.metrics import (
     Metrics,
     Whiteness,
-    cross_correlation,
     metrics,
 )
 from heli_jax.messages import sentence
 from heli_jax.numerics.white_noise import white_part
-from heli_jax.simulation.simulate import simulate
 
 # What to do about an output that the model does not explain.
 
@@ -48,8 +45,6 @@ GATE = 0.9
 FAR_FROM_WHITE = 0.5
 """autocorrelation of innovations at one sample beyond which the filter predicts badly; a
 disturbance with one pole too few leaves 0.1 to 0.3"""
-AGAINST = -0.3
-"""correlation below which a simulated output moves against the measured one"""
 _DIVERGED = 10.0
 """a simulation that leaves the measured range by this factor"""
 _GROWTH = 3.0
@@ -101,28 +96,14 @@ def advice_for(
     output: OutputAdequacy,
     records: Sequence[Record],
     unstable: bool,
-    apart: bool,
 ) -> str:
     """What to do about an output that is not explained: the most telling that this problem can do.
 
     Args:
         problem: what was fitted: what it has switched on already is no advice.
         unstable: whether the model is, over the length of the record.
-        apart: whether other outputs are followed well: then this one's sensor is at fault, not the
-            inputs, which all outputs share.
     """
     name, filtered = output.output, problem.noise_model == "disturbance"
-    correlation, at_start, lag = _agreement(problem, name, records)
-    if min(correlation, at_start) < AGAINST:
-        inputs = naming.names(problem.model.Inputs)
-        code = "advice.sign" if correlation < AGAINST else "advice.sign-at-start"
-        return sentence(code, output=name, inputs=inputs)
-    # The lag of signals that hardly agree anywhere is one of chance.
-    if lag and correlation > -AGAINST and not problem.nuisance.time_shift:
-        # A shift is shared by all outputs, and windows leave no room for one.
-        code = "advice.lag" if apart or problem.window is not None else "advice.lag-of-all"
-        later = "later" if lag > 0 else "earlier"
-        return sentence(code, output=name, seconds=abs(lag), later=later)
     diverged = _diverges(name, records)
     if problem.window is not None and diverged:
         return sentence("advice.shorter-windows")
@@ -138,54 +119,6 @@ def advice_for(
         code = "advice.disturbance" if axes else "advice.other-model"
         return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
     return sentence("advice.columns") if output.vaf >= 0 else ""
-
-
-def _agreement(
-    problem: Problem, name: str, records: Sequence[Record]
-) -> tuple[float, float, float]:
-    """Correlation of an output with the simulated one, the same at the start values, and the lag of
-    the first [s]."""
-    # The longest record tells most.
-    i = max(
-        (i for i, r in enumerate(records) if name in r.measured),
-        key=lambda i: records[i].measured[name].size,
-    )
-    measured, dt = records[i].measured[name], records[i].dt
-    correlation, lag = _alignment(measured, records[i].simulated[name], dt)
-    # A parameter that keeps its sign shrinks until nothing moves: the start still tells.
-    at_start = _alignment(measured, _at_start(problem, problem.training[i], name), dt)[0]
-    return correlation, at_start, lag
-
-
-def _at_start(problem: Problem, flight: Flight, name: str) -> np.ndarray:
-    """The output (N,) simulated at the start values from the model's own initial state."""
-    # In one piece even where the fit has windows: the sign of a response shows from its beginning.
-    params = problem.start_params(flight.known)
-    run = simulate(problem.model, params, flight, substeps=problem.substeps)
-    return np.asarray(getattr(run.outputs, name))
-
-
-def _alignment(measured: np.ndarray, simulated: np.ndarray, dt: float) -> tuple[float, float]:
-    """Correlation of measured and simulated at the lag [s] where it is largest in size.
-
-    The lag is 0 unless the correlation there is clearly better; (0, 0) where nothing moves.
-    """
-    # A simulation that overflowed has no correlation; that it diverged is said elsewhere.
-    if not np.max(np.abs(simulated)) < 1e100 or np.std(simulated) == 0:
-        return 0.0, 0.0
-    lags = max(1, min(round(MAX_TIME_SHIFT / dt), measured.size // 4))
-    with np.errstate(all="ignore"):
-        # Missing samples add nothing to the products and all of the simulation to their scale.
-        share = float(np.mean(~np.isnan(measured)))
-        c = cross_correlation(simulated, measured, lags) / np.sqrt(share)
-    if not np.isfinite(c).all():
-        return 0.0, 0.0
-    # Largest in size: a response of the wrong sign is aligned where it is most negative.
-    middle, best = float(c[lags]), int(np.argmax(np.abs(c)))
-    # Over so many lags chance alone finds one that is a little better than none.
-    if abs(c[best]) < abs(middle) + 0.1:
-        return middle, 0.0
-    return float(c[best]), (best - lags) * dt
 
 
 def _diverges(name: str, records: Sequence[Record]) -> bool:

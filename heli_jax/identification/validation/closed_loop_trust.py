@@ -42,7 +42,6 @@ from heli_jax.identification.estimation.frequency_instrument import (
     inputs_by_instrument,
     instrumented_inputs,
     instruments_of,
-    strengths,
 )
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, lines_of, records_of
 from heli_jax.identification.estimation.frequency_noise import LEAST, machine_of, smoothed
@@ -401,12 +400,8 @@ def weak_by_instrument(
         return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
     if at.data.flights[0].by_instrument is None:
         return ()
-    shares, of_all = _of_lines(at), strengths(at, J)
-    return tuple(
-        name
-        for name, share in zip(layout.of_interest, shares, strict=True)
-        if share > _MOST or of_all[name].F < STRONG
-    )
+    shares = _of_lines(at)
+    return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
 
 
 def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:

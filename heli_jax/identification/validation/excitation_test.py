@@ -21,7 +21,11 @@ from jaxtyping import Complex, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines, records_of
+from heli_jax.identification.estimation.frequency_lines import (
+    errors_of_lines,
+    lines_of,
+    records_of,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 
@@ -47,17 +51,17 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
     """
     by = instruments_of(problem)
     sums: dict[str, np.ndarray] = {}
-    # What ends elsewhere than it began, as a slow mode does, has its leap at all lines: what is
-    # left above a straight line between its ends is asked, too.
     for flight in problem.training:
         drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
         drives = [v for v in drives if np.ptp(v) > 0]
         names = [n for n, y in flight.outputs.items() if np.isfinite(y).all() and np.ptp(y) > 0]
         if not drives or not names:
             continue
-        count = flight.n_samples // 2
-        X, measured = _lines(drives, count), [flight.outputs[n] for n in names]
-        both = [_lines(v, count) for v in (measured, list(map(_between_ends, measured)))]
+        X, measured = lines_of(np.stack(drives, 1)), [flight.outputs[n] for n in names]
+        # What ends elsewhere than it began, as a slow mode does, has its leap at all lines: what is
+        # left above a straight line between its ends is asked, too.
+        above = [y - np.linspace(y[0], y[-1], y.size) for y in measured]
+        both = [lines_of(np.stack(v, axis=1)) for v in (measured, above)]
         found = [_in_bands(y, y, np.ones((len(y), 1)), X) for y in both]
         for name, *statistics in zip(names, *found, strict=True):
             sums[name] = sums.get(name, np.zeros((2, 5))) + np.stack(statistics)
@@ -67,11 +71,6 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
         for name, s in sums.items()
         if np.all(s[:, 1] > 0)
     }
-
-
-def _between_ends(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """A signal less the straight line from its first sample to its last."""
-    return y - np.linspace(y[0], y[-1], y.size)
 
 
 def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:
@@ -107,8 +106,8 @@ def errors_against_excitation(
         drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
         if not drives:
             continue
-        X = _lines(drives, record.lines)
-        y = _lines([flight.outputs[n][part] for n in names], record.lines)
+        X = lines_of(np.stack(drives, axis=1))
+        y = lines_of(np.stack([flight.outputs[n][part] for n in names], axis=1))
         # Records of one length share their whitening.
         if id(W) not in sizes:
             root = np.linalg.inv(np.asarray(W))
@@ -126,11 +125,6 @@ def errors_against_excitation(
         for name, (statistic, freedom, left, answer, variance) in sums.items()
         if freedom > 0
     }
-
-
-def _lines(signals: list[np.ndarray], count: int) -> Complex[np.ndarray, "K c"]:
-    v = np.stack(signals, axis=1)
-    return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + count] / np.sqrt(len(v))
 
 
 def _in_bands(

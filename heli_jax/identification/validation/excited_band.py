@@ -257,7 +257,7 @@ def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
         for p in long
     ]
     transforms = [segment_transforms(of_part, dt, length) for of_part in channels]
-    omega, both = transforms[0][0], np.concatenate([t for _, t in transforms], axis=1)
+    omega, both = transforms[0].omega, np.concatenate([t.X for t in transforms], axis=1)
     # Without zero frequency, which the straight lines took, and Nyquist's.
     inner = slice(1, -1)
     hz, m = omega[inner] / (2.0 * np.pi), len(moving)
@@ -388,7 +388,7 @@ def _powers_alone(flights: list[Flight], moving: list[str]) -> dict[str, tuple[f
     length = min(longest.n_samples, _LONGEST) // 2 * 2
     powers = {}
     for name in (n for n in moving if np.ptp(longest.inputs[n]) > 0):
-        omega, U = segment_transforms(longest.inputs[name][None, :], longest.dt, length)
-        power = np.sum(np.abs(U[1:-1, :, 0]) ** 2, axis=1)
-        powers[name] = _power_band(omega[1:-1] / (2.0 * np.pi), power)
+        spectra = segment_transforms(longest.inputs[name][None, :], longest.dt, length)
+        power = np.sum(np.abs(spectra.X[1:-1, :, 0]) ** 2, axis=1)
+        powers[name] = _power_band(spectra.omega[1:-1] / (2.0 * np.pi), power)
     return powers

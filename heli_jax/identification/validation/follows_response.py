@@ -18,7 +18,6 @@ correlation tells the two apart. Where a delay was estimated and is negative, th
 much earlier; elsewhere a late log is named as the other reading.
 """
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -76,22 +75,26 @@ def correlations_with_sums(
     """
     seen = np.isfinite(u) & np.isfinite(e).all(axis=1)
     u, e = np.where(seen, u, 0.0), np.where(seen[:, None], e, 0.0)
-    n, power, N = int(seen.sum()), float(np.sum(u**2)), u.size
-    # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's own.
-    most = [min(4 * (last - first + 1) + 20, N - 1) for first, last in blocks]
-    signals = _Signals(u, e, most, blocks)
+    n, N, (power, powers) = int(seen.sum()), u.size, (float(u @ u), np.sum(e**2, axis=0))
     correlated = Correlated(*np.zeros((2, e.shape[1], len(blocks))))
     correlated.p_value[:] = 1.0
     if not power > 0:
         return correlated
-    for b, (block, lags) in enumerate(zip(blocks, most, strict=True)):
-        own = signals.of_sums(block, lags)
+    of_u = _products_over_lags(u[:, None])[:, 0] / power
+    sums = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
+    for b, (first, last) in enumerate(blocks):
+        # From the first whole block on.
+        past = np.zeros_like(e)
+        past[last:] = sums[last - first + 1 : N - first + 1] - sums[: N - last]
+        own = _products_over_lags(past)
         size = np.sqrt(power * np.maximum(own[0], 0.0))
-        moves = size > _NOTHING * np.sqrt(power * signals.own[0] * (block[1] - block[0] + 1))
-        over = np.where(moves, 1.0 / np.where(moves, size, 1.0), 0.0)
-        correlation = signals.with_sums(block) * over
-        autocorrelation = own[1:] / np.where(moves, own[0], 1.0)
-        variance = 1.0 + 2.0 * (signals.of_u[1 : lags + 1] @ autocorrelation)
+        moves = size > _NOTHING * np.sqrt(power * powers * (last - first + 1))
+        correlation = u @ past * np.where(moves, 1.0 / np.where(moves, size, 1.0), 0.0)
+        # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's.
+        lags = min(4 * (last - first + 1) + 20, N - 1)
+        variance = 1.0 + 2.0 * (of_u[1 : lags + 1] @ own[1 : lags + 1]) / np.where(
+            moves, own[0], 1.0
+        )
         sd = np.sqrt(np.maximum(variance, 0.1) / n)
         p_value = 2.0 * scipy.special.ndtr(-np.abs(correlation) / sd)
         correlated.p_value[:, b] = np.where(moves, p_value, 1.0)
@@ -99,78 +102,10 @@ def correlations_with_sums(
     return correlated
 
 
-class _Signals:
-    """Products of signals over lags, and of sums over blocks of lags without making these sums.
-
-    What sums over the whole signal, with zeros before and behind it, have for products follows from
-    those of the signal; of what is wanted, sums that lie in the record as a whole, both ends are
-    taken off.
-    """
-
-    def __init__(
-        self, u: np.ndarray, e: np.ndarray, most: Sequence[int], blocks: Sequence[tuple[int, int]]
-    ) -> None:
-        """Of u (N,) and e (N, p), without a missing value."""
-        self.u, N = u, u.size
-        reach = [lags + last - first + 1 for lags, (first, last) in zip(most, blocks, strict=True)]
-        lags = max(*reach, *(last + 1 for _, last in blocks), 1)
-        # Padded by the lags alone: beyond them the end of the record may wrap round.
-        size = scipy.fft.next_fast_len(N + lags, real=True)
-        U, E = np.fft.rfft(u, size), np.fft.rfft(e.T, size)
-        of_u = np.fft.irfft(np.abs(U) ** 2, size)
-        self.of_u = of_u / (of_u[0] if of_u[0] > 0 else 1.0)
-        self.own = np.fft.irfft(np.abs(E) ** 2, size)[:, : lags + 1].T
-        self.crossed = np.fft.irfft(U * np.conj(E), size)[:, : lags + 1].T
-        self.sums = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
-
-    def with_sums(self, block: tuple[int, int]) -> Float[np.ndarray, " p"]:
-        """Of u with the sums over a block, from the first whole one on."""
-        first, last = block
-        early = self.u[first:last] @ self.sums[1 : last - first + 1]
-        return np.sum(self.crossed[first : last + 1], axis=0) - early
-
-    def of_sums(self, block: tuple[int, int], lags: int) -> Float[np.ndarray, "k p"]:
-        """Of the sums over a block, with themselves at lags 0 ... `lags`."""
-        (first, last), N, c = block, self.u.size, self.sums
-        width, whole = last - first + 1, N - last
-        if lags >= whole:
-            past = c[width : width + max(whole, 0)] - c[: max(whole, 0)]
-            made = np.zeros((lags + 1, c.shape[1]))
-            for k in range(min(lags + 1, len(past))):
-                made[k] = np.sum(past[: len(past) - k] * past[k:], axis=0)
-            return made
-        made = _weights(width, lags) @ self.own[: lags + width]
-
-        def at(begin: int, end: int) -> np.ndarray:
-            """The sums that begin at these samples, some of which may be none of the record."""
-            s = np.arange(begin, end)
-            return c[np.minimum(s + width, N)] - c[np.maximum(s, 0)]
-
-        # Those that begin before the record, each with itself and all that follow it.
-        if width > 1:
-            head = at(1 - width, lags)
-            made -= np.einsum("ip,kip->kp", head[: width - 1], _windows(head, lags + 1))
-        # Those that end behind it, each with itself and all before it.
-        tail = at(whole - lags, N)
-        return made - np.einsum("ip,kip->kp", tail[lags:], _windows(tail, lags + 1)[::-1])
-
-
-def _windows(v: Float[np.ndarray, "N p"], count: int) -> Float[np.ndarray, "k n p"]:
-    """Views (N - count + 1, p) that begin at the first samples."""
-    step, column = v.strides
-    shape = (count, len(v) - count + 1, v.shape[1])
-    return np.ndarray(shape, v.dtype, v, strides=(step, step, column))
-
-
-@functools.lru_cache(maxsize=64)
-def _weights(width: int, lags: int) -> Float[np.ndarray, "k d"]:
-    """What makes the autocorrelation of sums over so many samples, up to so many lags, of that of
-    the samples."""
-    made = np.zeros((lags + 1, lags + width))
-    for d in range(1 - width, width):
-        at = np.abs(np.arange(lags + 1) + d)
-        np.add.at(made, (np.arange(lags + 1), at), float(width - abs(d)))
-    return made
+def _products_over_lags(x: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "N p"]:
+    """Of each column with itself, by lag."""
+    size = scipy.fft.next_fast_len(2 * len(x), real=True)
+    return np.fft.irfft(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: len(x)]
 
 
 # What the past of a record does not foretell of it: the residuals of ARX models.
@@ -183,133 +118,46 @@ _ORDERS = (2, 4, 8, 16)
 """of the ARX models, of which BIC takes one"""
 _PER_UNKNOWN = 8
 """samples for each coefficient of a model, at least"""
-_FEW = 32
-"""columns of past samples that are kept as a matrix"""
 _RIDGE = 1e-12
 """added to the mean squares of past samples, which are of the size of one"""
 
 
 def arx_residuals(
-    y: Float[np.ndarray, "N p"], past: "Float[np.ndarray, 'N z'] | Past"
+    y: Float[np.ndarray, "N p"], past: Float[np.ndarray, "N z"]
 ) -> Float[np.ndarray, "N p"] | None:
-    """What past samples do not foretell of y (N, p), NaN where one of them is missing; None where
-    the record is too short."""
-    past = past if isinstance(past, Past) else Past(past)
-    rows, order = past.rows_of(y)
-    if not order:
+    """What a constant and the samples of other signals before it (their `past`) do not foretell of
+    y, NaN where one of them is missing; None where the record is too short."""
+    longest, (N, z) = _ORDERS[-1], past.shape
+    scale = np.nanstd(past, axis=0)
+    past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
+    x = np.ones((N - longest, longest * z + 1))
+    for k in range(longest):
+        x[:, 1 + k * z : 1 + (k + 1) * z] = past[longest - k - 1 : N - k - 1]
+    # The columns of a lower order come first.
+    sizes, counted = [n * z + 1 for n in _ORDERS], np.isfinite(y[longest:]).all(axis=1)
+    seen = [counted & np.isfinite(x[:, :k]).all(axis=1) for k in sizes]
+    sizes = [k for k, r in zip(sizes, seen, strict=True) if r.sum() >= _PER_UNKNOWN * k]
+    if not sizes:
         return None
-    seen = y[_ORDERS[-1] :][rows]
-    at = np.zeros((len(rows), y.shape[1]))
-    at[rows] = seen - np.mean(seen, axis=0)
-    m, p = seen.shape
-    # One factor serves all orders: the columns of a lower order come first. Of the products, not of
-    # the samples, which takes twenty times as long; the ridge is what rounding leaves of products.
-    products = past.products(rows, order)
-    factor = np.linalg.cholesky(products + _RIDGE * m * np.eye(len(products)))
-    along = scipy.linalg.solve_triangular(factor, past.along(at, order), lower=True)
+    rows = seen[len(sizes) - 1]
+    x, at = x[rows, : sizes[-1]], y[longest:][rows]
+    at = at - np.mean(at, axis=0)
+    m, p = at.shape
+    # One factor serves all orders. Of the products, not of the samples, which takes twenty times as
+    # long; the ridge is what rounding leaves of products.
+    factor = np.linalg.cholesky(x.T @ x + _RIDGE * m * np.eye(sizes[-1]))
+    along = scipy.linalg.solve_triangular(factor, x.T @ at, lower=True)
     unexplained = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
-    sizes = [n * past.z.shape[1] + 1 for n in _ORDERS if n <= order]
     # What rounding leaves of a signal that its past foretells exactly may be below zero.
     criteria = [
         m * np.sum(np.log(np.maximum(unexplained[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
         for k in sizes
     ]
     k = sizes[int(np.argmin(criteria))]
-    left = np.full(y.shape, np.nan)
     coefficients = scipy.linalg.solve_triangular(factor[:k, :k], along[:k], lower=True, trans=1)
-    left[_ORDERS[-1] :][rows] = (at - past.foretold(coefficients))[rows]
+    left = np.full(y.shape, np.nan)
+    left[longest:][rows] = at - x[:, :k] @ coefficients
     return left
-
-
-class Past:
-    """A constant and past samples, by lag, as what is foretold is foretold by them: their products
-    without the matrix of them all, which has a column for each signal and lag."""
-
-    def __init__(self, signals: Float[np.ndarray, "N z"]) -> None:
-        """Of signals of any unit, NaN where one is missing."""
-        self.complete = bool(np.isfinite(signals).all())
-        std, mean = (np.std, np.mean) if self.complete else (np.nanstd, np.nanmean)
-        scale = std(signals, axis=0)
-        z = (signals - mean(signals, axis=0)) / np.where(scale > 0, scale, 1.0)
-        self.missing = None if self.complete else ~np.isfinite(z).all(axis=1)
-        # Where one is missing, no row in which it stands is used.
-        self.z = z if self.missing is None else np.where(self.missing[:, None], 0.0, z)
-        self._whole: np.ndarray | None = None
-        # Of few signals the columns fit into the cache, and one product is quicker than many.
-        few = self.z.shape[1] * _ORDERS[-1] <= _FEW
-        self._matrix = (
-            self._columns(np.arange(len(self.z) - _ORDERS[-1]), _ORDERS[-1]) if few else None
-        )
-
-    def rows_of(self, y: Float[np.ndarray, "N p"]) -> tuple[np.ndarray, int]:
-        """The rows (N - longest,) at which y and its past were measured, and the highest order that
-        so many carry; 0 where they carry none."""
-        seen = np.isfinite(y[_ORDERS[-1] :]).all(axis=1)
-        for order in reversed(_ORDERS):
-            rows = seen
-            if self.missing is not None:
-                rows = seen & ~np.any(
-                    [self._lag(self.missing, k + 1) for k in range(order)], axis=0
-                )
-            if rows.sum() >= _PER_UNKNOWN * (order * self.z.shape[1] + 1):
-                return rows, order
-        return np.zeros(0, bool), 0
-
-    def products(self, rows: np.ndarray, order: int) -> Float[np.ndarray, "k k"]:
-        """Of all columns with each other, over the rows."""
-        if self._whole is None:
-            self._whole = self._of_all_rows()
-        k = order * self.z.shape[1] + 1
-        whole = self._whole[:k, :k]
-        at = np.flatnonzero(~rows)
-        if 2 * at.size <= len(rows):
-            x = self._columns(at, order)
-            return whole - x.T @ x
-        x = self._columns(np.flatnonzero(rows), order)
-        return x.T @ x
-
-    def along(self, v: Float[np.ndarray, "m p"], order: int) -> Float[np.ndarray, "k p"]:
-        """Of all columns with v, which is zero where a row is not used."""
-        if self._matrix is not None:
-            return self._matrix[:, : order * self.z.shape[1] + 1].T @ v
-        lags = (self._lag(self.z, k + 1).T @ v for k in range(order))
-        return np.concatenate([v.sum(axis=0)[None], *lags])
-
-    def foretold(self, coefficients: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "m p"]:
-        """The sum of so many columns."""
-        if self._matrix is not None:
-            return self._matrix[:, : len(coefficients)] @ coefficients
-        z, made = self.z.shape[1], np.tile(coefficients[0], (len(self.z) - _ORDERS[-1], 1))
-        for k in range((len(coefficients) - 1) // z):
-            made += self._lag(self.z, k + 1) @ coefficients[1 + k * z : 1 + (k + 1) * z]
-        return made
-
-    def _lag(self, v: np.ndarray, lag: int) -> np.ndarray:
-        return v[_ORDERS[-1] - lag : len(v) - lag]
-
-    def _columns(self, at: np.ndarray, order: int) -> Float[np.ndarray, "r k"]:
-        """Some rows of the matrix."""
-        lags = [self.z[at + _ORDERS[-1] - k - 1] for k in range(order)]
-        return np.concatenate([np.ones((at.size, 1)), *lags], axis=1)
-
-    def _of_all_rows(self) -> Float[np.ndarray, "k k"]:
-        if self._matrix is not None:
-            return self._matrix.T @ self._matrix
-        # One lag more of both moves the sum by a row at either end: with the products of the first
-        # lag with all others all are known.
-        x, first, (N, z) = self.z, _ORDERS[-1], self.z.shape
-        made = np.zeros((first, z, first, z))
-        for k in range(first):
-            made[0, :, k] = self._lag(x, 1).T @ self._lag(x, k + 1)
-        enter, leave = x[first - 2 :: -1], x[N - 2 : N - first - 1 : -1]
-        for k in range(first - 1):
-            made[k + 1, :, 0] = made[0, :, k + 1].T
-            ends = [v[k][:, None, None] * v[None, : first - 1] for v in (enter, leave)]
-            made[k + 1, :, 1:] = made[k, :, :-1] + ends[0] - ends[1]
-        sums = np.stack([self._lag(x, k + 1).sum(axis=0) for k in range(first)]).reshape(-1)
-        products = made.reshape(first * z, first * z)
-        whole = np.concatenate([sums[:, None], products], axis=1)
-        return np.concatenate([np.append(float(N - first), sums)[None], whole])
 
 
 LEVEL = 0.01
@@ -503,8 +351,7 @@ def _unforeseen(
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
     """
-    past = Past(own)
-    left = arx_residuals(u[:, None], past)
+    left = arx_residuals(u[:, None], own)
     for _ in range(_ROUNDS):
         if left is None:
             return None
@@ -513,7 +360,7 @@ def _unforeseen(
         # An input that mostly stays where it is has no other motion than its jumps.
         if size <= 1e-9 * np.std(u):
             break
-        left = arx_residuals(np.where(calm, u, np.nan)[:, None], past)
+        left = arx_residuals(np.where(calm, u, np.nan)[:, None], own)
     if left is None or not np.nanstd(left) > 1e-9 * np.std(u):
         return None
     return left[:, 0]

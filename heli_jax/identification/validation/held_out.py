@@ -22,7 +22,14 @@ from heli_jax.identification.estimation.output_error import in_time
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import labels, start_vector
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    Solution,
+    flight_places,
+    layout_of,
+)
 from heli_jax.identification.validation.excitation_test import (
     LEVEL,
     errors_against_excitation,
@@ -125,11 +132,9 @@ def _damped(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, 
 def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     """The same without windows: each flight from the initial state of its first."""
     # Of each flight's entries in z the first window's state stays, and the biases and offsets.
-    kept, at, k = [np.arange(layout.first_nuisance)], layout.first_nuisance, len(layout.states)
-    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        constants = layout.constants(outputs)
-        kept += [at + np.arange(k), at + count * k + np.arange(constants)]
-        at += count * k + constants
+    kept = [np.arange(layout.first_nuisance)]
+    for places in flight_places(layout):
+        kept += [places.states[0], places.constants]
     # As long as one window that holds them all.
     windows = tuple((1, count * m) for count, m in layout.windows)
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]

@@ -4,7 +4,6 @@ two the record bears out.
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -24,9 +23,8 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 from heli_jax.numerics.jumps import split
 
-_BEYOND_DOUBT = 20.0
-"""of twice the log-likelihood, from which on the other hold is taken where the log leaves it
-open"""
+BEYOND_DOUBT = 20.0
+"""gain in twice the log-likelihood from which on the record contradicts the hold"""
 
 
 def other_hold(
@@ -72,37 +70,16 @@ def other_hold(
     }
 
 
-class LikelierHold(NamedTuple):
-    """That the record is better explained by inputs that stay where they were commanded."""
-
-    problem: Problem
-    """with these inputs held"""
-    inputs: tuple[str, ...]
-    gain: float
-    """of twice the log-likelihood, to first order"""
-
-
-def likelier_hold(problem: Problem, at: Solution, wider: float = 1.0) -> LikelierHold | None:
-    """The problem with the inputs held that their log let be taken as linear, where the record
-    bears that out beyond doubt; None where it does not, or where nothing was left to the log.
-    """
+def likelihood_gain(problem: Problem, at: Solution, e: Evaluation) -> float:
+    """Gain in twice the log-likelihood, to first order, of holding the inputs that their log let
+    be taken as linear; 0 where there are none."""
     moving = [moving_inputs(problem, f, in_doubt=True) for f in problem.training]
-    # Before anything is computed: most logs leave nothing open.
     if not any(moving) or feeds_through(problem):
-        return None
-    e = evaluate(*at)
+        return 0.0
     other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
     if not (_is_finite(e) and _is_finite(other)):
-        return None
-    gain = deviance_of(at, _least(other), _least(e))
-    # Of residuals that are autocorrelated fewer samples are news.
-    gain /= max(wider, 1.0) ** 2
-    if not gain > _BEYOND_DOUBT:
-        return None
-    names = {n for held in moving for n in held}
-    reason = f"explains the record better so: twice the log-likelihood gains {gain:.3g}"
-    flights = tuple(_held(f, names, reason) for f in problem.flights)
-    return LikelierHold(replace(problem, flights=flights), tuple(sorted(names)), gain)
+        return 0.0
+    return deviance_of(at, _least(other), _least(e))
 
 
 def _least(e: Evaluation) -> float:
@@ -110,18 +87,6 @@ def _least(e: Evaluation) -> float:
     r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
     taken = directions(J).T @ r
     return float(r @ r - taken @ taken)
-
-
-def _held(flight: Flight, names: Collection[str], reason: str) -> Flight:
-    """A flight with the inputs held of which its log let a straight line be taken."""
-    doubted = {n for n in names if flight.hold[n] != "zero-order" and n in flight.hold_reason}
-    if not doubted:
-        return flight
-    return replace(
-        flight,
-        hold={**flight.hold, **dict.fromkeys(doubted, "zero-order")},
-        hold_reason={**flight.hold_reason, **dict.fromkeys(doubted, reason)},
-    )
 
 
 def _is_finite(e: Evaluation) -> bool:

@@ -14,8 +14,9 @@ Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score 
 others (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -31,22 +32,16 @@ NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
 """damping of the bank's filters, and the logarithm of the frequency from one to the next"""
 BROAD = NARROW[2:]
 _SURROGATES = 99
-_FIRST = 24
-"""of them that are asked first"""
-_CLEARLY = 0.1
-"""chance by these above which no more are asked: it is no news, however well it is known"""
 _LINES = 16_000
 """of all records together at most, the lowest of each"""
 _LEAST = 20
-"""lines of a record below which nothing is asked of it"""
+"""lines of a record below which it is not tested"""
 _SAME = 1e-4
 """part of a column beyond which it says something that those before it do not"""
 _AT_LEAST = 14.0
-"""gain below which no p value is asked for: by one filter alone chance makes it in 1 of 1000"""
+"""gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
-_AT_ONCE = 16
-"""filters that products are made of together"""
 _EULER = 0.5772156649015329
 
 
@@ -63,14 +58,33 @@ class Lines(NamedTuple):
     """of the residual, whitened and before it was scaled to one"""
 
 
-class Strongest(NamedTuple):
-    """The filter and drive that a residual follows most."""
+class Drive(NamedTuple):
+    """Something known that a residual may follow."""
 
+    column: int
+    """of `Lines.drives`"""
+    kind: Literal["input", "amplitude", "flights", "time"]
+    """an input through a mode or a lag; what is not linear of the motion; a parameter that differs
+    between flights, or changes over the record"""
+    of: tuple[str, ...] = ()
+    """the input, or the flights"""
+    bank: tuple[tuple[float, float], ...] = ()
+    """damping of the filters that it is tried through, and the logarithm between their frequencies;
+    it is tried without any as well unless it is an input"""
+    beside: tuple[int, ...] = ()
+    """columns whose answer through the same filter is taken off first"""
+    unknown: int | None = None
+    """that changes"""
+
+
+class Strongest(NamedTuple):
+    """The drive and filter that a residual follows most."""
+
+    drive: Drive
     statistic: float
     """gain of twice the log-likelihood, by two numbers"""
     p_value: float
     """that chance makes as much, by the best of all drives and filters"""
-    drive: int
     damping: float
     """of the filter; infinite of none"""
     frequency: float
@@ -142,87 +156,114 @@ def whitening(e: np.ndarray, holes: Sequence[int] = ()) -> np.ndarray:
     return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])
 
 
-class Residual(NamedTuple):
-    """The residual of all records together, real parts above imaginary ones."""
+def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
+    """The strongest answer of the residual of one output to any of the drives, and the probability
+    that chance makes one as strong."""
+    records = _lowest(records)
+    e, J, X, angles = (
+        np.concatenate(each)
+        for each in zip(*[(r.e, r.J, r.drives, r.angles) for r in records], strict=True)
+    )
+    rows, residual = _real(J), _real(e[:, None])
+    known = directions(rows, _SAME)
+    white = _without(known, residual)
+    freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
+    trials = list(_trials(records, drives, X.T))
+    gains = [one.gains(angles, known, white)[:, 0] for one in trials]
+    one, of = max(zip(trials, gains, strict=True), key=lambda pair: float(np.max(pair[1])))
+    at = int(np.argmax(of))
+    drive, gain = one.drives[at], float(of[at] * freedom / squares)
+    if not gain > _AT_LEAST:
+        nothing = np.zeros(J.shape[1])
+        return Strongest(drive, gain, 1.0, one.damping, one.frequency, nothing, nothing, 0.0)
+    # The same phases for the same residual, whoever tests it. In single precision, half the work:
+    # what chance makes is known to a tenth of itself.
+    turns = np.random.default_rng(0).random((e.size, _SURROGATES))
+    turns = (2.0 * np.pi * turns).astype(np.float32)
+    phases = np.cos(turns) + 1j * np.sin(turns)
+    anew = _real(_complex(white).astype(phases.dtype) * phases)
+    anew = _without(known.astype(np.float32), anew)
+    anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
+    chance = np.max([each.gains(angles, known, anew).max(axis=0) for each in trials], axis=0)
+    alone = one._replace(columns=one.columns[[*range(one.beside), one.beside + at]])
+    steps = _steps(rows, alone.through(angles).T, residual)
+    return Strongest(drive, gain, _by_chance(gain, chance), one.damping, one.frequency, *steps)
 
-    e: Float[np.ndarray, " K2"]
-    J: Float[np.ndarray, "K2 q"]
-    known: Float[np.ndarray, "K2 r"]
-    """orthonormal columns that span those of J"""
-    white: Float[np.ndarray, "K2 1"]
-    """what these leave of e"""
-    angles: Float[np.ndarray, " K"]
+
+class _Trial(NamedTuple):
+    """One filter, and the drives that are tried through it beside the same columns."""
+
+    damping: float
+    frequency: float
+    """[rad a sample]"""
+    drives: tuple[Drive, ...]
+    columns: Complex[np.ndarray, "c K"]
+    """those beside first, then the drives"""
 
     @property
-    def freedom(self) -> int:
-        """How many numbers the unknowns leave."""
-        return self.e.size - self.known.shape[1]
+    def beside(self) -> int:
+        """How many columns stand before the drives."""
+        return len(self.columns) - len(self.drives)
+
+    def through(self, angles: Float[np.ndarray, " K"]) -> Float[np.ndarray, "c2 K2"]:
+        """The columns through the filter, each by itself and one sample later."""
+        back = np.exp(-1j * angles)
+        x = self.columns
+        if np.isfinite(self.damping):
+            size = np.exp(-self.damping * self.frequency)
+            turn = self.frequency * np.sqrt(max(1.0 - self.damping**2, 0.0))
+            x = x / (1.0 - 2.0 * size * np.cos(turn) * back + (size * back) ** 2)
+        both = np.stack([x, x * back], axis=1).reshape(-1, len(angles))
+        return np.concatenate([np.real(both), np.imag(both)], axis=1)
+
+    def gains(
+        self,
+        angles: Float[np.ndarray, " K"],
+        known: Float[np.ndarray, "K2 q"],
+        residuals: Float[np.ndarray, "K2 r"],
+    ) -> Float[np.ndarray, "d r"]:
+        """The part of each residual's squares that each drive explains beyond what is known, by
+        products of columns: a basis for each filter and drive would take ten times as long.
+
+        Args:
+            known: orthonormal; the residuals have nothing of it.
+        """
+        rows, b, d = self.through(angles), 2 * self.beside, len(self.drives)
+        of_known, answers = rows @ known, rows.astype(residuals.dtype) @ residuals
+        whole = rows @ rows[:b].T
+        left = whole - of_known @ of_known[:b].T
+        taken = left[b:] @ _inverse(left[:b], whole[:b])
+        answers = (answers[b:] - taken @ answers[:b]).reshape(d, 2, -1)
+        each, of_known, left, taken = (
+            v[-2 * d :].reshape(d, 2, -1) for v in (rows, of_known, left, taken)
+        )
+        own = each @ _turned(each)
+        over = _inverse(own - of_known @ _turned(of_known) - taken @ _turned(left), own)
+        return np.sum(answers * (over @ answers), axis=1)
 
 
-def residual_of(records: Sequence[Lines]) -> Residual:
-    """The residual of one output, of which `strongest` asks."""
-    e, J, angles = (
-        np.concatenate(each)
-        for each in zip(*[(r.e, r.J, r.angles) for r in _lowest(records)], strict=True)
-    )
-    rows, v = _real(J), _real(e[:, None])
-    known = directions(rows, _SAME)
-    return Residual(v[:, 0], rows, known, _without(known, v), angles)
-
-
-def strongest(
-    records: Sequence[Lines],
-    drives: Sequence[int],
-    bank: Sequence[tuple[float, float]],
-    *,
-    beside: Sequence[int] = (),
-    plain: bool = False,
-    least: float = 0.0,
-    residual: Residual | None = None,
-) -> Strongest:
-    """The strongest answer of the residual to a drive through a filter of a bank.
-
-    Args:
-        drives: columns of `Lines.drives` that are asked for.
-        bank: damping of the filters and the logarithm between their frequencies.
-        beside: columns whose answer through the same filter is taken off first.
-        plain: whether the drives are tried without any filter as well.
-        least: gain up to which nothing but the gain is asked, as where another answer has as much.
-        residual: that of these records, where it is at hand.
-    """
-    of, records = residual or residual_of(records), _lowest(records)
-    freedom, squares = of.freedom, np.sum(of.white**2)
-    X = np.concatenate([record.drives for record in records]).T
-    filters = _filters(records, bank, plain)
-    columns = _Columns(np.concatenate([_ends(records), X[[*beside]]]), X[[*drives]], of.angles)
-    asked, answers = _asked(filters, columns, _complex(of.known).T, _complex(of.white).T)
-    gains = _gains(asked, answers)
-    k = int(np.argmax(gains))
-    gain = float(gains.reshape(-1)[k] * freedom / squares)
-    drive, one = drives[k % len(drives)], filters[k // len(drives)]
-    if not gain > max(_AT_LEAST, least):
-        nothing = np.zeros(of.J.shape[1])
-        return Strongest(gain, 1.0, drive, *one, nothing, nothing, 0.0)
-    # The same phases for the same residual, whoever asks. In single precision, half the work: what
-    # chance makes is known to a tenth of itself.
-    turns = np.random.default_rng(0).random((len(of.angles), _SURROGATES))
-    turns, basis = (2.0 * np.pi * turns).astype(np.float32), of.known.astype(np.float32)
-
-    def of_chance(turns: np.ndarray) -> np.ndarray:
-        phases = np.cos(turns) + 1j * np.sin(turns)
-        anew = _without(basis, _real(_complex(of.white).astype(phases.dtype) * phases))
-        anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-        return _gains(asked, _answers(filters, columns, _complex(anew).T)).max(axis=(0, 1))
-
-    others = of_chance(turns[:, :_FIRST])
-    if _by_chance(gain, others) < _CLEARLY:
-        others = np.concatenate([others, of_chance(turns[:, _FIRST:])])
-    chance = _by_chance(gain, others)
-    ((G, _),) = _responses([one], columns.back)
-    found = np.concatenate([columns.beside, columns.drives[[k % len(drives)]]])
-    found = np.stack([found, found * columns.back], axis=1).reshape(-1, len(of.angles))
-    through = _real(_complex(G.T) * found.T)
-    return Strongest(gain, chance, drive, *one, *_steps(of.J, through, of.e[:, None]))
+def _trials(
+    records: Sequence[Lines], drives: Sequence[Drive], X: Complex[np.ndarray, "d K"]
+) -> Iterator[_Trial]:
+    """The drives by filter and by what stands beside them; the filters from two swings over the
+    longest record on."""
+    low = 2.0 * min(float(record.angles[0]) for record in records)
+    high = 0.9 * max(float(record.angles[-1]) for record in records)
+    # What the record's ends make of a filter's states has a column for each record.
+    ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).astype(complex)
+    for (bank, plain, beside), group in itertools.groupby(
+        drives, lambda d: (d.bank, d.kind != "input", d.beside)
+    ):
+        those = tuple(group)
+        columns = np.concatenate([ends, X[[*beside]], X[[d.column for d in those]]])
+        if plain:
+            yield _Trial(np.inf, 0.0, those, columns)
+        for damping, step in bank:
+            w = low
+            while w < high:
+                yield _Trial(damping, w, those, columns)
+                # No finer than lines lie.
+                w *= np.exp(max(step, 0.25 * low / w))
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
@@ -271,109 +312,6 @@ def step_to_least(records: Sequence[Lines]) -> Float[np.ndarray, " q"]:
     return _steps(J, np.zeros((len(J), 2)), e)[1]
 
 
-class _Columns(NamedTuple):
-    """Columns that go through the filters, each by itself and one sample later."""
-
-    beside: Complex[np.ndarray, "b K"]
-    """those whose answer through the same filter is taken off first"""
-    drives: Complex[np.ndarray, "d K"]
-    angles: Float[np.ndarray, " K"]
-
-    @property
-    def back(self) -> Complex[np.ndarray, " K"]:
-        """The response of a delay by one sample."""
-        return np.exp(-1j * self.angles)
-
-
-class _Asked(NamedTuple):
-    """Products, by filter, that do not depend on the residual."""
-
-    over: Float[np.ndarray, "F b2 b2"]
-    """the inverse of those of the columns beside, without what is known"""
-    cross: Float[np.ndarray, "F d b2 2"]
-    """of the columns beside with each drive, without what is known"""
-    own: Float[np.ndarray, "F d 2 2"]
-    """the inverse of each drive's, without what is known and the columns beside"""
-
-
-def _asked(
-    filters: Sequence[tuple[float, float]],
-    columns: _Columns,
-    known: Complex[np.ndarray, "q K"],
-    residual: Complex[np.ndarray, "1 K"],
-) -> tuple[_Asked, Float[np.ndarray, "F c 2 1"]]:
-    """Precompute the products that do not depend on the residual, and those with this residual.
-
-    By products of columns, since the filters all act on the same ones: a basis for each filter and
-    drive would take ten times as long.
-
-    Args:
-        filters: dampings and frequencies [rad a sample].
-        known: an orthonormal basis of the sensitivities; residuals have nothing of it.
-        residual: whose products come second, of the columns beside first, then of each drive.
-    """
-    taken = np.concatenate([known, residual])
-    (b, K), d = columns.beside.shape, len(columns.drives)
-    x, back, F = np.concatenate([columns.beside, columns.drives]), columns.back, len(filters)
-    once, each, size = _once(x, taken, back), np.conj(x[:b, None]) * x, np.abs(x[b:]) ** 2
-    # With itself, with the other one sample later, and with itself so: of two that are both later
-    # the product is that of the two.
-    rows = (np.real(v).reshape(-1, K) for v in (each, each * back, each * np.conj(back)))
-    twice = np.concatenate([*rows, size, size * np.real(back)])
-    products = [(G @ once.T, power @ twice.T) for G, power in _responses(filters, back)]
-    of_taken, both = (np.concatenate(parts) for parts in zip(*products, strict=True))
-    of_taken = of_taken.reshape(F, b + d, 2, -1)
-    shifted = both[:, : 3 * b * (b + d)].reshape(F, 3, b, b + d)[:, [[0, 1], [2, 0]]]
-    shifted = shifted.transpose(0, 3, 1, 4, 2).reshape(F, 2 * b, b + d, 2)
-    own = both[:, 3 * b * (b + d) :].reshape(F, 2, d)[:, [[0, 1], [1, 0]]].transpose(0, 3, 1, 2)
-    whole = shifted[:, :, :b].reshape(F, 2 * b, 2 * b)
-    by_beside = of_taken[:, :b, :, :-1].reshape(F, 2 * b, -1)
-    by_drive = of_taken[:, b:, :, :-1]
-    over = _inverse(whole - by_beside @ _turned(by_beside), whole)
-    cross = shifted[:, :, b:].transpose(0, 2, 1, 3) - by_beside[:, None] @ _turned(by_drive)
-    left = own - by_drive @ _turned(by_drive) - _turned(cross) @ over[:, None] @ cross
-    return _Asked(over, cross, _inverse(left, own)), of_taken[..., -1:]
-
-
-def _once(
-    x: Complex[np.ndarray, "c K"],
-    taken: Complex[np.ndarray, "t K"],
-    back: Complex[np.ndarray, " K"],
-) -> Float[np.ndarray, "n K2"]:
-    """The products of columns, and of each one sample later, with what is taken of them."""
-    both = np.conj(np.stack([x, x * back], axis=1))
-    rows = (both[:, :, None] * taken).reshape(-1, len(back))
-    return np.concatenate([np.real(rows), np.imag(rows)], axis=1)
-
-
-def _answers(
-    filters: Sequence[tuple[float, float]], columns: _Columns, taken: Complex[np.ndarray, "t K"]
-) -> Float[np.ndarray, "F c 2 t"]:
-    """As those of `_asked`, of other residuals in their precision."""
-    x, back = (
-        v.astype(taken.dtype)
-        for v in (np.concatenate([columns.beside, columns.drives]), columns.back)
-    )
-    G = np.concatenate(
-        [v.astype(np.real(taken).dtype) for v, _ in _responses(filters, columns.back)]
-    )
-    # Column by column: there are many residuals.
-    each = [(G @ _once(v[None], taken, back).T).reshape(len(G), 2, len(taken)) for v in x]
-    return np.stack(each, axis=1)
-
-
-def _gains(asked: _Asked, answers: Float[np.ndarray, "F c 2 r"]) -> Float[np.ndarray, "F d r"]:
-    """Gains: the part of each residual's squares that a drive through a filter explains.
-
-    Args:
-        answers: those with the residuals, of the columns beside first, then of each drive.
-    """
-    b = answers.shape[1] - asked.cross.shape[1]
-    right = asked.over @ answers[:, :b].reshape(len(answers), 2 * b, -1)
-    left = answers[:, b:] - _turned(asked.cross) @ right[:, None]
-    return np.sum(left * (asked.own @ left), axis=2)
-
-
 def _turned(M: np.ndarray) -> np.ndarray:
     return np.swapaxes(M, -1, -2)
 
@@ -396,54 +334,6 @@ def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
         return 1.0
     middle = float(np.mean(others)) - _EULER * scale
     return float(-np.expm1(-np.exp(-(gain - middle) / scale)))
-
-
-def _filters(
-    records: Sequence[Lines], bank: Sequence[tuple[float, float]], plain: bool
-) -> list[tuple[float, float]]:
-    """Dampings and frequencies [rad a sample], from two swings over the longest record on."""
-    low = 2.0 * min(float(record.angles[0]) for record in records)
-    high = 0.9 * max(float(record.angles[-1]) for record in records)
-    tried = [(np.inf, 0.0)] if plain else []
-    for damping, step in bank:
-        w = low
-        while w < high:
-            tried.append((damping, w))
-            # No finer than lines lie.
-            w *= np.exp(max(step, 0.25 * low / w))
-    return tried
-
-
-def _responses(
-    filters: Sequence[tuple[float, float]], back: Complex[np.ndarray, " K"]
-) -> Iterator[tuple[Float[np.ndarray, "F K2"], Float[np.ndarray, "F K"]]]:
-    """Frequency responses of the filters at the lines, real and imaginary parts side by side, and
-    their squared sizes; of a few filters at a time: fresh memory takes longer than the sums.
-
-    Args:
-        filters: dampings and frequencies [rad a sample].
-    """
-    w, damping = (np.array([one[i] for one in filters]) for i in (1, 0))
-    plain = ~np.isfinite(damping)
-    damping = np.where(plain, 1.0, damping)
-    size = np.where(plain, 0.0, np.exp(-damping * w))
-    twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
-    over = np.stack([np.ones(len(w)), -twice, size**2], axis=1)
-    powers, K = np.stack([np.ones_like(back), back, back**2]), back.size
-    powers = np.concatenate([np.real(powers), np.imag(powers)], axis=1)
-    for k in range(0, len(w), _AT_ONCE):
-        # By real numbers: NumPy divides complex ones slowly.
-        G = over[k : k + _AT_ONCE] @ powers
-        power = 1.0 / (G[:, :K] ** 2 + G[:, K:] ** 2)
-        G[:, :K] *= power
-        G[:, K:] *= -power
-        yield G, power
-
-
-def _ends(records: Sequence[Lines]) -> Complex[np.ndarray, "r K"]:
-    """By record what the filter's states at its ends are driven by."""
-    sizes = [record.e.size for record in records]
-    return np.repeat(np.eye(len(sizes)), sizes, axis=1).astype(complex)
 
 
 def _steps(

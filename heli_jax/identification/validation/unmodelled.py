@@ -12,7 +12,7 @@ constant takes up.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,15 +30,15 @@ from heli_jax.identification.estimation.evaluation import (
 )
 from heli_jax.identification.estimation.output_error import OBJECTIVE as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import signals
-from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.unknowns.layout import Solution, flight_places
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
+    Drive,
     Lines,
     Strongest,
     lines_of,
     pulled_away,
-    residual_of,
     step_to_least,
     strongest,
 )
@@ -182,7 +182,7 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
         return rows
     # By differences of the simulation, whose program is there: a Jacobian would compile another.
     z = np.asarray(z)
-    blocks = _blocks(at)
+    blocks = [places.every for places in flight_places(layout)]
     common = [np.array([k]) for k in range(layout.first_nuisance)]
     longest = max((b.size for b in blocks), default=0)
     # Each flight's own unknowns move at once: none is felt by another flight.
@@ -199,16 +199,6 @@ def sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarr
                 if k < layout.first_nuisance or k in blocks[i]:
                     slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
     return slopes
-
-
-def _blocks(at: Solution) -> list[np.ndarray]:
-    """By flight where in z its own unknowns stand."""
-    layout, first, out = at.layout, at.layout.first_nuisance, []
-    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        size = count * len(layout.states) + layout.constants(outputs)
-        out.append(np.arange(first, first + size))
-        first += size
-    return out
 
 
 # What may drive what a model lacks.
@@ -230,25 +220,16 @@ def moving_inputs(at: Solution) -> list[str]:
     return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
 
 
-def drives(
-    at: Solution, e: Evaluation, i: int, name: str, moving: Sequence[str]
-) -> Float[np.ndarray, "N d"]:
-    """The inputs that move, then what is not linear of these and of `motions`, and what a linkage
-    with play keeps of the inputs.
-
-    Args:
-        at: where the fit ended.
-        moving: of `moving_inputs`.
-    """
-    inputs = naming.asdict(at.data.flights[i].inputs)
-    u = [_normal(np.asarray(inputs[n])) for n in moving]
-    y = np.asarray(e.simulated[i][name])
+def nonlinear(y: np.ndarray, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """What is not linear of inputs and of the `motions` of a simulated output (each (N,)), and what
+    a linkage with play keeps of the inputs."""
+    u = [_normal(v) for v in inputs]
     response = [_normal(v) for v in motions(y)]
     curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
     # Friction has a sign and no size.
     curved += [np.sign(v) for v in response[:2]]
-    # What play takes off hangs on where the stick came from, not on where it is: no power does.
-    return np.stack([*u, *curved, *(v - _behind_play(v) for v in u)], axis=1)
+    # Play depends on where the stick came from, not on where it is: no power does.
+    return [*curved, *(v - _behind_play(v) for v in u)]
 
 
 def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -274,35 +255,6 @@ def _normal(v: np.ndarray) -> np.ndarray:
     return v / size if size > 0 else v
 
 
-def changing(
-    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: Sequence[int]
-) -> dict[int, np.ndarray]:
-    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
-    one over the flights in their order, and one halfway.
-
-    Args:
-        at: where the fit ended.
-        J: by flight and output (N, q) the derivative of the residual by all unknowns.
-    """
-    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
-    t = np.linspace(-1.0, 1.0, sum(sizes))
-    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
-    return {
-        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
-        for i, s in each
-    }
-
-
-def of_single_flights(lines: Sequence[Lines], k: int) -> list[Lines]:
-    """With k further drives a record: what a change of each parameter in that record alone does."""
-    out = []
-    for i, record in enumerate(lines):
-        more = np.zeros((record.e.size, k * len(lines)), complex)
-        more[:, k * i : k * (i + 1)] = record.J[:, :k]
-        out.append(record._replace(drives=np.concatenate([record.drives, more], axis=1)))
-    return out
-
-
 LEVEL, IN_COLOUR = 0.01, 1e-3
 """of all outputs and questions together; and where residuals in time are autocorrelated, as in
 strong gusts: what whitens them is then too short to leave nothing"""
@@ -318,11 +270,7 @@ class Unmodelled(NamedTuple):
     """What the residual of an output follows beyond chance."""
 
     output: str
-    kind: Literal["input", "amplitude", "flights", "time"]
-    """an input, later or beside the model; what is not linear of the motion; parameters that differ
-    between flights, or change over the record"""
-    of: tuple[str, ...]
-    """the input, or the flights"""
+    drive: Drive
     gain: float
     """of twice the log-likelihood"""
     p_value: float
@@ -358,153 +306,143 @@ def unmodelled(
     names = sorted({n for i in looked_at for n in layout.outputs[i] if usable(at, e, i, n)})
     if not names:
         return nothing
-    level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
+    level = (IN_COLOUR if coloured else LEVEL) / len(names)
     lacking, J = [], sensitivities(at, e)
-    lines = {name: _lines(at, e, name, J) for name in names}
-    for name in names:
-        asked = _of_output(at, lines[name])
-        one = None if asked is None else _where_least(at, asked, name, level)
-        if one is not None and one.strong.p_value < level:
-            lacking.append(_told(at, e, name, one, J, flights))
-    each = [[one for _, one in lines[name]] for name in names if lines[name]]
-    k = len(layout.of_interest)
-    chances = [pulled_away(records, k) for records in each]
+    each = {name: _lines(at, e, name, J, flights) for name in names}
+    for name, (drives, records) in each.items():
+        if not drives:
+            continue
+        strong = _where_least(at, name, drives, records, level, flights)
+        if strong.p_value < level:
+            lacking.append(_told(at, e, name, strong, J))
+    asked, k = [records for _, records in each.values() if records], len(layout.of_interest)
+    chances = [pulled_away(records, k) for records in asked]
     p = min(1.0, min(chances) * len(chances)) if chances else 1.0
     if p > IN_COLOUR:
         return lacking, (p, {})
-    step = step_to_least([one for records in each for one in records])[:k] * np.asarray(e.slopes)
+    step = step_to_least([one for records in asked for one in records])[:k] * np.asarray(e.slopes)
     return lacking, (p, dict(zip(layout.of_interest, step.tolist(), strict=True)))
 
 
-class _Asked(NamedTuple):
-    """The strongest answer of an output, and how large its whitened residual is."""
-
-    strong: Strongest
-    by_amplitude: bool
-    over_time: bool
-    deviance: float
-    """of the whitened residual: twice its negative log-likelihood but for a constant"""
-    odd: int | None
-    """the flight that it is of, where it is an answer that only one gives"""
-    flights: tuple[int, ...]
-    """that were looked at"""
-    columns: int
-    """drives before those of a changing parameter"""
-
-
-def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked:
+def _where_least(
+    at: Solution,
+    name: str,
+    drives: Sequence[Drive],
+    records: Sequence[Lines],
+    level: float,
+    called: Sequence[str],
+) -> Strongest:
     """The answer where the output's whitened residual is least, if it is significant before.
 
     With coloured residuals a fit ends elsewhere: its unknowns are off by more than sensitivities
     are straight, and what these cannot take up would pass for something that the model lacks.
     """
-    part = 1.0
+    part, strong = 1.0, strongest(records, drives)
     for _ in range(_ROUNDS):
-        if not asked.strong.p_value < level:
+        if not strong.p_value < level:
             break
-        there = at._replace(z=at.z + part * jnp.asarray(asked.strong.step, at.z.dtype))
+        there = at._replace(z=at.z + part * jnp.asarray(strong.step, at.z.dtype))
         e = evaluate(*there)
-        again = None
+        asked, again = [], []
         if any(usable(there, e, i, name) for i in longest(at)):
-            again = _of_output(there, _lines(there, e, name, sensitivities(there, e)))
-        if again is None or not again.deviance < asked.deviance:
+            asked, again = _lines(there, e, name, sensitivities(there, e), called)
+        if not asked or not _deviance(again) < _deviance(records):
             part *= 0.25
             continue
-        gained, at, asked, part = asked.deviance - again.deviance, there, again, 1.0
+        gained, at, records, part = _deviance(records) - _deviance(again), there, again, 1.0
+        strong = strongest(records, asked)
         if gained < _ENOUGH:
             break
-    return asked
+    return strong
+
+
+def _deviance(records: Sequence[Lines]) -> float:
+    """Twice the negative log-likelihood of a whitened residual, but for a constant: two numbers a
+    line, each of the variance size**2."""
+    return float(4.0 * sum(one.e.size * np.log(one.size) for one in records))
 
 
 def _lines(
-    at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
-) -> list[tuple[int, Lines]]:
-    """By flight the lines of an output that can be asked of, with the drives that are asked for:
-    the inputs, what is not linear, and what parameters do that change."""
+    at: Solution,
+    e: Evaluation,
+    name: str,
+    J: Mapping[tuple[int, str], np.ndarray],
+    called: Sequence[str],
+) -> tuple[list[Drive], list[Lines]]:
+    """The drives that the residual of an output may follow, none where nothing can be tested, and
+    its lines by flight.
+
+    Args:
+        called: the flights' names.
+    """
     moving, samples = moving_inputs(at), of_one_clock(at, e, name)
-    over_time, out = changing(at, J, name, [i for i, _ in samples]), []
-    for i, own in samples:
-        X = drives(at, e, i, name, moving)
-        X = np.stack([own.of_input(v) for v in X.T], axis=1) if own.every > 1 else X[own.rows]
-        X = np.concatenate([X, over_time[i][own.rows]], axis=1)
+    k, m = len(at.layout.of_interest), len(moving)
+    steps, lines = [J[i, name].shape[0] for i, _ in samples], []
+    # A change of a parameter: a steady one over the flights in their order, and one halfway.
+    t = np.split(np.linspace(-1.0, 1.0, sum(steps)), np.cumsum(steps)[:-1])
+    for place, ((i, own), shape) in enumerate(zip(samples, t, strict=True)):
+        inputs = naming.asdict(at.data.flights[i].inputs)
+        u, slopes = [np.asarray(inputs[n]) for n in moving], J[i, name][:, :k]
+        known = np.stack([*u, *nonlinear(np.asarray(e.simulated[i][name]), u)], axis=1)
+        X = [np.stack([own.of_input(v) for v in known.T], axis=1)]
+        # A change in one flight alone, before those over time: it is one halfway as well.
+        X += [slopes[own.rows] * (other == place) for other in range(len(samples))]
+        X += [(slopes * by[:, None])[own.rows] for by in (shape, np.sign(shape))]
         left = np.asarray(e.raw[i][name])[own.rows]
-        lines = lines_of(left, J[i, name][own.rows], X, own.holes)
-        if lines is not None:
-            out.append((i, lines))
-    return out
-
-
-def _of_output(at: Solution, those: Sequence[tuple[int, Lines]]) -> _Asked | None:
-    """The strongest answer of an output: linear, by amplitude, over time or of one flight; None
-    where nothing can be asked."""
-    m = len(moving_inputs(at))
-    if not those or not m:
-        return None
-    lines, k = [one for _, one in those], len(at.layout.of_interest)
-    columns = lines[0].drives.shape[1]
-    constant = columns - 2 * k
-    residual = residual_of(lines)
-    linear = strongest(lines, range(m), NARROW, residual=residual)
-    # Of three answers the best one, of equal ones the first: chance is asked of no other.
-    curved = strongest(
-        lines, range(m, constant), BROAD,
-        beside=range(m), plain=True, least=linear.statistic, residual=residual,
-    )  # fmt: skip
-    most = max(linear.statistic, curved.statistic)
-    changes = list(range(constant, columns))
-    if len(lines) > 1:
-        lines = of_single_flights(lines, k)
-        # First: what differs from flight to flight is a change halfway as well.
-        changes = [*range(columns, lines[0].drives.shape[1]), *changes]
-    changed = strongest(lines, changes, (), plain=True, least=most, residual=residual)
-    # Two numbers a line, each of the variance size**2.
-    deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
-    # Each takes up a part of the others.
-    best = max((linear, curved, changed), key=lambda s: s.statistic)
-    odd = those[(best.drive - columns) // k][0] if best.drive >= columns else None
-    by_amplitude, over = best is curved, best is changed and odd is None
-    asked = tuple(i for i, _ in those)
-    before = columns if odd is not None else constant
-    return _Asked(best, by_amplitude, over, float(deviance), odd, asked, before)
+        found = lines_of(left, J[i, name][own.rows], np.concatenate(X, axis=1), own.holes)
+        if found is not None:
+            lines.append((place, found))
+    records = [one for _, one in lines]
+    if not records or not m:
+        return [], records
+    columns = records[0].drives.shape[1]
+    first = columns - (len(samples) + 2) * k
+    drives = [Drive(c, "input", (n,), NARROW) for c, n in enumerate(moving)]
+    drives += [Drive(c, "amplitude", (), BROAD, tuple(range(m))) for c in range(m, first)]
+    if len(records) > 1:
+        names = [called[i] if i < len(called) else f"flight {i + 1}" for i, _ in samples]
+        of = [names[place] for place, _ in lines]
+        drives += [
+            # Of two nobody knows which is odd.
+            Drive(
+                first + place * k + c,
+                "flights",
+                tuple(of) if len(of) == 2 else (names[place], "the others"),
+                unknown=c,
+            )
+            for place, _ in lines
+            for c in range(k)
+        ]
+    drives += [Drive(columns - 2 * k + c, "time", unknown=c % k) for c in range(2 * k)]
+    return drives, records
 
 
 def _told(
     at: Solution,
     e: Evaluation,
     name: str,
-    one: _Asked,
+    strong: Strongest,
     J: Mapping[tuple[int, str], np.ndarray],
-    flights: Sequence[str],
 ) -> Unmodelled:
-    strong, slopes = one.strong, np.asarray(e.slopes)
-    k, far = slopes.size, tuple[str, ...]()
+    slopes, far = np.asarray(e.slopes), tuple[str, ...]()
+    k, drive = slopes.size, strong.drive
     shifts = strong.shift[:k] * slopes
-    if one.over_time or one.odd is not None:
-        # The drive is the sensitivity of one parameter, which is off by the change itself as well.
-        changed = (strong.drive - one.columns) % k
-        change = strong.amount * slopes[changed]
-        there = shifts[changed] + change
-        shifts[changed] = max((shifts[changed], there, -change), key=abs)
-    kind: Literal["input", "amplitude", "flights", "time"] = "input"
-    of: tuple[str, ...] = ()
-    if one.by_amplitude:
-        kind, of, shifts = "amplitude", (), _by_amplitude(at, e, name, J) * slopes
+    if drive.kind == "amplitude":
+        shifts = _by_amplitude(at, e, name, J) * slopes
         # The shift is a lower bound. It is held against the interval that noise alone leaves: one
         # that allows for coloured residuals is wide by what was found here.
         beyond = np.abs(shifts) > HALF_INTERVAL * deviations(e.J)[:k] * np.abs(slopes)
         far = tuple(n for n, one in zip(at.layout.of_interest, beyond, strict=True) if one)
-    elif one.odd is not None:
-        kind, of = "flights", _between(one, flights)
-    elif one.over_time:
-        kind, of = "time", ()
-    else:
-        of = (moving_inputs(at)[strong.drive],)
+    elif drive.unknown is not None:
+        # The drive is the sensitivity of one parameter, which is off by the change itself as well.
+        change = strong.amount * slopes[drive.unknown]
+        there = shifts[drive.unknown] + change
+        shifts[drive.unknown] = max((shifts[drive.unknown], there, -change), key=abs)
     first, own = of_one_clock(at, e, name)[0]
     frequency = strong.frequency / (float(at.data.flights[first].dt) * own.every)
     return Unmodelled(
         name,
-        kind,
-        of,
+        drive,
         strong.statistic,
         strong.p_value,
         frequency if strong.damping < 1.0 else None,
@@ -543,12 +481,3 @@ def _by_amplitude(
         if squares < least:
             best, least = -change[rows.shape[1] :] * mean / sd, squares
     return best
-
-
-def _between(one: _Asked, flights: Sequence[str]) -> tuple[str, ...]:
-    """The flights between which the response differs; of two nobody knows which is odd."""
-    called = [flights[i] if i < len(flights) else f"flight {i + 1}" for i in one.flights]
-    if len(called) == 2:
-        return tuple(called)
-    assert one.odd is not None
-    return (called[one.flights.index(one.odd)], "the others")

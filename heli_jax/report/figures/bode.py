@@ -333,7 +333,7 @@ def draw_response(
 
     Args:
         omega: (k,) [rad/s]
-        pair: with H, sd, coherence and picture, (k,) each, and half95 (`flight_responses.Pair`).
+        pair: with H, sd and coherence, (k,) each, and half95 (`flight_responses.Pair`).
         fits: transfer functions, each a label and its response (k,).
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
@@ -345,15 +345,10 @@ def draw_response(
     relative = pair.half95 * pair.sd[known] / np.abs(pair.H[known])
     gain = _DB * np.log(np.abs(np.where(known, pair.H, 1.0)))
     error = (relative, relative)
-    words = "one window, 95 % intervals"
+    words = "95 % intervals"
     _bars(axes, omega[known], gain[known], branch[known], error, style.BLUE, words)
     shown = seen if seen.any() else known
     _limit(axes, gain[shown], branch[shown])
-    if np.isfinite(pair.picture).any():
-        # Bin by bin beside the dots: unwrapped by itself it may leave them by turns.
-        own = _nearest(np.degrees(np.angle(pair.picture)), branch)
-        H = np.where(known, pair.picture, np.nan)
-        _curve(axes, omega, H, own, color=style.SKY, lw=1.0, label="several windows")
     colours = itertools.cycle((style.VERMILLION, style.GREEN, style.PURPLE))
     for (label, H), color in zip(fits, colours, strict=False):
         turned = phase(H)
