@@ -58,6 +58,60 @@ def pairs(content: Mapping[str, object], unit: str = "") -> Table:
     )
 
 
+class Bar(NamedTuple):
+    """An estimate with its 95 % interval as a bar; places in percent of the bar's width."""
+
+    name: str
+    value: str
+    unit: str
+    low: float | None
+    """None where there is no interval"""
+    high: float | None
+    words: str
+    """the interval as text"""
+
+
+class Bars(NamedTuple):
+    """The estimates on one axis: their relative deviation from the estimate."""
+
+    rows: tuple[Bar, ...]
+    reach: str
+    """of the axis to either side"""
+
+
+def bars(fit: Fit) -> Bars:
+    """The free parameters, each with its interval in parts of its estimate."""
+    stopped, ends = fit.status == "not-converged", {}
+    for name, e in fit.estimates.items():
+        if not stopped and e.sd is not None and e.lower95 is not None and e.upper95 is not None:
+            pair = [end / e.value - 1.0 if e.value else math.nan for end in (e.lower95, e.upper95)]
+            if all(map(math.isfinite, pair)):
+                ends[name] = sorted(pair)
+    most = max((abs(v) for pair in ends.values() for v in pair), default=0.0)
+    # A vague one must not press the others flat: beyond the axis a bar is cut off.
+    reach = next((r for r in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if most <= r), 1.0)
+    rows = []
+    for name, e in fit.estimates.items():
+        cells = (where_it_stopped(e), "", "", "") if stopped else _cells(e)
+        places = [50.0 + 50.0 * min(max(v / reach, -1.0), 1.0) for v in ends.get(name, ())]
+        low, high = places or (None, None)
+        interval = "" if cells[3] == NOTHING else cells[3]
+        rows.append(Bar(name, cells[0], pretty(e.unit), low, high, interval))
+    return Bars(tuple(rows), percent(reach, 0))
+
+
+def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
+    """Rows of the matrix of correlations: name, and the text and number of each cell."""
+    rows = []
+    for name, values in zip(fit.verdict.names, fit.verdict.correlation, strict=True):
+        # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
+        # parameter, sqrt(1 - r^2); at two digits both are 1.00.
+        numbers = [float(r) if math.isfinite(r) else 0.0 for r in values]
+        cells = [(_signed(r, 5 if 0.995 < abs(r) < 1.0 else 2), r) for r in numbers]
+        rows.append((name, cells))
+    return rows
+
+
 _SHARE = 0.005
 """of the posterior variance: less is 0 % in the table, or 0.00"""
 

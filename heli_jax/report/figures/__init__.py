@@ -1,6 +1,7 @@
-"""The report's figures: plain data in, Matplotlib Axes out, each on a figure of its own.
+"""The report's figures: plain data in, a `Chart` out; None where there is nothing to draw.
 
-Draw within `style.in_style()` to get the report's look.
+Matrices, intervals and pairs of samples are no lines: they are Matplotlib's, drawn within
+`style.in_style()`, and files alone.
 """
 
 from heli_jax.report.figures.bode import bode, bode_overlay, bode_unit, draw_response, match
@@ -14,6 +15,7 @@ from heli_jax.report.figures.estimates import (
 )
 from heli_jax.report.figures.signals import (
     motion,
+    overview,
     residual_correlation,
     response,
     rls_history,
@@ -31,6 +33,7 @@ __all__ = [
     "intervals",
     "match",
     "motion",
+    "overview",
     "posterior_pairs",
     "residual_correlation",
     "response",
