@@ -5,14 +5,12 @@ import functools
 import re
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming, units
+from heli_jax import units
 from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
-from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import measured, percent, vaf_percent
@@ -20,7 +18,7 @@ from heli_jax.report import figures
 from heli_jax.report.charts import Logged
 from heli_jax.report.figures.estimates import MOST, share_within
 from heli_jax.report.files import Analysis as Analysis
-from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.page import Draw, Picture
 
 MOST_FLIGHTS = 6
@@ -34,11 +32,10 @@ GROUPS = {
     "response": "From above, over time: measured and simulated, what is left between them, inputs.",
     "residual": "From above, by lag: its correlation with itself, then with each input; of white "
     "noise 99 % of the lags lie within the band.",
-    "bode": "Magnitude and phase of the fitted model,{rls} and of the record where its coherence "
-    "allows.",
-    "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
-    "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes did "
-    "not notice (Wood and Hodgkinson, 1980).",
+    "match": "From above: gain and phase of model and data with 95 % intervals, and of the "
+    "recursive least squares without their hold; partial coherence of the data; data over model. "
+    "Grey: envelopes of what pilots of full-size aeroplanes did not notice (Wood and Hodgkinson, "
+    "1980).",
     "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
     "intervals, partial coherence of the data, and data over model.",
     "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
@@ -97,8 +94,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                     together=len(fit.whiteness),
                     test=fit.whiteness.get(f"{s.flight}/{output}"),
                 )
-    if fit.signals[0].inputs:
-        drawings["bode"] = _bode(fit, problem, baseline)
     if (responses := supplementary.responses) is not None:
         about = (
             f"model linearised about {responses.about}" if responses.about else "continuous model"
@@ -111,7 +106,8 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
             for pair in pairs:
                 unit = figures.bode_unit(model, pair.output, pair.input)
                 name = f"{group}_{pair.output}-{pair.input}"
-                drawings[name] = later(figures.match, pair, unit, note)
+                rls = baseline if group == "match" and _of(baseline, pair) else None
+                drawings[name] = later(figures.match, pair, unit, note, rls)
     if len(fit.verdict.names) > 1:
         drawings["correlation"] = later(figures.correlation_matrix, fit.verdict)
     drawings["starts"] = later(figures.waterfall, fit.starts)
@@ -143,16 +139,8 @@ def _parts(flights: list[str]) -> list[str]:
     ]
 
 
-def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
-    """The frequency response of the flight that the baseline saw, with what is known of it."""
-    # The first flight where there is no baseline.
-    i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
-    # What the flight states of the vehicle goes before the estimates, as in the fit.
-    # Signals hold the fitted flights first, in the order of `training`; those held out follow.
-    known = problem.training[i].known if i < len(problem.training) else {}
-    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
-    return functools.partial(figures.bode, flight, baseline)
+def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
+    return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
 
 
 def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
@@ -207,10 +195,9 @@ def from_si(signal: Signal) -> float:
         return 1.0
 
 
-def caption(picture: Picture, *, rls: bool) -> str:
-    """What a figure shows, and the name of its files; `rls`: whether there are least squares."""
+def caption(picture: Picture) -> str:
+    """What a figure shows, and the name of its files."""
     [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
-    words = words.replace("{rls}", " of the recursive least squares," if rls else "")
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 

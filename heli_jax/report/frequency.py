@@ -1,4 +1,4 @@
-"""Frequency responses of a fit, of its baseline and of the record itself, and the coherence of a
+"""Frequency responses of the baseline and of the record itself, and the coherence of a
 record: of each input with the others taken out, and where the model lets expect it.
 
 A record shows coherence between an input and an output only where the one moves the other. Which
@@ -6,7 +6,7 @@ do, and in which band, the model says: of an output that an input hardly moves n
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +32,6 @@ from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
 from heli_jax.simulation.simulate import substeps_for
-
-type Response = Callable[[np.ndarray], np.ndarray]
 
 # Parameters of a model are a class of the user's own: they are annotated Any.
 
@@ -78,11 +76,6 @@ class FittedFlight(NamedTuple):
     signals: Signals
 
 
-def log_grid(low: float, high: float, n: int = 900) -> np.ndarray:
-    """Frequencies (n,) [rad/s], equally spaced in the logarithm."""
-    return np.geomspace(low, high, n)
-
-
 def sample_time(signals: Signals) -> float:
     """Time between samples [s]; 1 for a single sample, which has none."""
     return float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
@@ -112,37 +105,6 @@ def at_record(flight: FittedFlight) -> OperatingPoint:
         dt,
         substeps=substeps_for(dt, flight.model.fastest),
     )
-
-
-def responses(
-    model: Model,
-    params: Any,
-    output: str,
-    input: str,
-    dt: float,
-    at: OperatingPoint = EVERYWHERE,
-) -> tuple[Response, Response]:
-    """H(i omega) and Hd(e^{i omega dt}) of the model linearised about a point, as functions.
-
-    The second holds the input over each sample: this, and not the first, is what a sampled record
-    can show.
-    """
-    # One linearisation serves both, and NumPy evaluates them: a figure is no reason to compile.
-    matrices = linear_matrices(model, params, at)
-    i = naming.names(model.Outputs).index(output)
-    j = naming.names(model.Inputs).index(input)
-    delay = dict(model.delays).get(input)
-    late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
-
-    # With the phase that the input's delay takes.
-    def continuous(omega: np.ndarray) -> np.ndarray:
-        A, B, C, D = matrices
-        return _transfer(1j * omega, A, B[:, j], C[i], D[i, j]) * np.exp(-1j * omega * late)
-
-    def sampled(omega: np.ndarray) -> np.ndarray:
-        return held(matrices, i, j, dt, omega) * np.exp(-1j * omega * late)
-
-    return continuous, sampled
 
 
 def linear_matrices(model: Model, params: Any, at: OperatingPoint) -> list[np.ndarray]:
@@ -201,13 +163,14 @@ def memory(
 
 
 def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
-    """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
+    """Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its input."""
     # On the unit circle, as it was identified: its continuous form is an approximation where no
     # inverse of the hold exists.
-    z = np.exp(1j * omega * baseline.dt)
+    turns = omega * baseline.dt
+    z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)
     # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):
-        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z)
+        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z) / hold
 
 
 def _needed(dt: float, memory: float) -> int:

@@ -72,7 +72,7 @@ def render(
     origin: Origin | None = None,
 ) -> str:
     """The page as text."""
-    fit, problem, rls = analysis.fit, analysis.problem, analysis.baseline is not None
+    fit, problem = analysis.fit, analysis.problem
     numbers, first = numbers or Numbers(), None
     if (worst := worst_output(fit)) is not None:
         chart = figures.overview(*worst, problem.model)
@@ -98,8 +98,7 @@ def render(
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         overview=first,
         pictures={
-            group: [(p, caption(p, rls=rls)) for p in drawn if p.name.startswith(group)]
-            for group in GROUPS
+            group: [(p, caption(p)) for p in drawn if p.name.startswith(group)] for group in GROUPS
         },
         numbers=numbers.content(),
     )

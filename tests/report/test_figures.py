@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 
 from heli_jax import models
 from heli_jax.analysis.lti import c2d
+from heli_jax.analysis.operating_point import EVERYWHERE
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.fit import Signals, StartRow
 from heli_jax.identification.validation.metrics import lags_for
 from heli_jax.report import card, figures, frequency, style
 from heli_jax.report.charts import thinned
-from heli_jax.report.frequency import Coherence, FittedFlight, _spectra
+from heli_jax.report.frequency import Coherence, _spectra
+from tests.responses import continuous
 
 
 def noise_signals(n=900, inputs=("x_roll",), seed=0):
@@ -76,7 +78,6 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
     drawn = {
         "response": figures.response(s, "roll", problem.model),
         "residual": figures.residual_correlation(s, "roll"),
-        "bode": figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline),
         "matrix": style.styled(lambda: figures.correlation_matrix(fit.verdict)),
         "starts": figures.waterfall(fit.starts),
         "rls": figures.rls_history(baseline),
@@ -111,14 +112,13 @@ def test_waterfall_marks_failures_and_spans_decades():
 def test_sampled_response_is_that_of_c2d(sound):
     _, problem, _ = sound
     p, dt = problem.vehicle, 0.05
+    matrices = frequency.linear_matrices(problem.model, p, EVERYWHERE)
     omega = np.geomspace(0.1, 0.99 * np.pi / dt, 50)
-    tf = roll_transfer_function(p, stand=True)
-    continuous, sampled = frequency.responses(problem.model, p, "roll", "x_roll", dt)
-    num, den = (np.array([float(v) for v in c]) for c in tf)
-    s, z = 1j * omega, np.exp(1j * omega * dt)
-    assert continuous(omega) == pytest.approx(np.polyval(num, s) / np.polyval(den, s), rel=1e-8)
+    num, den = (np.array([float(v) for v in c]) for c in roll_transfer_function(p, stand=True))
+    z = np.exp(1j * omega * dt)
     num, den = c2d(num, den, dt)
-    assert sampled(omega) == pytest.approx(np.polyval(num, z) / np.polyval(den, z), rel=1e-6)
+    sampled = frequency.held(matrices, 0, 0, dt, omega)
+    assert sampled == pytest.approx(np.polyval(num, z) / np.polyval(den, z), rel=1e-6)
 
 
 def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
@@ -129,8 +129,8 @@ def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
     assert isinstance(response, frequency.Empirical)
     assert response.segments >= frequency.SEGMENTS
     clear = (response.coherence > 0.9) & (response.omega > 2.0) & (response.omega < 10.0)
-    _, sampled = frequency.responses(models.roll_on_stand, bench30, "roll", "x_roll", 0.02)
-    ratio = response.H[clear] / sampled(response.omega[clear])
+    matrices = frequency.linear_matrices(models.roll_on_stand, bench30, EVERYWHERE)
+    ratio = response.H[clear] / frequency.held(matrices, 0, 0, 0.02, response.omega[clear])
     assert clear.sum() > 5
     assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.1)
     assert np.median(np.degrees(np.angle(ratio))) == pytest.approx(0.0, abs=8.0)
@@ -164,13 +164,19 @@ def test_a_slow_mode_leaves_the_response_from_two_periods_of_a_segment_on():
         assert f"Hz ({found.lowest:.2g} rad/s) on" in said.remark
 
 
-def test_a_record_may_have_no_response(sound):
+def test_a_record_may_have_no_response():
     assert isinstance(frequency.empirical(np.zeros(4000), np.ones(4000), 0.02, 1.0), str)
     assert isinstance(frequency.empirical(np.arange(100.0), np.ones(100), 0.02, 1.0), str)
+
+
+def test_the_baseline_s_response_is_drawn_without_its_hold(sound):
     fit, problem, baseline = sound
-    s = fit.signals[0]._replace(inputs={"x_roll": np.zeros_like(fit.signals[0].times)})
-    chart = figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline)
-    assert len(chart.panels) == 2
+    omega = np.geomspace(1.0, 6.0, 20)
+    H = continuous(problem.model, fit.params, "roll", "x_roll")(omega)
+    ratio = frequency.discrete(baseline, omega) / H
+    # Half a sample of delay at 6 rad/s would be 8.6 deg.
+    assert np.max(np.abs(np.degrees(np.angle(ratio)))) < 5.0
+    assert np.abs(ratio) == pytest.approx(np.ones(20), abs=0.15)
 
 
 def test_phase_begins_on_one_branch():

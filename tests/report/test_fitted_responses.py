@@ -6,12 +6,12 @@ import pytest
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
-from heli_jax.report import frequency
 from heli_jax.report.drawings import Analysis, drawings
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.html import render
 from heli_jax.report.tables import handling_lines
+from tests import responses
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,7 @@ def test_the_model_s_response_is_that_of_the_bode_figure_and_moves_with_its_para
     names = (pair.output, pair.input)
 
     def continuous(params):
-        H, _ = frequency.responses(problem.model, params, *names, 0.05)
-        return H(pair.omega)
+        return responses.continuous(problem.model, params, *names)(pair.omega)
 
     H = continuous(fit.params)
     np.testing.assert_allclose(pair.model.response, H, rtol=1e-9)

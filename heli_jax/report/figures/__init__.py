@@ -4,7 +4,7 @@ Matrices, intervals and pairs of samples are no lines: they are Matplotlib's, dr
 `style.in_style()`, and files alone.
 """
 
-from heli_jax.report.figures.bode import bode, bode_overlay, bode_unit, draw_response, match
+from heli_jax.report.figures.bode import bode_overlay, bode_unit, draw_response, match
 from heli_jax.report.figures.estimates import (
     bootstrap_pairs,
     correlation_matrix,
@@ -24,7 +24,6 @@ from heli_jax.report.figures.signals import (
 )
 
 __all__ = [
-    "bode",
     "bode_overlay",
     "bode_unit",
     "bootstrap_pairs",

@@ -1,4 +1,4 @@
-"""Bode figures: a fit beside its record, model beside data, a measured response, several runs.
+"""Bode figures: model beside data, a measured response, several runs.
 
 Frequencies are in Hz, as configurations have bands; a phase lies on the branch nearest to that of
 the smoothest curve.
@@ -20,7 +20,7 @@ from heli_jax.identification.result import Signals
 from heli_jax.report import frequency, style
 from heli_jax.report.charts import Chart, Panel, Series, band, bars, limits_of, panel
 from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.frequency import FittedFlight, phase, sample_time
+from heli_jax.report.frequency import phase, sample_time
 
 _TURN = 2.0 * np.pi
 """rad/s of 1 Hz"""
@@ -42,110 +42,10 @@ _FEW, _HUGE = 3, 1e9
 """bins that make a curve, or the axes' limits, at least; what no output of a machine reaches"""
 
 
-def bode(flight: FittedFlight, baseline: Baseline | None) -> Chart:
-    """Magnitude and phase of the fit, of the RLS and of the record, and the record's coherence.
-
-    The fit is drawn twice: sampled with its input held, as a record can show it and as the RLS
-    is, and thin as the continuous H(i omega). An estimated gain and time shift are included.
-
-    Args:
-        baseline: the RLS, whose input and output are taken; the first ones without it.
-    """
-    model, signals, dt = flight.model, flight.signals, sample_time(flight.signals)
-    output = baseline.output if baseline else next(iter(signals.measured))
-    input = baseline.input if baseline else next(iter(signals.inputs))
-    nyquist = np.pi / dt
-    # From two periods in the record, below which it shows nothing, to a little beyond Nyquist,
-    # where the continuous response goes on and the sampled one does not.
-    limits = 4 * np.pi / (dt * max(signals.times.size, 8)), 1.6 * nyquist
-    at = frequency.at_record(flight)
-    memory = frequency.memory(model, flight.params, at, dt * signals.times.size)
-    record = frequency.empirical(signals.inputs[input], signals.measured[output], dt, memory)
-    continuous, sampled = frequency.responses(model, flight.params, output, input, dt, at)
-    # Short of the Nyquist frequency: sampling puts a zero at or near z = -1 where the relative
-    # degree is two, and decibels have no floor.
-    omega, below = frequency.log_grid(*limits), frequency.log_grid(limits[0], 0.999 * nyquist)
-    H = continuous(omega) * frequency.nuisance_factor(flight.fit, input, omega)
-    held = sampled(below) * frequency.nuisance_factor(flight.fit, input, below)
-    reference = _Reference(omega, H)
-    fitted = _curve("fit, sampled", below, held, reference.along(below, held), style.BLUE, 1.6)
-    # Poles and zeros of the RLS near the unit circle, and the continuous fit past the Nyquist
-    # frequency, would press the fit flat: they do not set the axes.
-    beside = [_curve("fit, continuous", omega, H, reference.along(omega, H), style.SKY, 1.0)]
-    if baseline is not None:
-        R = frequency.discrete(baseline, below)
-        dashes = _curve("RLS", below, R, reference.along(below, R), style.ORANGE, 1.5)
-        beside.append((dashes[0]._replace(dashed=True), dashes[1]._replace(dashed=True)))
-    ruling, note, coherence = [fitted], f"no empirical response: {record}", ()
-    if isinstance(record, frequency.Empirical):
-        coherent = record.coherence > COHERENT
-        w, Hr = record.omega[coherent], record.H[coherent]
-        if coherent.any():
-            dots = _curve("record", w, Hr, reference.beside(w, Hr), style.BLACK, 2.2)
-            ruling.insert(0, (dots[0]._replace(kind="points"), dots[1]._replace(kind="points")))
-        note = _words(record, coherent)
-        coherence = (_coherence(record.omega, record.coherence),)
-        if any(np.ptp(u) > 0 for n, u in signals.inputs.items() if n != input):
-            # H = Suy / Suu is that of this input alone only where the others are uncorrelated.
-            note += "; other inputs taken as uncorrelated"
-    if not reference.finite:
-        note = f"the model cannot be linearised about {at.words or 'zero'}; {note}"
-    elif at.words:
-        note = f"linearised about {at.words}; {note}"
-    panels = []
-    for k, (words, height, beyond) in enumerate(
-        ((f"magnitude [{bode_unit(model, output, input)}]", 1.9, 40.0), ("phase [deg]", 1.6, 180.0))
-    ):
-        series = [c[k] for c in (*ruling, *beside)]
-        (low, high), inner = limits_of(series), limits_of([c[k] for c in ruling], 0.0)
-        room = max(low, inner[0] - beyond), min(high, inner[1] + beyond)
-        panels.append(panel(words, series, height, limits=room))
-    marked = tuple(p._replace(marks=(nyquist / _TURN,)) for p in (*panels, *coherence))
-    note += "; upright line: Nyquist"
-    return _chart(f"{input} to {output}: frequency response", note, limits, marked)
-
-
-def _words(record: frequency.Empirical, coherent: np.ndarray) -> str:
-    """What is to be said of the record's own response."""
-    if not coherent.any():
-        return f"no empirical response: coherence stays below {COHERENT}"
-    # Short: with the operating point before it, the note must fit the figure's width.
-    note = f"record: {record.segments} segments, coherence > {COHERENT}"
-    return note + (f", from {record.lowest / _TURN:.2g} Hz" if record.lowest else "")
-
-
 def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Panel]) -> Chart:
     """Over frequency; limits in rad/s."""
     hz = float(limits[0]) / _TURN, float(limits[-1]) / _TURN
     return Chart(title, "frequency [Hz]", hz, tuple(panels), note, logarithmic=True)
-
-
-class _Reference:
-    """The continuous response of the fit: the phase that the other curves are laid beside."""
-
-    def __init__(self, omega: np.ndarray, H: np.ndarray) -> None:
-        self.finite = bool(np.isfinite(H).any())
-        good = np.isfinite(H) & (np.abs(H) > 0)
-        # Where the response is zero or not finite it has no phase.
-        self.log_omega, self.phase = np.log(omega[good]), phase(H[good])
-
-    def beside(self, omega: np.ndarray, H: np.ndarray) -> np.ndarray:
-        """Phase [deg] of H, on the branch nearest to the reference's: point by point."""
-        angle = np.degrees(np.angle(H))
-        if not self.log_omega.size:
-            return angle
-        return _nearest(angle, np.interp(np.log(omega), self.log_omega, self.phase))
-
-    def along(self, omega: np.ndarray, H: np.ndarray) -> np.ndarray:
-        """The same for a curve: unwrapped, as a whole on the reference's branch."""
-        good = np.isfinite(H)
-        unwrapped = np.full(H.shape, np.nan)
-        unwrapped[good] = np.degrees(np.unwrap(np.angle(H[good])))
-        if not good.any():
-            return unwrapped
-        # The median, for point by point a curve half a turn away would jump between two branches.
-        off = np.median(unwrapped[good] - self.beside(omega[good], H[good]))
-        return unwrapped - 360.0 * np.round(off / 360.0)
 
 
 def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -217,9 +117,12 @@ def _room(values: np.ndarray, margin: float, series: Sequence[Series]) -> tuple[
     return float(np.min(values)) - margin, float(np.max(values)) + margin
 
 
-def match(pair: FittedPair, unit: str, note: str) -> Chart:
+def match(pair: FittedPair, unit: str, note: str, baseline: Baseline | None = None) -> Chart:
     """Gain, phase and partial coherence of data and model, and their quotient, all with 95 %
     intervals; the quotient within the envelopes of what pilots do not notice.
+
+    Args:
+        baseline: the recursive least squares of this input and output, as a further curve.
     """
     omega, model = pair.omega, pair.model
     known = np.isfinite(pair.H) & (pair.sd < _WIDE_DATA * np.abs(pair.H))
@@ -233,6 +136,13 @@ def match(pair: FittedPair, unit: str, note: str) -> Chart:
         # Beside the model: point by point, since data may have gaps.
         angle = _nearest(angle, near[known])
     data = _bars(f, gain, angle, (own, own), style.BLACK, "data, 95 % intervals")
+    beside = []
+    if baseline is not None:
+        R = frequency.discrete(baseline, omega)
+        turned = _nearest(np.degrees(np.angle(R)), near)
+        beside = [
+            c._replace(dashed=True) for c in _curve("RLS", omega, R, turned, style.ORANGE, 1.2)
+        ]
     # What a bin without coherence says is mostly noise over a stick that hardly moved: it is drawn
     # where there is room, and makes none. In gusts a response has a coherence of 0.3 to 0.6, and
     # intervals that are read: such bins have to be within the axes.
@@ -248,7 +158,7 @@ def match(pair: FittedPair, unit: str, note: str) -> Chart:
     ):
         x, v, reach = hz[modelled], value[modelled], Z95 * sd[modelled]
         fitted = Series("model", x, v, style.BLUE, width=1.4)
-        series = [band(x, v - reach, v + reach, style.SKY), fitted, data[k]]
+        series = [band(x, v - reach, v + reach, style.SKY), fitted, *beside[k : k + 1], data[k]]
         limits = _room(ruling, _MARGINS[k], series)
         panels.append(panel(words, series, height, limits=limits))
     panels.append(_coherence(omega, pair.coherence))
