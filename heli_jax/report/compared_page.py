@@ -16,8 +16,7 @@ from heli_jax.identification.result import Signals
 from heli_jax.report import style
 from heli_jax.report.charts import Chart, Numbers, Series, limits_of, panel, samples
 from heli_jax.report.compared_runs import ComparedRuns
-from heli_jax.report.figures import bode_overlay, time_label
-from heli_jax.report.figures.bode import OVERLAY_WORDS
+from heli_jax.report.figures import time_label
 from heli_jax.report.origin import origin
 from heli_jax.report.page import Picture, filled, picture
 from heli_jax.report.saved_fit import SavedFit
@@ -83,11 +82,6 @@ def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Pictur
             missing = [label for label in compared.labels if label not in drawn]
             without = f"no {output} of that log in a flight named {name}, or no result"
             yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
-        for input in dict.fromkeys(n for _, s in by_run for n in s.inputs):
-            draw = functools.partial(bode_overlay, by_run, name, output, input)
-            made = picture("bode", draw, numbers)
-            if made is not None:
-                yield made, OVERLAY_WORDS
 
 
 def _overlaps(

@@ -38,18 +38,14 @@ GROUPS = {
     "1980).",
     "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
     "intervals, partial coherence of the data, and data over model.",
-    "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
     "starts": "The misfit that each start of the optimiser reached, best first.",
     "rls": "Each coefficient while the record goes by: one to be trusted settles.",
-    "intervals": "Of each parameter, by every method; the dotted line is the estimate.",
     "trace": "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift.",
     "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
     "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
     "intervals and correlations.",
 }
 """what a figure shows, after its title, by what its name begins with"""
-TABLES = ("correlation", "intervals")
-"""figures that are files alone: the page has their numbers as tables"""
 
 
 def worst_output(fit: Fit) -> tuple[Signals, str] | None:
@@ -74,7 +70,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, dict[str, Draw]()
     if (comparison := supplementary.intervals) is not None:
-        drawings["intervals"] = later(figures.intervals, comparison, fit)
         if comparison.posterior is not None:
             drawings["trace"] = later(figures.trace, comparison.posterior, fit)
             drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
@@ -108,8 +103,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 name = f"{group}_{pair.output}-{pair.input}"
                 rls = baseline if group == "match" and _of(baseline, pair) else None
                 drawings[name] = later(figures.match, pair, unit, note, rls)
-    if len(fit.verdict.names) > 1:
-        drawings["correlation"] = later(figures.correlation_matrix, fit.verdict)
     drawings["starts"] = later(figures.waterfall, fit.starts)
     if baseline is not None:
         # Time in the log of its flight's first sample [s].

@@ -20,8 +20,6 @@ from heli_jax.analysis.operating_point import (
     operating_point,
 )
 from heli_jax.analysis.spectra import (
-    OWN,
-    leakage,
     partial_coherence,
     segment_transforms,
     size_of,
@@ -49,20 +47,6 @@ _LONGEST = 4096
 """samples of a segment at most, unless the memory asks for more: further ones average better"""
 _MEMORIES = 16
 """in a record at least, so that segments of one are enough for an average"""
-
-
-class Empirical(NamedTuple):
-    """Output over input as the record shows it; arrays (k,)."""
-
-    omega: np.ndarray
-    """rad/s"""
-    H: np.ndarray
-    coherence: np.ndarray
-    power: np.ndarray
-    """spectral density of the input"""
-    segments: int
-    lowest: float = 0.0
-    """rad/s that omega begins at where a mode is too slow for the segments, else 0"""
 
 
 class FittedFlight(NamedTuple):
@@ -216,36 +200,6 @@ def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -
 
 def _count(samples: int, length: int) -> int:
     return 1 + (samples - length) // (length // 2)
-
-
-def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
-    """Welch's cross-spectrum over the input's spectrum, or why the record does not allow it.
-
-    Args:
-        u: the input (N,).
-        y: the output (N,).
-        dt: sample time [s].
-        memory: how long the machine remembers its input [s].
-    """
-    if not np.ptp(u) > 0:
-        return "the input does not move"
-    if np.isnan(y).any():
-        return "samples are missing"
-    # A segment shorter than the memory answers to what the stick did before it began: the average
-    # is then biased at its lowest frequencies, however many segments there are.
-    segments = segments_of(u.size, dt, memory)
-    if isinstance(segments, str):
-        return segments
-    of_both = segment_transforms(np.stack([u, y]), dt, segments.length)
-    omega, S = of_both.omega, of_both.density
-    Suu, Syy, Suy = np.real(S[:, 0, 0]), np.real(S[:, 1, 1]), S[:, 0, 1]
-    # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
-    # are coherent as well; and of zero frequency the segments' straight lines left nothing.
-    own = (Suu > OWN * leakage(Suu)) & (Syy > OWN * leakage(Syy))
-    useful = (omega > 0) & (omega >= _BELOW * segments.lowest) & own & (Suu > 0) & (Syy > 0)
-    omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
-    coherence = np.abs(Suy) ** 2 / (Suu * Syy)
-    return Empirical(omega, Suy / Suu, coherence, Suu, segments.count, segments.lowest)
 
 
 def phase(H: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ from heli_jax.report.charts import Numbers
 from heli_jax.report.drawings import (
     GROUPS,
     MOST_FLIGHTS,
-    TABLES,
     Analysis,
     alt_text,
     caption,
@@ -77,7 +76,6 @@ def render(
     if (worst := worst_output(fit)) is not None:
         chart = figures.overview(*worst, problem.model)
         first = picture("overview", lambda: chart, numbers)
-    drawn = [p for p in pictures if p.name not in TABLES]
     return filled(
         "report.html.j2",
         title=title,
@@ -98,7 +96,8 @@ def render(
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         overview=first,
         pictures={
-            group: [(p, caption(p)) for p in drawn if p.name.startswith(group)] for group in GROUPS
+            group: [(p, caption(p)) for p in pictures if p.name.startswith(group)]
+            for group in GROUPS
         },
         numbers=numbers.content(),
     )

@@ -175,15 +175,3 @@ def test_headings_on_either_side_of_south_are_one_heading(xcell):
     outputs = {"dx": np.full(N, -8.0), "dy": np.zeros(N), "yaw": psi}
     at = operating_point(models.helicopter("consistent"), xcell, STILL, outputs, DT)
     assert at.words == "the trim at 8 m/s ahead"
-
-
-def test_what_the_windows_sidelobes_bring_is_no_response():
-    """A slow stick and a slower answer: at high frequencies there are sidelobes alone."""
-    rng, n, dt = np.random.default_rng(3), 4000, 0.01
-    sos = scipy.signal.butter(8, 2.2, fs=1 / dt, output="sos")
-    u = scipy.signal.sosfiltfilt(sos, rng.standard_normal(n))
-    y = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
-    found = frequency.empirical(u, y, dt, 0.5)
-    exact = np.abs(0.1 / (1.0 - 0.9 * np.exp(-1j * found.omega * dt)))
-    assert found.omega[-1] < 40.0  # rad/s, of 314
-    np.testing.assert_allclose(np.abs(found.H), exact, rtol=0.15)

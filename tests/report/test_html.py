@@ -68,9 +68,8 @@ def test_page_holds_everything_itself(sound_page):
     files = {f"figures/{name}.svg" for name in names}
     loaded = [v for v in links.addresses if not v.startswith("#") and v not in {*FILES, *files}]
     assert loaded == []
-    # Every figure is one that the page draws, but the correlations, which are a table.
-    assert len(names) == 5
-    # And the worst output of the first screen.
+    # Every figure is one that the page draws, as is the worst output of the first screen.
+    assert len(names) == 4
     assert text.count("<figure data-chart=") == 5
     assert links.tags.count("img") == 0
     anchors = {v[1:] for v in links.addresses if v.startswith("#")}

@@ -1,14 +1,12 @@
 """The report's figures: plain data in, a `Chart` out; None where there is nothing to draw.
 
-Matrices, intervals and pairs of samples are no lines: they are Matplotlib's, drawn within
-`style.in_style()`, and files alone.
+Pairs of samples are no lines: they are Matplotlib's, drawn within `style.in_style()`, and images on
+the page.
 """
 
-from heli_jax.report.figures.bode import bode_overlay, bode_unit, draw_response, match
+from heli_jax.report.figures.bode import bode_unit, draw_response, match
 from heli_jax.report.figures.estimates import (
     bootstrap_pairs,
-    correlation_matrix,
-    intervals,
     posterior_pairs,
     trace,
     waterfall,
@@ -24,12 +22,9 @@ from heli_jax.report.figures.signals import (
 )
 
 __all__ = [
-    "bode_overlay",
     "bode_unit",
     "bootstrap_pairs",
-    "correlation_matrix",
     "draw_response",
-    "intervals",
     "match",
     "motion",
     "overview",

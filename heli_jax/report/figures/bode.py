@@ -1,4 +1,4 @@
-"""Bode figures: model beside data, a measured response, several runs.
+"""Bode figures: model beside data, and a measured response.
 
 Frequencies are in Hz, as configurations have bands; a phase lies on the branch nearest to that of
 the smoothest curve.
@@ -16,11 +16,10 @@ from heli_jax.analysis.spectra import COHERENT, octave_mean
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.identifiability.verdict import Z95
-from heli_jax.identification.result import Signals
 from heli_jax.report import frequency, style
 from heli_jax.report.charts import Chart, Panel, Series, band, bars, limits_of, panel
 from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.frequency import phase, sample_time
+from heli_jax.report.frequency import phase
 
 _TURN = 2.0 * np.pi
 """rad/s of 1 Hz"""
@@ -38,8 +37,8 @@ _MARGINS = (6.0, 45.0)
 """dB and deg beyond what sets the axes"""
 _ERRORS = (12.0, 90.0)
 """dB and deg that the panels of the error show at most to either side"""
-_FEW, _HUGE = 3, 1e9
-"""bins that make a curve, or the axes' limits, at least; what no output of a machine reaches"""
+_FEW = 3
+"""bins that set the axes' limits at least"""
 
 
 def _chart(title: str, note: str, limits: Sequence[float], panels: Sequence[Panel]) -> Chart:
@@ -251,54 +250,3 @@ def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
     if seen.any():
         along = np.interp(np.log(omega), np.log(omega[seen]), phase(H[seen]))
     return _nearest(np.degrees(np.angle(H)), along)
-
-
-OVERLAY_WORDS = (
-    "By the spectra of the record's input with the measured and with each simulated output, in the "
-    f"same segments, where coherence is above {COHERENT}: what leakage and other inputs do to one "
-    "they do to all."
-)
-
-
-def bode_overlay(
-    by_run: Sequence[tuple[str, Signals]], flight: str, output: str, input: str
-) -> Chart | None:
-    """Gain and phase from an input to the measured output and to each run's simulated one.
-
-    None where no run's simulated output has a coherent response to the input.
-    """
-    with_input = [(label, s) for label, s in by_run if input in s.inputs]
-    simulated = [(label, _coherent(s, input, s.simulated[output])) for label, s in with_input]
-    known = [(label, r) for label, r in simulated if r is not None]
-    if not known:
-        return None
-    first, curves = with_input[0][1], []
-    if (measured := _coherent(first, input, first.measured[output])) is not None:
-        dots = _curve("measured", measured.omega, measured.H, phase(measured.H), style.GREY, 2.6)
-        curves.append((dots[0]._replace(kind="points"), dots[1]._replace(kind="points")))
-    for k, (label, r) in enumerate(simulated):
-        if r is not None:
-            color = style.CYCLE[k % len(style.CYCLE)]
-            curves.append(_curve(label, r.omega, r.H, phase(r.H), color, 1.2))
-    panels = [
-        panel(words, [c[k] for c in curves], height)
-        for k, (words, height) in enumerate((("magnitude [dB]", 1.5), ("phase [deg]", 1.3)))
-    ]
-    omega = np.concatenate([r.omega for _, r in known])
-    limits = omega.min(), omega.max()
-    return _chart(f"{input} to {output}, {style.short(flight)}", "", limits, panels)
-
-
-def _coherent(s: Signals, input: str, y: np.ndarray) -> frequency.Empirical | None:
-    """Where it is coherent; None where that is nowhere, samples are missing or y diverges."""
-    if not (np.isfinite(y).all() and np.max(np.abs(y)) < _HUGE):
-        return None
-    # The memory of zero: how long a machine remembers is not known here, and all have the same
-    # segments.
-    record = frequency.empirical(s.inputs[input], y, sample_time(s), 0.0)
-    if isinstance(record, str):
-        return None
-    good = (record.coherence > COHERENT) & (np.abs(record.H) > 0)
-    if good.sum() < _FEW:
-        return None
-    return record._replace(omega=record.omega[good], H=record.H[good])

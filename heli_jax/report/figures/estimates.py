@@ -1,4 +1,4 @@
-"""Figures of the estimates: correlation, intervals, what each start reached, what was sampled."""
+"""Figures of the estimates: what each start reached, what was sampled."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -6,11 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.identification.identifiability.profile import Profile
-from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.result import Estimate, Fit, StartRow
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
-from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
 from heli_jax.report.charts import Chart, Series, panel
@@ -19,47 +16,6 @@ from heli_jax.report.style import subtitle
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-def correlation_matrix(verdict: Verdict) -> "Figure":
-    """How the estimates of the parameters are correlated: near +1 or -1 the data cannot tell two
-    of them apart."""
-    names, r = verdict.names, verdict.correlation
-    side = min(style.WIDTH, 1.5 + 0.62 * len(names))
-    # Names of any length stand beside the matrix, and no fixed margin suits all.
-    drawing = style.figure(side, min(style.WIDTH, side + 0.5), constrained=True)
-    ax = drawing.subplots()
-    # Two colours of equal weight, told apart with every common kind of colour blindness.
-    ax.pcolormesh(r, cmap="PuOr", vmin=-1.0, vmax=1.0, edgecolors="white", linewidth=1.5)
-    ax.set_aspect("equal")
-    # The first parameter on top, as a matrix is read; pcolormesh counts from below.
-    ax.invert_yaxis()
-    centres = np.arange(len(names)) + 0.5
-    ax.set_xticks(centres, names, rotation=35 if max(map(len, names)) > 4 else 0)
-    ax.set_yticks(centres, names)
-    ax.grid(visible=False)
-    ax.tick_params(length=0)
-    ax.spines[:].set_visible(False)
-    size = 8.5 if len(r) < 9 else 6.0
-    for (i, j), value in np.ndenumerate(r):
-        color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
-        text = "1" if i == j else _cell_text(float(value))
-        ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
-    ax.set_title("Correlation of the estimates", loc="left")
-    if verdict.undetermined:
-        ax.set_title(ax.get_title("left"), loc="left", pad=19)
-        subtitle(ax, "directions that are not identifiable are left out")
-    return drawing
-
-
-def _cell_text(r: float) -> str:
-    """A correlation in two digits, five where the last ones count."""
-    if not np.isfinite(r):
-        return ""
-    # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
-    # parameter, sqrt(1 - r^2); at two digits both are 1.00.
-    text = f"{r:+.5f}" if abs(r) > 0.995 else f"{r:+.2f}"
-    return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
 
 
 _DRAWN = 1e100
@@ -106,48 +62,6 @@ def waterfall(starts: tuple[StartRow, ...]) -> Chart | None:
         if finite.all()
         else f"starts that ended without a cost below {_DRAWN:g} are drawn on top",
     )
-
-
-_METHODS = {
-    "gaussian": ("Gaussian", style.BLUE),
-    "profile": ("profile", style.VERMILLION),
-    "bootstrap": ("bootstrap", style.GREEN),
-    "nuts": ("NUTS", style.PURPLE),
-}
-
-
-def intervals(comparison: Intervals, fit: Fit) -> "Figure | None":
-    """95 % intervals by every method, and the likelihood of the profile; one panel a parameter."""
-    names = list(comparison.by_parameter)
-    if not names:
-        return None
-    drawing = style.figure(1.9, constrained=True)
-    axes = np.atleast_1d(drawing.subplots(1, len(names)))
-    # The methods that any parameter has, so that a row is the same method in every panel.
-    present = [m for m in _METHODS if any(m in by for by in comparison.by_parameter.values())]
-    for ax, name in zip(axes, names, strict=True):
-        by_method, estimate = comparison.by_parameter[name], fit.estimates[name]
-        for k, m in enumerate(present):
-            if m in by_method:
-                ax.plot(by_method[m], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
-        ax.axvline(estimate.value, color=style.GREY, lw=0.8, ls=":")
-        if name in comparison.profiles:
-            _draw_likelihood(ax, comparison.profiles[name], len(present))
-        ax.set_yticks([-k for k in range(len(present))], [_METHODS[m][0] for m in present])
-        ax.tick_params(axis="y", labelleft=name == names[0])
-        ax.set_ylim(-len(present) + 0.4, 0.6)
-        style.few_ticks(ax, "x", 3)
-        ax.set_xlabel(style.label(name, estimate.unit))
-    axes[0].set_title("95 % intervals", loc="left")
-    return drawing
-
-
-def _draw_likelihood(ax: "Axes", profile: Profile, rows: int) -> None:
-    # A deviance of 9 is three standard deviations: further out lies what sets no interval.
-    near = profile.deviance < 9.0
-    # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.
-    height = 0.2 - (rows - 1) * (1.0 - np.exp(-0.5 * profile.deviance[near]))
-    ax.plot(profile.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
 
 
 MOST = 6
