@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
+from heli_jax.flights.formats.arrays import ArrayTable
 from heli_jax.flights.log import ChannelLog, Topic, sharing_clocks
 from heli_jax.flights.row_clock import contradicted_rate
 from heli_jax.flights.table import Table, listed, sample_count, shown

@@ -11,7 +11,7 @@ import numpy as np
 
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.array_clocks import by_clocks
-from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.formats.arrays import ArrayTable
 from heli_jax.flights.clock_guess import (
     COUNTS_ROWS,
     is_called_time,

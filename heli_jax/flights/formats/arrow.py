@@ -19,7 +19,7 @@ from heli_jax.flights.table import (
 )
 from heli_jax.regular_file import open_regular, read_regular, size_words
 
-# Imported again within the functions that need it, as in `csv_table`.
+# Imported again within the functions that need it, as in `csv_text`.
 if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
