@@ -9,11 +9,10 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
-from heli_jax.flights.formats.arrays import ArrayTable
+from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import at_marks, counted, mark_words

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.finding import Finding, note
+from heli_jax.flights.clock import clock_scale
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.request import Request
-from heli_jax.flights.row_clock import clock_scale
 from heli_jax.flights.slower import SLOWER, usual_step
 from heli_jax.flights.table import Table, listed, shown
 

@@ -10,7 +10,15 @@ import numpy as np
 
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
-from heli_jax.flights.clock_guess import require_increasing, unit_notes
+from heli_jax.flights.clock import (
+    ROWS,
+    clock_scale,
+    contradicted_rate,
+    counted,
+    require_increasing,
+    unit_notes,
+    with_runs,
+)
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
@@ -26,7 +34,6 @@ from heli_jax.flights.read_channels import (
     rows_in_window,
 )
 from heli_jax.flights.request import Request
-from heli_jax.flights.row_clock import ROWS, clock_scale, contradicted_rate, counted, with_runs
 from heli_jax.flights.table import Table, column, shown, wrong
 from heli_jax.flights.time_units import require_likely
 

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 from heli_jax.finding import Finding, note
 from heli_jax.flights.align import Lag, NotAligned, lag_between
-from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import DerivedTable, with_derived
 from heli_jax.flights.file_units import with_file_units
 from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.formats.arrays import ArrayTable
+from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.onto_grid import Key

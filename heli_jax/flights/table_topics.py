@@ -5,13 +5,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from heli_jax.finding import LEFT_OUT, Finding, note
+from heli_jax.flights.clock import ROWS, clock_scale, counted, with_runs
 from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import ArrayTable
 from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.row_clock import ROWS, clock_scale, counted, with_runs
 from heli_jax.flights.table import Table, listed, shown, wrong
 
 
