@@ -1,7 +1,7 @@
-"""Logs in columns of Apache: Parquet, and Arrow's own files (.feather, .arrow)."""
+"""Logs in columns of Apache: Parquet, and Arrow's own files and streams (.feather, .arrow)."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -22,17 +22,19 @@ from heli_jax.regular_file import open_regular, read_regular, size_words
 # Imported again within the functions that need it, as in `csv_text`.
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-_LARGEST = 16 * 10**9
-"""bytes: the whole file goes through sha256, the columns asked for into memory"""
+ARROW_MARK = b"ARROW1"
+"""what files of Arrow begin with, and those of Feather"""
+_STREAM = b"\xff\xff\xff\xff"
+_LARGEST, _LARGEST_ARROW = 16 * 10**9, 10**9
+"""bytes: of Parquet the columns asked for go into memory, of Arrow the whole file"""
 _LONGEST_FOOTER = 64 * 10**6
 _AT_ONCE = 2 * 10**6
 """cells that are decoded before their rows are counted: 16 MB of numbers"""
 
 
-def open_parquet(path: Path) -> "ParquetTable":
-    """Open a Parquet file and read its schema.
+def open_parquet(path: Path) -> "ColumnTable":
+    """Open a Parquet file and read its schema; only the columns asked for are read later.
 
     Raises:
         InputError: it is no Parquet file, it is broken, or larger than a log may be.
@@ -41,25 +43,46 @@ def open_parquet(path: Path) -> "ParquetTable":
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    where = str(path)
     with open_regular(path, "a log in Parquet", _LARGEST) as opened:
         size = os.fstat(opened.fileno()).st_size
         # Before anything goes through the whole file: what ends otherwise is none of Parquet.
-        _check_end(str(path), opened, size)
+        _check_end(where, opened, size)
         try:
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
-            n_rows = metadata.num_rows
         # pyarrow raises UnicodeDecodeError where the name of a column is no text.
         except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
-            raise wrong(str(path), "is no whole Parquet file") from e
-        if not len(schema) or not n_rows:
-            raise wrong(str(path), "holds no rows, expected a log")
-        require_few_columns(str(path), metadata.num_columns)
+            raise wrong(where, "is no whole Parquet file") from e
+        require_few_columns(where, metadata.num_columns)
         # Text stays as its dictionary: a few words that every row repeats can be large.
         texts = [f.name for f in schema if pa.types.is_string(f.type) or pa.types.is_binary(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
-    return ParquetTable(str(path), size, Digest(path), file)
+
+    def pieces(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+        # Counted: a damaged column can claim, and decode to, any number of rows.
+        rows = 0
+        try:
+            for piece in file.iter_batches(
+                max(_AT_ONCE // max(len(names), 1), 1), columns=list(names)
+            ):
+                rows += piece.num_rows
+                if rows > metadata.num_rows:
+                    break
+                piece.validate(full=True)  # a damaged page can decode to lengths that do not fit
+                yield piece
+        except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
+            raise wrong(where, "is no whole Parquet file") from e
+        if rows != metadata.num_rows:
+            raise wrong(where, "is no whole Parquet file")
+
+    # Of groups of rows: what is said of a single column is not asked, since of some damage to it
+    # pyarrow ends the whole process.
+    groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
+    unpacked = sum(group.total_byte_size for group in groups)
+    count, digest = metadata.num_rows, Digest(path)
+    return ColumnTable(where, "parquet", size, digest, schema, count, pieces, unpacked)
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:
@@ -68,7 +91,6 @@ def _check_end(path: str, file: BinaryIO, size: int) -> None:
     # PAR1, or PARE where the metadata are encrypted. 12 bytes are both marks and the length.
     file.seek(max(size - 8, 0))
     end = file.read(8)
-    file.seek(0)
     length = int.from_bytes(end[:4], "little")
     if end[4:] not in (b"PAR1", b"PARE") or length + 12 > size:
         raise wrong(path, "is no whole Parquet file")
@@ -77,22 +99,75 @@ def _check_end(path: str, file: BinaryIO, size: int) -> None:
         raise wrong(path, f"expected a footer of at most {words}")
 
 
+def open_arrow(path: Path) -> "ColumnTable":
+    """Read a file or a stream of Arrow.
+
+    Raises:
+        InputError: it is none, it is broken, or larger than a log may be.
+        OSError: it cannot be read.
+    """
+    import pyarrow as pa
+
+    where = str(path)
+    data = read_regular(path, "a log in Arrow's format", _LARGEST_ARROW)
+    if not data.startswith((ARROW_MARK, _STREAM)):
+        raise wrong(where, "is no file of Arrow, expected one that begins with its mark")
+    source, budget, pieces = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data)), []
+    try:
+        if data.startswith(_STREAM):
+            file = batches = pa.ipc.open_stream(source)
+        else:
+            file = pa.ipc.open_file(source)
+            batches = (file.get_batch(i) for i in range(file.num_record_batches))
+        for batch in batches:
+            budget.take(max(batch.nbytes, 8 * batch.num_rows * batch.num_columns))
+            batch.validate(full=True)
+            pieces.append(batch)
+        table = pa.Table.from_batches(pieces, file.schema)
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
+        raise wrong(where, f"is no whole file of Arrow ({type(e).__name__})") from e
+    require_few_columns(where, len(table.schema))
+
+    def of_columns(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+        # By place: of two columns of one name `select` takes neither.
+        kept = [i for i, name in enumerate(table.column_names) if name in names]
+        yield from table.select(kept).to_batches()
+
+    digest = Digest(data)
+    return ColumnTable(
+        where, "arrow", len(data), digest, table.schema, table.num_rows, of_columns, 0
+    )
+
+
 class ColumnTable:
     """A `Table` on columns of Arrow, which come in pieces."""
 
-    format = "arrow"
     notes: tuple[Finding, ...] = ()
-    _unpacked = 0
-    """bytes of all columns once they are unpacked, where the file states them"""
 
     def __init__(
-        self, path: str, size: int, digest: Digest, schema: "pa.Schema", n_rows: int
+        self,
+        path: str,
+        kind: str,
+        size: int,
+        digest: Digest,
+        schema: "pa.Schema",
+        n_rows: int,
+        pieces: "Callable[[Sequence[str]], Iterator[pa.RecordBatch]]",
+        unpacked: int,
     ) -> None:
-        self.path, self.size = path, size
-        self._budget = Budget(path, size)
+        """
+        Args:
+            pieces: of columns by name.
+            unpacked: bytes of all columns once they are unpacked, where the file states them.
+        """
+        if not len(schema) or not n_rows:
+            raise wrong(path, "holds no rows, expected a log")
+        self.path, self.format, self.size = path, kind, size
         self._digest, self._schema, self._n_rows = digest, schema, n_rows
-        self.names: tuple[str, ...] = tuple(self._schema.names)
-        stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
+        self._pieces, self._unpacked, self._budget = pieces, unpacked, Budget(path, size)
+        self.names: tuple[str, ...] = tuple(schema.names)
+        stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in schema}
         self.units: Mapping[str, str] = {
             name: unit.decode("utf-8", "replace") for name, unit in stated.items()
         }
@@ -135,16 +210,15 @@ class ColumnTable:
         not read, so that all of their cells count as filled."""
         import pyarrow as pa
 
-        nested = [pa.types.is_nested(f.type) for f in self._schema]
-        flat = [f.name for f, n in zip(self._schema, nested, strict=True) if not n]
-        data = self._read(flat if any(nested) else None)
+        nested = {f.name for f in self._schema if pa.types.is_nested(f.type)}
+        data = self._read(list(dict.fromkeys(n for n in self.names if n not in nested)))
         # By name: two columns may have the same, and come in an order of their own.
         columns: dict[str, list[pa.ChunkedArray]] = {}
         for name, x in zip(data.column_names, data.columns, strict=True):
             columns.setdefault(name, []).append(x)
         surveys = []
-        for name, of_lists in zip(self.names, nested, strict=True):
-            if of_lists:
+        for name in self.names:
+            if not columns.get(name):
                 surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)
@@ -163,66 +237,23 @@ class ColumnTable:
 
     def time_unit(self, name: str) -> str | None:
         """`s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
-        import pyarrow as pa
-
         # By place: of two columns of one name the first, where `field` would refuse the name.
         kind = self._schema.field(self.names.index(name)).type
-        if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
-            return str(kind.unit)
-        return None
+        return str(kind.unit) if _is_clock(kind) else None
 
-    def _read(self, names: Sequence[str] | None) -> "pa.Table":
-        """The columns, none of them of lists or records; all of the file without names."""
+    def _read(self, names: Sequence[str]) -> "pa.Table":
+        """The columns, none of them of lists or records."""
         import pyarrow as pa
 
-        self._budget.require(max(8 * self._n_rows * len(names or self.names), self._unpacked))
+        self._budget.require(max(8 * self._n_rows * len(names), self._unpacked))
         return pa.Table.from_batches(list(self._pieces(names)))
 
-    def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
-        """The columns in pieces, in their order; all without names."""
-        raise NotImplementedError
 
+def _is_clock(kind: "pa.DataType") -> bool:
+    import pyarrow as pa
 
-class ParquetTable(ColumnTable):
-    """A `Table` on a Parquet file; only the columns asked for are read."""
-
-    format = "parquet"
-
-    def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
-        super().__init__(path, size, digest, file.schema_arrow, file.metadata.num_rows)
-        self._file = file
-        # Of groups of rows: what is said of a single column is not asked, since of some damage to
-        # it pyarrow ends the whole process.
-        groups = (file.metadata.row_group(i) for i in range(file.metadata.num_row_groups))
-        self._unpacked = sum(group.total_byte_size for group in groups)
-
-    def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
-        """The columns in pieces, of as many rows together as the file says that it has.
-
-        Raises:
-            InputError: that is not so, the file is broken, or they are too many numbers.
-        """
-        import pyarrow as pa
-
-        n_rows, count = self._n_rows, len(names or self.names)
-        columns = None if names is None else list(names)
-        # In pieces that are counted: a damaged column can claim, and decode to, any number of
-        # rows.
-        rows = 0
-        try:
-            for piece in self._file.iter_batches(
-                max(_AT_ONCE // max(count, 1), 1), columns=columns
-            ):
-                rows += piece.num_rows
-                if rows > n_rows:
-                    break
-                piece.validate(full=True)  # a damaged page can decode to lengths that do not fit
-                yield piece
-        # UnicodeDecodeError: of a damaged name, which pyarrow reads as UTF-8.
-        except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
-            raise wrong(self.path, "is no whole Parquet file") from e
-        if rows != n_rows:
-            raise wrong(self.path, "is no whole Parquet file")
+    types = pa.types
+    return any(test(kind) for test in (types.is_timestamp, types.is_duration, types.is_time))
 
 
 def _is_number(kind: "pa.DataType") -> bool:
@@ -230,10 +261,7 @@ def _is_number(kind: "pa.DataType") -> bool:
 
     types = pa.types
     # A clock's ticks count as numbers, so that a column of time stamps can be the time.
-    tests = (
-        *(types.is_integer, types.is_floating, types.is_decimal, types.is_boolean),
-        *(types.is_timestamp, types.is_duration, types.is_time),
-    )
+    tests = (types.is_integer, types.is_floating, types.is_decimal, types.is_boolean, _is_clock)
     return any(test(kind) for test in tests)
 
 
@@ -242,85 +270,12 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    kind = values.type
     # Ticks as whole numbers first: no cast goes from stamps to floating point.
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time64(kind):
-        values = values.cast(pa.int64())
-    elif pa.types.is_time32(kind):
-        values = values.cast(pa.int32())
+    if _is_clock(values.type):
+        values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
     # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
     # calendar's stamps round to 256 ns.
     values = pc.cast(values, pa.float64(), safe=False)
     # A piece of a column has to be asked to copy where it has nulls; a column copies anyway.
     copied = {"zero_copy_only": False} if isinstance(values, pa.Array) else {}
     return np.asarray(values.to_numpy(**copied), dtype=np.float64)
-
-
-# Apache Arrow's own format: Feather (.feather) and its files and streams (.arrow).
-
-ARROW_MARK = b"ARROW1"
-"""what files begin with, and those of Feather"""
-_STREAM = b"\xff\xff\xff\xff"
-_LARGEST_ARROW = 10**9
-
-
-def open_arrow(path: Path) -> "ArrowTable":
-    """Read a file or a stream of Arrow.
-
-    Raises:
-        InputError: it is none, it is broken, or larger than a log may be.
-        OSError: it cannot be read.
-    """
-    import pyarrow as pa
-
-    where = str(path)
-    data = read_regular(path, "a log in Arrow's format", _LARGEST_ARROW)
-    if not data.startswith((ARROW_MARK, _STREAM)):
-        raise wrong(where, "is no file of Arrow, expected one that begins with its mark")
-    source, budget = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data))
-    try:
-        if data.startswith(_STREAM):
-            file = batches = pa.ipc.open_stream(source)
-        else:
-            file = pa.ipc.open_file(source)
-            batches = (file.get_batch(i) for i in range(file.num_record_batches))
-        table = pa.Table.from_batches(list(_checked(batches, budget)), file.schema)
-        table.validate(full=True)
-    # pyarrow raises UnicodeDecodeError where the name of a column is no text.
-    except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
-        raise wrong(where, f"is no whole file of Arrow ({type(e).__name__})") from e
-    if not len(table.schema) or not table.num_rows:
-        raise wrong(where, "holds no rows, expected a log")
-    require_few_columns(where, len(table.schema))
-    return ArrowTable(where, len(data), Digest(data), table)
-
-
-def _checked(
-    batches: "Iterator[pa.RecordBatch] | pa.RecordBatchReader", budget: Budget
-) -> "Iterator[pa.RecordBatch]":
-    for batch in batches:
-        budget.take(max(batch.nbytes, 8 * batch.num_rows * batch.num_columns))
-        batch.validate(full=True)
-        yield batch
-
-
-class ArrowTable(ColumnTable):
-    """A `Table` on columns of Arrow, in memory."""
-
-    format = "arrow"
-
-    def __init__(self, path: str, size: int, digest: Digest, table: "pa.Table") -> None:
-        super().__init__(path, size, digest, table.schema, table.num_rows)
-        self._table = table
-
-    def _pieces(self, names: Sequence[str] | None) -> "Iterator[pa.RecordBatch]":
-        import pyarrow as pa
-
-        # By place: of two columns of one name `select` takes neither.
-        fields = enumerate(self._schema)
-        kept = [
-            i
-            for i, f in fields
-            if names is None or (f.name in names and not pa.types.is_nested(f.type))
-        ]
-        yield from self._table.select(kept).to_batches()
