@@ -19,8 +19,16 @@ from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import not_increasing, shared_stamps, without_overflow
 from heli_jax.flights.log import holds_commands
-from heli_jax.flights.table import Survey, Table, column, listed, require_columns, shown, wrong
-from heli_jax.flights.table_view import TableView
+from heli_jax.flights.table import (
+    Survey,
+    Table,
+    TableView,
+    column,
+    listed,
+    require_columns,
+    shown,
+    wrong,
+)
 from heli_jax.flights.time_units import (
     LETTERS,
     SECONDS,

@@ -36,7 +36,6 @@ from heli_jax.flights.grid import (
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
 from heli_jax.flights.table import (
     Survey,
     Table,
@@ -46,6 +45,7 @@ from heli_jax.flights.table import (
     wrong,
 )
 from heli_jax.flights.time_units import SECONDS
+from heli_jax.flights.vibration import RotorLines, rotor_lines
 
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""

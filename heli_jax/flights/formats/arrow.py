@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from heli_jax.finding import Finding
-from heli_jax.flights.digest import Digest
+from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import (
     Budget,
     Survey,
@@ -131,7 +131,8 @@ def open_arrow(path: Path) -> "ColumnTable":
 
     def of_columns(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
         # By place: of two columns of one name `select` takes neither.
-        kept = [i for i, name in enumerate(table.column_names) if name in names]
+        flat = (not pa.types.is_nested(f.type) for f in table.schema)
+        kept = [i for i, f in enumerate(flat) if f and table.column_names[i] in names]
         yield from table.select(kept).to_batches()
 
     digest = Digest(data)
@@ -210,15 +211,16 @@ class ColumnTable:
         not read, so that all of their cells count as filled."""
         import pyarrow as pa
 
-        nested = {f.name for f in self._schema if pa.types.is_nested(f.type)}
-        data = self._read(list(dict.fromkeys(n for n in self.names if n not in nested)))
+        flat = [not pa.types.is_nested(f.type) for f in self._schema]
+        named = zip(self.names, flat, strict=True)
+        data = self._read(list(dict.fromkeys(name for name, is_flat in named if is_flat)))
         # By name: two columns may have the same, and come in an order of their own.
         columns: dict[str, list[pa.ChunkedArray]] = {}
         for name, x in zip(data.column_names, data.columns, strict=True):
             columns.setdefault(name, []).append(x)
         surveys = []
-        for name in self.names:
-            if not columns.get(name):
+        for name, is_flat in zip(self.names, flat, strict=True):
+            if not is_flat:
                 surveys.append(Survey(name, None, self._n_rows))
                 continue
             x = columns[name].pop(0)

@@ -20,7 +20,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
-from heli_jax.flights.digest import Digest
+from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import (
     Budget,
     Survey,
