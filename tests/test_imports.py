@@ -197,7 +197,6 @@ def test_no_modules_import_each_other_in_a_circle():
                 "report/sweeps.py",
                 "report/responses.py",
                 "simulation_output.py",
-                "flights/array_table.py",
                 "flights/convert.py",
                 "exports.py",
                 "report/sample_files.py",

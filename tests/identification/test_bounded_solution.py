@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import Flight
-from heli_jax.flights.instruments import own_instruments
+from heli_jax.flights.flight import own_instruments
 from heli_jax.identification.estimation.frequency_lines import Matrices, Signals, orthonormal
 from heli_jax.identification.estimation.frequency_response import (
     bounded_outputs,

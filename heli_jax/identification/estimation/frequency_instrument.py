@@ -16,8 +16,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.flight import Flight
-from heli_jax.flights.instruments import own_instruments, own_said
+from heli_jax.flights.flight import Flight, own_instruments, own_said
 from heli_jax.identification.estimation.frequency_lines import in_time_of, lines_of
 from heli_jax.identification.estimation.frequency_noise import once_a_length, smoothed
 from heli_jax.identification.problem import Problem
