@@ -31,6 +31,7 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
+from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.regression import Step
 from heli_jax.identification.equation_error.start import (
     Equation,
@@ -56,7 +57,6 @@ from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
-from heli_jax.report.statements import whiteness_note
 from heli_jax.versions import versions
 
 ABSENT = object()
@@ -134,7 +134,7 @@ class Residuals(TypedDict):
     white: bool
     overconfident: bool
     """whether intervals count samples as news that repeat each other"""
-    note: Annotated[str, whiteness_note]
+    note: Annotated[str, lambda fit: _whiteness_note(fit)]
     """what follows where they are not white"""
     by_output: Annotated[dict[str, Whiteness], "whiteness"]
     """by `flight/output`; under filter error of the innovations"""
@@ -477,6 +477,10 @@ TOO: dict[type, type] = {
     HandlingPair: HandlingToo,
 }
 """what the file has beside the fields of a class, or in their place"""
+
+
+def _whiteness_note(fit: Fit) -> str:
+    return next((f.sentence for f in fit.findings if f.code in (COLOURED, TOO_NARROW)), "")
 
 
 # Values that are no attribute: a mapping holds keys as they stand in the file. An analysis is
