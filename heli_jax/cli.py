@@ -670,7 +670,7 @@ def _compare(options: argparse.Namespace) -> int:
     run_directory.require_place(place, f"--out {place}")
     with run_directory.whole_file(place, f"--out {place}") as temporary:
         if place.suffix.lower() == ".html":
-            from heli_jax.report.compared_page import write_page
+            from heli_jax.report.compared_runs import write_page
 
             write_page(temporary, compared)
         else:

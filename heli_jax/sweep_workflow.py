@@ -91,8 +91,7 @@ def _sweep_job(config: Experiment) -> "Job":
 
 def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Callable[[str], None]) -> None:
     """The figures of a sweep; what they leave out is said."""
-    from heli_jax.report.sweep_page import write_page
-    from heli_jax.report.sweeps import RESULTS, results, write_figures
+    from heli_jax.report.sweeps import RESULTS, results, write_figures, write_page
     from heli_jax.sweeps.summary import worst
 
     try:

@@ -71,7 +71,7 @@ class FitRun:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
         # Here, since matplotlib takes a second, and a fit without report needs none of it.
-        from heli_jax.report.drawings import Analysis, drawings
+        from heli_jax.report.fit_page import Analysis, drawings
         from heli_jax.report.style import styled
 
         shown = _with_responses(self) if name.startswith(("match", "held")) else self.supplementary
@@ -379,8 +379,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 def _write(run: FitRun, out: Path, *, replaces: bool = False) -> FitRun:
     """The run directory, in place of that of an earlier moment of this run where it `replaces`
     one."""
-    from heli_jax.report.drawings import Analysis
-    from heli_jax.report.html import write_report as write_page
+    from heli_jax.report.fit_page import Analysis
+    from heli_jax.report.fit_page import write_report as write_page
     from heli_jax.report.origin import origin
     from heli_jax.report.sample_files import sample_files, write_samples
 

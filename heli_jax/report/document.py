@@ -31,6 +31,7 @@ from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.finding import Distrust, Finding, sentences
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
+from heli_jax.identification.diagnostics.noise import COLOURED, TOO_NARROW
 from heli_jax.identification.equation_error.start import (
     Equation,
     EquationErrorStart,
@@ -56,7 +57,6 @@ from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 from heli_jax.identification.validation.held_out import HeldOutFrequency
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.report.card import Gate, card
-from heli_jax.report.statements import whiteness_note
 from heli_jax.versions import versions
 
 ABSENT = object()
@@ -134,7 +134,7 @@ class Residuals(TypedDict):
     white: bool
     overconfident: bool
     """whether intervals count samples as news that repeat each other"""
-    note: Annotated[str, whiteness_note]
+    note: Annotated[str, lambda fit: _whiteness_note(fit)]
     """what follows where they are not white"""
     by_output: Annotated[dict[str, Whiteness], "whiteness"]
     """by `flight/output`; under filter error of the innovations"""
@@ -479,6 +479,10 @@ TOO: dict[type, type] = {
 """what the file has beside the fields of a class, or in their place"""
 
 
+def _whiteness_note(fit: Fit) -> str:
+    return next((f.sentence for f in fit.findings if f.code in (COLOURED, TOO_NARROW)), "")
+
+
 # Values that are no attribute: a mapping holds keys as they stand in the file. An analysis is
 # `heli_jax.report.files.Analysis`, which imports this module.
 
@@ -623,29 +627,70 @@ class _Section(BaseModel):
 def model_of(section: Any) -> type[_Section]:
     """The pydantic model of a section of the table, or of a class whose fields are keys."""
     fields = _fields(section)
-    made = {n: (_validated(kind) | None, None) for n, (kind, _) in fields.items()}
+    made = {n: (_read(kind).checked | None, None) for n, (kind, _) in fields.items()}
     model = create_model(section.__name__, __base__=_Section, **made)  # type: ignore[call-overload]
     model.sources = {n: source for n, (_, source) in fields.items()}
     return model
 
 
-def _validated(kind: Any) -> Any:
-    """A kind of the table as pydantic checks it; in place of any number there may be null."""
-    options = _options(kind)
-    if len(options) > 1:
-        return functools.reduce(operator.or_, map(_validated, options))
-    if _is_section(kind):
-        return model_of(kind)
-    if typing.get_origin(kind) in _MAPPINGS:
-        return dict[str, _validated(typing.get_args(kind)[1])]
-    items = typing.get_args(kind)
-    if typing.get_origin(kind) is tuple and Ellipsis not in items:
-        return tuple[tuple(map(_validated, items))]  # type: ignore[misc]
-    if (inner := _item(kind)) is not None:
-        return list[_validated(inner)]
-    if kind in (float, int, bool, str):
-        return kind | None
-    return kind if kind is type(None) or typing.get_origin(kind) is Literal else Any
+class _Read(NamedTuple):
+    """A kind of the table, read."""
+
+    words: str
+    checked: Any
+    """as pydantic has it; in place of any number there may be null"""
+    sections: tuple[tuple[Any, str], ...] = ()
+    """those within it, and what stands between its path and their keys"""
+
+    def within(self, between: str) -> tuple[tuple[Any, str], ...]:
+        return tuple((section, between + rest) for section, rest in self.sections)
+
+
+_PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text"}
+
+
+@functools.cache
+def _read(kind: Any) -> _Read:
+    origin, items = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        each = [_read(option) for option in items]
+        words = " or ".join(dict.fromkeys(option.words for option in each))
+        union = functools.reduce(operator.or_, (option.checked for option in each))
+        return _Read(words, union, tuple(s for option in each for s in option.sections))
+    if kind in _PLAIN:
+        return _Read(_PLAIN[kind], kind | None)
+    if kind is type(None):
+        return _Read("null", None)
+    if typing.is_typeddict(kind) or (isinstance(kind, type) and hasattr(kind, "_fields")):
+        return _Read("section", model_of(kind), ((kind, ""),))
+    if origin is Literal:
+        return _Read(" | ".join(map(str, items)), kind)
+    if origin in (dict, Mapping):
+        of = _read(items[1])
+        return _Read(f"{of.words} by name", dict[str, of.checked], of.within(".NAME"))
+    if origin is tuple and Ellipsis not in items:
+        each = [_read(item) for item in items]
+        words = ", ".join(item.words for item in each)
+        return _Read(f"[{words}]", tuple[tuple(item.checked for item in each)])  # type: ignore[misc]
+    if origin in (list, tuple, Sequence):
+        of = _read(items[0])
+        return _Read(f"list of {of.words}", list[of.checked], of.within("[]"))
+    return _Read("list of numbers", Any)  # an array
+
+
+@functools.cache
+def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
+    """By key its kind, and what finds its value."""
+    hints = typing.get_type_hints(section, include_extras=True)
+    if section in TOO:
+        hints |= typing.get_type_hints(TOO[section], include_extras=True)
+    fields = {}
+    for name, kind in hints.items():
+        source: Any = name
+        if typing.get_origin(kind) is Annotated:
+            kind, source = typing.get_args(kind)
+        fields[name] = kind, source if callable(source) else operator.attrgetter(source)
+    return fields
 
 
 def written(kind: Any, value: Any) -> Any:
@@ -655,7 +700,7 @@ def written(kind: Any, value: Any) -> Any:
         kind: of the table; a section, or a mapping or list of such.
         value: what has its keys as attributes, or in a mapping as they stand in the file.
     """
-    adapter = TypeAdapter(_validated(kind))
+    adapter = TypeAdapter(_read(kind).checked)
     made = adapter.validate_python(value)
     return plain(adapter.dump_python(made, exclude_unset=True))
 
@@ -711,82 +756,12 @@ def matching(text: str) -> list[Key]:
     return by_path or [k for k in every if words in k.meaning.lower()]
 
 
-_MAPPINGS, _SEQUENCES = (dict, Mapping), (list, tuple, Sequence)
-
-
 def _walk(section: Any, path: str) -> Iterator[Key]:
     stated = naming.texts(section) | (naming.texts(TOO[section]) if section in TOO else {})
     for name, (kind, _) in _fields(section).items():
-        place = f"{path}.{name}" if path else name
-        yield Key(place, _kind(kind), stated.get(name, ""))
+        place, read = f"{path}.{name}" if path else name, _read(kind)
+        yield Key(place, read.words, stated.get(name, ""))
         # `verdict_before` has the keys of `verdict`: told once.
         if name not in ("verdict_before", "determined_combinations") or path == "verdict":
-            for inner, suffix in _within(kind):
-                yield from _walk(inner, place + suffix)
-
-
-def _within(kind: Any) -> Iterator[tuple[Any, str]]:
-    """The sections within a field, and what stands between its path and their keys."""
-    for option in _options(kind):
-        if _is_section(option):
-            yield option, ""
-        elif typing.get_origin(option) in _MAPPINGS:
-            yield from ((s, f".NAME{rest}") for s, rest in _within(typing.get_args(option)[1]))
-        elif (inner := _item(option)) is not None:
-            yield from ((s, f"[]{rest}") for s, rest in _within(inner))
-
-
-def _is_section(kind: Any) -> bool:
-    return typing.is_typeddict(kind) or (isinstance(kind, type) and hasattr(kind, "_fields"))
-
-
-@functools.cache
-def _fields(section: Any) -> dict[str, tuple[Any, Callable[[Any], Any]]]:
-    """By key its kind, and what finds its value."""
-    hints = typing.get_type_hints(section, include_extras=True)
-    if section in TOO:
-        hints |= typing.get_type_hints(TOO[section], include_extras=True)
-    fields = {}
-    for name, kind in hints.items():
-        source: Any = name
-        if typing.get_origin(kind) is Annotated:
-            kind, source = typing.get_args(kind)
-        fields[name] = kind, source if callable(source) else operator.attrgetter(source)
-    return fields
-
-
-def _options(kind: Any) -> tuple[Any, ...]:
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        return typing.get_args(kind)
-    return (kind,)
-
-
-def _item(kind: Any) -> Any:
-    """What a list has in it; None of what is no list."""
-    if typing.get_origin(kind) not in _SEQUENCES:
-        return None
-    return typing.get_args(kind)[0]
-
-
-def _kind(kind: Any) -> str:
-    return " or ".join(dict.fromkeys(_one_kind(option) for option in _options(kind)))
-
-
-_PLAIN = {bool: "true | false", int: "integer", float: "number", str: "text", type(None): "null"}
-
-
-def _one_kind(kind: Any) -> str:
-    if kind in _PLAIN:
-        return _PLAIN[kind]
-    if _is_section(kind):
-        return "section"
-    if typing.get_origin(kind) is Literal:
-        return " | ".join(map(str, typing.get_args(kind)))
-    if typing.get_origin(kind) in _MAPPINGS:
-        return f"{_kind(typing.get_args(kind)[1])} by name"
-    items = typing.get_args(kind)
-    if typing.get_origin(kind) is tuple and Ellipsis not in items:
-        return f"[{', '.join(map(_kind, items))}]"
-    if (inner := _item(kind)) is not None:
-        return f"list of {_kind(inner)}"
-    return "list of numbers"  # an array
+            for inner, between in read.sections:
+                yield from _walk(inner, place + between)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 type Draw = "Callable[[], Chart | Figure | None]"
 """draws a figure; None where there is nothing to draw"""
 
+MOST_FLIGHTS = 6
+"""flights that get figures of their own; signals.csv has them all"""
 _FOLDER = Path(__file__).parent
 _SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "flight.js", "tables.js")
 _NOTHING: dict[str, Any] = {"arrays": [], "charts": [], "scenes": []}

@@ -1,4 +1,4 @@
-"""Quick-look figures of a sweep: a Dataset over `element` in, Matplotlib Figures out.
+"""Quick-look figures of a sweep, a Dataset over `element` in, Matplotlib Figures out; and its page.
 
 Elements that are not ok, and values that are not finite, count in no median and no histogram; the
 former are marked in red where their axes are finite. A result of several flights is drawn as its
@@ -8,9 +8,10 @@ the report's look.
 
 import functools
 import itertools
+import json
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,8 +26,10 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 from scipy.stats import binned_statistic_2d
 
-from heli_jax.numbers import number
-from heli_jax.report import style
+from heli_jax.numbers import NOTHING, number
+from heli_jax.report import style, tables
+from heli_jax.report.origin import origin
+from heli_jax.report.page import Picture, filled, of_file
 from heli_jax.report.style import pretty
 from heli_jax.sweeps.datasets import chunks_of
 
@@ -570,3 +573,86 @@ def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
     # Matplotlib multiplies and divides them, which near the ends of float64 makes infinities.
     sizes = np.abs(values)
     return np.where(sizes < 1e100, np.where(sizes > 1e-100, values, 0.0), np.nan)
+
+
+_QUANTILES = ("min", "q05", "median", "q95", "max")
+_FILES = ("config.yaml", "summary.json", "figures/")
+_DIGITS = 4
+_KINDS = {
+    "slices": ("{} against each axis", "dots, and the median with a 5 to 95 % band"),
+    "maps": ("{} over pairs of axes", "colours: median of the elements in each cell"),
+}
+"""by what a figure's file begins with: its title, and what it draws"""
+_OTHERS = {
+    "corner": ("Axes and results together", "histograms, and densities of each two of them"),
+    "worst": ("Where the worst elements lie", "a line through the axes for each"),
+}
+
+
+def write_page(path: Path, directory: Path, title: str) -> None:
+    """Write the page."""
+    content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    config = directory / "config.yaml"
+    text = config.read_text(encoding="utf-8") if config.is_file() else ""
+    files = tuple(name for name in _FILES if (directory / name).exists())
+    page = filled(
+        "sweep.html.j2",
+        title=title,
+        summary=content,
+        counts=", ".join(f"{n} {s.replace('_', ' ')}" for s, n in content["status"].items() if n),
+        results=_results(content),
+        elements=_elements(content),
+        pictures=list(_pictures(content, directory / "figures")),
+        origin=origin(text, files),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+# Any: what summary.json holds.
+def _results(content: dict[str, Any]) -> tables.Table:
+    rows = [
+        (name, *(number(r.get(k), _DIGITS) for k in _QUANTILES), pretty(r.get("unit")))
+        for name, r in content["results"].items()
+    ]
+    return tables.Table(("result", "min", "5 %", "median", "95 %", "max", "unit"), rows)
+
+
+def _elements(content: dict[str, Any]) -> tables.Table:
+    """Result, whether worst or best, value, and where it lies: a column for each axis."""
+    listed = [
+        (name, words, pretty(content["results"].get(name, {}).get("unit")), element)
+        for words in ("worst", "best")
+        for name, elements in content[words].items()
+        for element in elements
+    ]
+    axes = list(dict.fromkeys(axis for *_, e in listed for axis in e["axes"]))
+    rows = []
+    for name, words, unit, e in listed:
+        # `number` writes a dash for what is not there.
+        value, *places = (number(v, _DIGITS) for v in (e.get("value"), *map(e["axes"].get, axes)))
+        rows.append((name, words, value, unit, str(e["element"]), *places))
+    return tables.Table(("result", "which", "value", "unit", "element", *axes), rows)
+
+
+def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, str]]:
+    """The figures with their captions: titles in words, and what they show in numbers."""
+    results = {stem: name for name, stem in stems(list(content["results"])).items()}
+    for png in sorted(folder.glob("*.png")):
+        kind, _, stem = png.stem.partition("-")
+        name = results.get(stem, stem)
+        title, words = _OTHERS.get(png.stem) or _KINDS.get(kind, (png.stem, ""))
+        title = title.format(name)
+        names = [name] if kind in _KINDS else list(content["results"])
+        numbers = "; ".join(_range(n, content["results"][n]) for n in names[:_TOLD])
+        alt = f"{title}: {words}. Over the sweep {numbers}."
+        yield of_file(png, title, alt), f"{title}: {words}. (figures/{png.stem}.svg, .png)"
+
+
+_TOLD = 6
+"""results whose numbers a figure's words give"""
+
+
+def _range(name: str, result: dict[str, Any]) -> str:
+    unit = pretty(result.get("unit"))
+    ends = f"{number(result.get('min'), 3)} to {number(result.get('max'), 3)}"
+    return f"{name} {ends}{'' if unit == NOTHING else f' {unit}'}"

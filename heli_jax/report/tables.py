@@ -76,18 +76,21 @@ class Bars(NamedTuple):
 
     rows: tuple[Bar, ...]
     reach: str
-    """of the axis to either side"""
+    """of the axis to either side; empty where there is no bar"""
 
 
 def bars(fit: Fit) -> Bars:
-    """The free parameters, each with its interval in parts of its estimate."""
+    """The free parameters, and the combinations that the data determine in place of them, each
+    with its interval in parts of its estimate."""
     stopped, rows = fit.status == "not-converged", []
-    for name, e in fit.estimates.items():
+    shown = [(n, e, pretty(e.unit)) for n, e in fit.estimates.items()]
+    shown += [(c.name, c, "") for c in (() if stopped else fit.verdict.combinations)]
+    for name, e, unit in shown:
         cells = (where_it_stopped(e), "", "", "") if stopped else _cells(e)
         known = not stopped and e.sd is not None and e.lower95 is not None
         ends = (e.lower95, e.upper95) if known else None
         interval = "" if cells[3] == NOTHING else cells[3]
-        rows.append((Bar(name, cells[0], pretty(e.unit), None, None, interval), ends, e.value))
+        rows.append((Bar(name, cells[0], unit, None, None, interval), ends, e.value))
     return _on_one_axis(rows)
 
 
@@ -118,7 +121,7 @@ def _on_one_axis(rows: Sequence[tuple[Bar, Any, float]]) -> Bars:
             low, high = (50.0 + 50.0 * min(max(v / reach, -1.0), 1.0) for v in pair)
             bar = bar._replace(low=low, high=high)
         placed.append(bar)
-    return Bars(tuple(placed), percent(reach, 0))
+    return Bars(tuple(placed), percent(reach, 0) if any(parts) else "")
 
 
 def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
@@ -171,7 +174,7 @@ def prior_note(problem: Problem, fit: Fit) -> str:
     )
 
 
-def where_it_stopped(e: Estimate) -> str:
+def where_it_stopped(e: Estimate | Combination) -> str:
     """The cell of an estimate of a fit that did not converge: a number that is no result."""
     return f"{number(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
 

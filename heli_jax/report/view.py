@@ -15,9 +15,8 @@ from heli_jax.analysis.trim import is_full_nonlinear
 from heli_jax.dynamics.model import Model
 from heli_jax.report import figures, style
 from heli_jax.report.charts import Numbers
-from heli_jax.report.drawings import MOST_FLIGHTS
 from heli_jax.report.origin import Origin, origin
-from heli_jax.report.page import Picture, filled, picture
+from heli_jax.report.page import MOST_FLIGHTS, Picture, filled, picture
 from heli_jax.simulation.trajectory import Trajectory
 
 _HUGE = 1e9

@@ -12,8 +12,7 @@ from heli_jax.identification.estimation.objective import errors_of
 from heli_jax.identification.estimation.output_error import OutputError
 from heli_jax.identification.methods import METHODS, Method
 from heli_jax.identification.uncertainty.comparison import intervals
-from heli_jax.report.drawings import Analysis
-from heli_jax.report.html import write_report
+from heli_jax.report.fit_page import Analysis, write_report
 from tests.identification.bench import BENCH, record, response, vehicle
 
 BEND = 1.345

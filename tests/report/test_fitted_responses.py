@@ -6,10 +6,9 @@ import pytest
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
-from heli_jax.report.drawings import Analysis, drawings
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
+from heli_jax.report.fit_page import Analysis, drawings, render
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
-from heli_jax.report.html import render
 from heli_jax.report.tables import handling_lines
 from tests import responses
 

@@ -10,10 +10,9 @@ import pytest
 
 from heli_jax import numbers
 from heli_jax.finding import note
-from heli_jax.report import files, statements, tables
-from heli_jax.report.drawings import Analysis
+from heli_jax.report import files, fit_page, tables
 from heli_jax.report.files import SensorAgreement, SupplementaryAnalyses
-from heli_jax.report.html import write_report
+from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import origin
 from heli_jax.vehicle import Constant
 from tests.report.conftest import SCRIPT
@@ -151,7 +150,7 @@ def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     fit = dataclasses.replace(fit, **changes)
     names = write_report(tmp_path, Analysis(fit, problem), "bench", {})
     assert not {"rls", "starts"} & set(names)
-    assert [line.level for line in statements.lines(fit)] == ["bad", "none", "none"]
+    assert [line.level for line in fit_page.lines(fit)] == ["bad", "none", "none"]
     # Of numbers that are no result there are no intervals to speak of.
     row = next(row for row in tables.parameters(fit).rows if row[0] == "If")
     assert row[1:5] == ("−1.23·10⁻⁴ (no result)", "–", "–", "–")

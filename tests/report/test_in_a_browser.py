@@ -7,8 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from heli_jax.report.drawings import Analysis
-from heli_jax.report.html import write_report
+from heli_jax.report.fit_page import Analysis, write_report
 from heli_jax.report.origin import origin
 from heli_jax.report.view import write_view
 from heli_jax.vehicle import load_vehicle

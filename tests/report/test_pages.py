@@ -11,7 +11,7 @@ from heli_jax.flights.flight import Signal
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.numbers import percent
-from heli_jax.report import compared_page, drawings, figures
+from heli_jax.report import compared_runs, figures, fit_page
 from heli_jax.report.files import write_signals
 from heli_jax.report.saved_fit import load_fit
 from tests.report.test_compared_runs import METRICS, write_run
@@ -75,13 +75,13 @@ def test_card_and_figure_give_one_number_where_samples_are_missing():
 
 def test_a_pulse_width_is_shown_as_logged_beside_si():
     pwm = Signal("aileron_pwm", "m", "m", offset=1496.0, scale=6e-9, invert=True)
-    as_logged = drawings.as_logged(pwm)
+    as_logged = fit_page.as_logged(pwm)
     assert as_logged is not None
     x = 6e-9 * (1496.0 - 1436.0)  # the log's 1436, inverted
     assert x * as_logged.factor + as_logged.offset == pytest.approx(1436.0)
     assert as_logged.unit == "aileron_pwm"
-    assert drawings.as_logged(Signal("roll", "rad", "rad")) is None
-    degrees = drawings.as_logged(Signal("roll", "deg", "rad"))
+    assert fit_page.as_logged(Signal("roll", "rad", "rad")) is None
+    degrees = fit_page.as_logged(Signal("roll", "deg", "rad"))
     assert degrees == ("deg", pytest.approx(180.0 / math.pi), 0.0)
 
 
@@ -94,7 +94,7 @@ def test_one_part_of_a_log_is_overlaid_whatever_the_runs_call_it(tmp_path, windo
         agreed = {"roll": METRICS}
         folder = write_run(tmp_path / run, {"Ixx": (2.0e-5, 1e-6)}, data=data, metrics=agreed)
         write_signals(folder / "signals.csv", (held._replace(flight=name),))
-    compared_page.write_page(tmp_path / "out.html", compare_runs([tmp_path / n for n in "ab"]))
+    compared_runs.write_page(tmp_path / "out.html", compare_runs([tmp_path / n for n in "ab"]))
     html = (tmp_path / "out.html").read_text()
     assert ("Simulated over measured" in html) == drawn
     assert ("No responses are overlaid" in html) != drawn
@@ -116,7 +116,7 @@ def test_runs_side_by_side_have_files_configurations_and_responses(tmp_path):
     compared = compare_runs([tmp_path / n for n in "abc"])
     page = tmp_path / "pages" / "out.html"
     page.parent.mkdir()
-    compared_page.write_page(page, compared)
+    compared_runs.write_page(page, compared)
     html = page.read_text()
     assert '<a href="../a/fit.json">fit.json</a>' in html
     assert "model: &lt;b&gt;" in html

@@ -11,10 +11,9 @@ from heli_jax.identification.uncertainty.bootstrap import Bootstrap
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Convergence, Posterior
 from heli_jax.report import figures, tables
-from heli_jax.report.drawings import Analysis, drawings
 from heli_jax.report.figures.estimates import coordinate, gaussian_ellipse, share_within
 from heli_jax.report.files import SupplementaryAnalyses
-from heli_jax.report.html import write_report
+from heli_jax.report.fit_page import Analysis, drawings, write_report
 from heli_jax.report.origin import Origin
 from heli_jax.report.sample_files import (
     posterior_tree,

@@ -1,28 +1,123 @@
-"""Which figures a report has: each drawn when it is asked for, with the words under it and those
-for who does not see it."""
+"""The report of a fit: one HTML file that holds everything, its figures, their words, and the three
+statements at its head."""
 
 import functools
+import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.rls import Baseline
-from heli_jax.identification.fit import Fit
-from heli_jax.identification.result import Signals
+from heli_jax.identification.identifiability.verdict import FACTOR
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Fit, Signals
+from heli_jax.identification.validation.adequacy import (
+    EXPECTED,
+    EXPLAINED,
+    FAR_FROM_WHITE,
+    NEARLY_WHITE,
+)
 from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import measured, percent, vaf_percent
-from heli_jax.report import figures
-from heli_jax.report.charts import Logged
+from heli_jax.report import figures, tables
+from heli_jax.report.card import card, summary
+from heli_jax.report.charts import Logged, Numbers
 from heli_jax.report.figures.estimates import MOST, share_within
 from heli_jax.report.files import Analysis as Analysis
 from heli_jax.report.fitted_responses import FittedPair
-from heli_jax.report.page import Draw, Picture
+from heli_jax.report.origin import Origin
+from heli_jax.report.page import MOST_FLIGHTS, Draw, Picture, filled, picture
+from heli_jax.vehicle import Constant, of_helicopter
+from heli_jax.versions import versions
 
-MOST_FLIGHTS = 6
-"""flights that get figures of their own; signals.csv has them all"""
+
+def write_report(
+    directory: Path,
+    analysis: Analysis,
+    title: str,
+    vehicle_constants: Mapping[str, Constant],
+    origin: Origin | None = None,
+    *,
+    png: bool = False,
+) -> list[str]:
+    """Write report.html and figures/NAME.svg; return the figures' names.
+
+    The page loads nothing from outside itself. Whatever comes from logs and configurations is
+    escaped.
+
+    Args:
+        directory: where; it exists.
+        analysis: the fit and what belongs to it.
+        title: of the page.
+        vehicle_constants: the vehicle file's, by name.
+        origin: command, configuration and files beside the page; nothing of them unless given.
+        png: whether to write figures/NAME.png too.
+
+    Raises:
+        OSError: the directory cannot be written to.
+    """
+    folder = directory / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers, shown, logged = Numbers(), list[Picture](), logged_units(analysis)
+    # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
+    for name, draw in drawings(analysis).items():
+        units = logged.get(name)
+        made = picture(name, draw, numbers, folder=folder, logged=units, png=png)
+        if made is not None:
+            shown.append(made._replace(alt=alt_text(made, analysis)))
+    page = render(analysis, title, vehicle_constants, shown, numbers, origin)
+    (directory / "report.html").write_text(page, encoding="utf-8")
+    return [made.name for made in shown]
+
+
+def render(
+    analysis: Analysis,
+    title: str,
+    vehicle_constants: Mapping[str, Constant],
+    pictures: list[Picture],
+    numbers: Numbers | None = None,
+    origin: Origin | None = None,
+) -> str:
+    """The page as text."""
+    fit, problem = analysis.fit, analysis.problem
+    numbers, first = numbers or Numbers(), None
+    if (worst := worst_output(fit)) is not None:
+        chart = figures.overview(*worst, problem.model)
+        first = picture("overview", lambda: chart, numbers)
+    return filled(
+        "report.html.j2",
+        title=title,
+        fit=fit,
+        problem=problem,
+        baseline=analysis.baseline,
+        more=analysis.supplementary,
+        # Once: it takes spectra of every pair of signals.
+        card=card(problem, fit),
+        summary=summary,
+        # The template asks this module for its rows.
+        lines=lines(fit),
+        meanings=meanings(fit),
+        remark=model_remark(problem),
+        tables=tables,
+        logged=logged_outputs(analysis),
+        constants=tables.constants(problem, vehicle_constants),
+        versions=versions(),
+        origin=origin,
+        unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
+        overview=first,
+        pictures={
+            group: [(p, caption(p)) for p in pictures if p.name.startswith(group)]
+            for group in GROUPS
+        },
+        numbers=numbers.content(),
+    )
+
+
 _MOST = 6
 """pairs that are told one by one"""
 
@@ -221,3 +316,114 @@ def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
     count = next(iter(samples.values())).size
     within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
     return f"{count} samples, mean and sd: {'; '.join(each)}{within}"
+
+
+class Line(NamedTuple):
+    """One of the three statements at the head of the page."""
+
+    level: str
+    """good, warning, bad or none"""
+    word: str
+    text: str
+    """one sentence"""
+
+
+def lines(fit: Fit) -> tuple[Line, Line, Line]:
+    """Did the optimiser converge; what do the data determine; is the model adequate."""
+    if fit.status == "not-converged":
+        stopped = "The optimiser stopped before an optimum, and these numbers are no result."
+        return (
+            Line("bad", "Not converged", stopped),
+            Line("none", "Identifiability not judged", "The data determine numbers at an optimum."),
+            Line("none", "Adequacy not judged", "A model is judged at an optimum."),
+        )
+    best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
+    reached = f"The optimiser reached an optimum in {fit.steps} steps."
+    if runs > 1:
+        reached = f"{best} of {runs} runs of the optimiser reached this optimum."
+    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
+    determined = Line("good", "Identifiable", text)
+    if fit.status == "not-identifiable" or fit.not_identifiable:
+        determined = Line("bad", "Not identifiable", text)
+    elif fit.untrusted:
+        determined = Line("warning", "Identifiable, not trusted", text)
+    adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
+    if fit.adequate:
+        shares = {n: m.vaf for n, m in fit.metrics.items() if math.isfinite(m.vaf)}
+        told = "Nothing in the record speaks against the model."
+        if shares:
+            worst = min(shares, key=lambda n: shares[n])
+            told = f"{told[:-1]}; simulated, VAF of {worst} {vaf_percent(shares[worst])}."
+        adequate = Line("good", "Adequate", told)
+    return Line("good", "Converged", reached), determined, adequate
+
+
+def model_remark(problem: Problem) -> str:
+    """Why an inertia found here is a number of the paper's model; empty for other models."""
+    # A model with parameters of its own need not have the paper's equations 14 and 15.
+    if not of_helicopter(problem.model.Params):
+        return ""
+    factor = float(np.asarray(problem.vehicle.cyclic_moment))
+    return (
+        "Ixx and If are numbers of the paper's model, not of the machine: eqs 14-15 have the "
+        f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
+        "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
+        "Compare an estimate with a weighed or swung inertia only with that in mind."
+    )
+
+
+def meanings(fit: Fit) -> list[tuple[str, str]]:
+    """Heading and text of each statement, and of what residuals that are not white do to it."""
+    return [
+        (
+            "Converged",
+            "the last step changed every parameter by less than a thousandth of the sd that it "
+            "would have were all else known.",
+        ),
+        (
+            "Determined",
+            "by data and priors the 95 % intervals, as they are reported, reach at most a factor "
+            f"of {FACTOR:g} to either side, also without the weak priors of biases, offsets and "
+            "initial states.",
+        ),
+        ("Adequate", _adequate(fit)),
+        (
+            "Not trusted",
+            "a misfit that was found moves the estimate by more than half of its 95 % interval, or "
+            "by an amount that is not known: the interval is withdrawn.",
+        ),
+        ("Residuals that are not white", _coloured(fit)),
+    ]
+
+
+def _adequate(fit: Fit) -> str:
+    if any(output.against_disturbance is not None for output in fit.adequacy.judged):
+        ahead = fit.adequacy.ahead
+        what = "simulation" if ahead is None else f"predictions up to {ahead:g} s ahead"
+        return (
+            f"the error of the {what} has at most {EXPECTED:g} times the power that the estimated "
+            "disturbance makes, with innovations that are white or have an autocorrelation below "
+            f"{FAR_FROM_WHITE:g} at one sample; or the simulation explains {percent(EXPLAINED, 0)} "
+            "of what is not white noise. Nothing in the record speaks against every model."
+        )
+    return (
+        f"the simulation explains at least {percent(EXPLAINED, 0)} of what is not white noise, or "
+        f"at most {percent(NEARLY_WHITE, 0)} of the residual's variance is other than that. "
+        "Nothing in the record speaks against every model."
+    )
+
+
+def _coloured(fit: Fit) -> str:
+    if fit.status == "not-converged":
+        intervals = "Of a fit that stopped before an optimum no intervals are given."
+    elif fit.overconfident:
+        intervals = "The intervals given are not corrected for them and are too narrow."
+    elif fit.coloured:
+        intervals = "The intervals given are corrected for their autocorrelation."
+    else:
+        intervals = "There are none here, and the intervals need no correction."
+    return (
+        f"{intervals} A disturbance in them that knows nothing of the inputs leaves the estimates "
+        "unbiased; dynamics that the model lacks bias them, and so does a disturbance under "
+        "feedback, and no interval allows for that."
+    )
