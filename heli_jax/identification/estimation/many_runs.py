@@ -55,7 +55,7 @@ _MOST = 6000
 
 
 class Own(NamedTuple):
-    """What each run has of its own, beside its unknowns."""
+    """The parts of the record that each run has of its own."""
 
     inputs: bool
     outputs: bool
