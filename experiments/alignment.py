@@ -9,7 +9,7 @@ each.
 import numpy as np
 
 from heli_jax.flights.align import NotAligned, lag_between
-from heli_jax.flights.slower import Timed
+from heli_jax.flights.resample import Timed
 
 CASES = [
     # rates [Hz], fastest part of the motion [Hz], noise over the motion's sd

@@ -49,7 +49,7 @@ ABLATIONS: tuple[Ablation, ...] = (
         f"{_IDENTIFICATION}.estimation.noise_scales:with_own_noise",
         lambda problem, noise: noise,
     ),
-    Ablation("strays", f"{_FLIGHTS}.strays:strays", lambda *_: ()),
+    Ablation("strays", f"{_FLIGHTS}.marks:strays", lambda *_: ()),
     Ablation(
         "swapped_modes",
         f"{_IDENTIFICATION}.identifiability.equivalents:second_solutions",

@@ -188,10 +188,10 @@ def figure5(r: Run) -> Figure:
     shown = {"RLS of order 4": r.rls[STAND_RUN].simulated, "Filter error, a known": known}
     axes = made.subplots(2, 1, sharex=True)
     for ax, (name, simulated) in zip(axes, shown.items(), strict=True):
-        style.line(ax, np.arange(N), y, color=style.PALE, lw=1.6, label="measured")
-        style.line(ax, np.arange(N), simulated, color=style.BLUE, lw=0.8, label="simulated")
+        ax.plot(y, color=style.PALE, lw=1.6, label="measured")
+        ax.plot(simulated, color=style.BLUE, lw=0.8, label="simulated")
         _dressed(ax, r, f"{name}: VAF {percent(metrics(y, simulated).vaf, 0)}")
-        style.legend_above(ax)
+        ax.legend(loc="lower right", bbox_to_anchor=(1.005, 1.0), ncols=2, borderaxespad=0.2)
     axes[0].set_xlabel("")
     return made
 
@@ -200,7 +200,7 @@ def figure6(r: Run) -> Figure:
     """The stick at neutral, on the scale of Figure 5."""
     made, roll = style.figure(2.8, constrained=True), r.flights[NEUTRAL].outputs["roll"]
     ax = made.subplots()
-    style.line(ax, np.arange(N), roll, color=style.BLUE, lw=0.8)
+    ax.plot(roll, color=style.BLUE, lw=0.8)
     _dressed(ax, r, f"Stick at neutral: {np.std(roll):.2f} rad rms")
     return made
 

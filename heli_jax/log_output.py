@@ -11,11 +11,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from heli_jax.finding import as_data
+from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
-from heli_jax.flights.rotor_lines import LEAST, RotorLines
-from heli_jax.flights.row_clock import ROWS
-from heli_jax.flights.vibration import SMALLEST, line_words
+from heli_jax.flights.vibration import LEAST, SMALLEST, RotorLines, line_words
 from heli_jax.numbers import terse
 from heli_jax.terminal import print_table, tell
 

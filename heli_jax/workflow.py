@@ -64,7 +64,7 @@ class FitRun:
     # Drawn anew each time: a figure that is kept could be changed by who got it before. Any, since
     # matplotlib's classes are named in `report` alone.
     def figure(self, name: str) -> Any:
-        """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`, `bode`,
+        """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`,
         `match_OUTPUT-INPUT`, `starts`, ...
 
         Raises:

@@ -50,7 +50,7 @@ def write_tables(folder: Path, minutes: float) -> None:
 
 
 def write_dataflash(path: Path, megabytes: float) -> None:
-    from heli_jax.flights.dataflash import FIELDS
+    from heli_jax.flights.formats.dataflash import FIELDS
 
     known = {"FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns", 0)} | _MESSAGES
     head, cycle = b"", []

@@ -13,7 +13,7 @@ import scipy.signal
 from coverage_cases import BENCH, Case, Run, intervals
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.flights.slower import Timed, at_nearest
+from heli_jax.flights.resample import Timed, at_nearest
 from heli_jax.simulation.inputs import random_steps
 
 N, DT, FINE = 1500, 0.02, 20

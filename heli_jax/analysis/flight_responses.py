@@ -35,9 +35,8 @@ from heli_jax.analysis.spectra import (
 )
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.finding import Finding, note, sentences
-from heli_jax.flights.flight import Flight
+from heli_jax.flights.flight import Flight, own_instruments, own_said
 from heli_jax.flights.holds import without_jumps
-from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.flights.parts import spans
 
 _ROUNDS = 2

@@ -393,10 +393,6 @@ class Windowed(NamedTuple):
         """(p,) independent averages of each output"""
         return np.sum(self.seen, axis=0) / PER_AVERAGE
 
-    def by_flight(self, v: np.ndarray) -> list[np.ndarray]:
-        """An array (W, ...) of all windows in parts, flight by flight."""
-        return np.split(v, np.cumsum([len(s) for s in self.starts])[:-1])
-
 
 def window_transforms(
     x: Float[np.ndarray | Array, "c N"],

@@ -31,13 +31,13 @@ from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, located, require_known
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
+from heli_jax.flights.clock import by_rate
 from heli_jax.flights.convert import Selection
 from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
-from heli_jax.flights.file_units import taken_note
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.named import Named, NamedBy
-from heli_jax.flights.row_clock import by_rate
+from heli_jax.flights.preset import Named, NamedBy
+from heli_jax.flights.request import taken_note
 from heli_jax.flights.table import Table
 from heli_jax.identification.methods import objective_of
 

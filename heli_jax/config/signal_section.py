@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from heli_jax.config.section import Section
-from heli_jax.flights.ccpm import Swashplate
+from heli_jax.flights.derived import Swashplate
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.origins import scale_problem
 from heli_jax.flights.preset import preset, presets
@@ -59,7 +59,7 @@ Numbers = float | list[float]
 
 
 class CcpmConfig(Section):
-    """The servos of a swashplate and where they lift it (`heli_jax.flights.ccpm.Swashplate`)."""
+    """The servos of a swashplate and where they lift it (`heli_jax.flights.derived.Swashplate`)."""
 
     servos: list[str]
     """the channels of the servos"""

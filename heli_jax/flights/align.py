@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.resample import in_gaps, resampled
-from heli_jax.flights.slower import Timed, own_clock, usual_step
+from heli_jax.flights.resample import Timed, in_gaps, own_clock, resampled, usual_step
 
 BAND = 0.2
 """of the slower signal's rate: what is faster is taken away, and cubics pass what is left"""

@@ -19,13 +19,14 @@ from heli_jax.flights.marks import (
     at_marks,
     counted,
     mark_words,
+    stray_words,
+    strays,
     without_marks,
 )
 from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.request import Request
+from heli_jax.flights.resample import Timed
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
-from heli_jax.flights.slower import Timed
-from heli_jax.flights.strays import stray_words, strays
 from heli_jax.flights.table import column, shown, wrong
 
 _JUMP = (0.75, 1.001)

@@ -9,26 +9,30 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.array_clocks import by_clocks
-from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
-from heli_jax.flights.ccpm import Swashplate
-from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
+from heli_jax.flights.derived import (
+    DerivedLog,
+    DerivedTable,
+    Swashplate,
+    marks_of_sources,
+    with_derived,
+)
+from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import at_marks, counted, mark_words
-from heli_jax.flights.named import NamedBy
-from heli_jax.flights.onto_grid import window_note
-from heli_jax.flights.open_log import open_log
-from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
-from heli_jax.flights.request import require_rate_and_window
-from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
-from heli_jax.flights.table import listed, require_few_columns, shown, wrong
-from heli_jax.flights.table_topics import (
+from heli_jax.flights.joined import (
     matching,
     one_topic,
     without_joins,
 )
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.marks import at_marks, counted, mark_words
+from heli_jax.flights.onto_grid import window_note
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.preset import NamedBy
+from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
+from heli_jax.flights.request import require_rate_and_window
+from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
+from heli_jax.flights.table import listed, require_few_columns, shown, wrong
 
 ENDINGS = (".csv", ".parquet", ".nc")
 TIME = "time"

@@ -10,9 +10,19 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.finding import Finding, note
-from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import counter_notes, table_clock
+from heli_jax.flights.clock import (
+    ROWS,
+    clock_scale,
+    contradicted_rate,
+    counter_notes,
+    numbering,
+    numbering_notes,
+    restarts,
+    table_clock,
+    with_runs,
+)
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.formats.arrays import clock_notes
 from heli_jax.flights.grid import (
     LATEST,
     SHORTEST_STEP,
@@ -26,16 +36,6 @@ from heli_jax.flights.grid import (
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.row_clock import (
-    ROWS,
-    clock_scale,
-    contradicted_rate,
-    numbering,
-    numbering_notes,
-    restarts,
-    with_runs,
-)
 from heli_jax.flights.table import (
     Survey,
     Table,
@@ -45,6 +45,7 @@ from heli_jax.flights.table import (
     wrong,
 )
 from heli_jax.flights.time_units import SECONDS
+from heli_jax.flights.vibration import RotorLines, rotor_lines
 
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
@@ -94,7 +95,7 @@ class TimeInfo:
     the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
     they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
     `counted` [Hz] is how many samples a second has, where `column` counts them, or no column is a
-    clock and the rows do (`heli_jax.flights.row_clock.ROWS`); `said` where the file says so.
+    clock and the rows do (`heli_jax.flights.clock.ROWS`); `said` where the file says so.
     Where the time begins anew the table holds several `runs`, put one after another; where it goes
     on `numbering` is the column that numbers them.
     """

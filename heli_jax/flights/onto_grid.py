@@ -14,22 +14,20 @@ from heli_jax.flights.holds import LOW_PASSED, Decision, decide, low_passed
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import (
+    OWN,
+    Timed,
+    at_nearest,
+    at_own_rate,
     goes_down,
     held_low_passed,
     held_mean,
     held_until_jumps,
     hold,
     in_gaps,
-    longest_gap,
-    resampled,
-)
-from heli_jax.flights.slower import (
-    OWN,
-    Timed,
-    at_nearest,
-    at_own_rate,
     is_slower,
+    longest_gap,
     own_clock,
+    resampled,
     slower_words,
     usual_step,
 )

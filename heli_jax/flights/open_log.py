@@ -4,17 +4,18 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from heli_jax.flights import (
-    array_table,
-    blackbox_fields,
+from heli_jax.flights import progress
+from heli_jax.flights.formats import (
+    arrow,
+    blackbox,
+    blackbox_frames,
+    csv_text,
     dataflash,
-    json_log,
-    parquet_table,
-    progress,
+    json_records,
+    library_arrays,
+    numpy_arrays,
     ulog,
 )
-from heli_jax.flights.blackbox import open_blackbox
-from heli_jax.flights.csv_table import inner_ending, is_gzipped, open_csv
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import Table, require_short_names, shown, wrong
 from heli_jax.regular_file import open_regular, require_regular
@@ -22,9 +23,8 @@ from heli_jax.regular_file import open_regular, require_regular
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
-_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_fields.MARK)
+_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_frames.MARK)
 """what their logs begin with, and no table does"""
-_ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
     "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet, .feather, .json), arrays "
     "(.mat, .nc, .h5, .hdf5, .npz, .npy) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
@@ -123,38 +123,25 @@ def _reader(path: Path) -> _Reader:
     # By the ending first where it says enough, so that a damaged Parquet file is called so and not
     # read as text.
     if ending == ".parquet":
-        return parquet_table.open_parquet
-    if is_gzipped(path):
-        if inner_ending(path) not in _TEXTS:
+        return arrow.open_parquet
+    if csv_text.is_gzipped(path):
+        if csv_text.inner_ending(path) not in _TEXTS:
             problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
             raise wrong(str(path), f"{problem}; expected it unpacked")
-        return open_csv
+        return csv_text.open_csv
     marked = _by_content(head)
     # What such a file begins with is the user's own text, which may look like the mark of any
     # other; but an autopilot's log may have been given the name of a table.
     if ending in (".csv", ".tsv"):
-        of_autopilot = head.startswith(_AUTOPILOTS) or _is_exported(head)
-        return marked if marked is not None and of_autopilot else open_csv
+        exported = head.lstrip().startswith(b"FMT,") and dataflash.is_dataflash_text(head)
+        of_autopilot = exported or head.startswith(_AUTOPILOTS)
+        return marked if marked is not None and of_autopilot else csv_text.open_csv
     # Arrays go by their ending, since MATLAB 7.3, NetCDF 4 and HDF5 files hold the same mark.
-    if marked is not None and ending not in _ARRAYS:
+    if marked is not None and ending not in (".mat", ".nc", ".h5", ".hdf5"):
         return marked
-    by_ending: dict[str, _Reader] = dict.fromkeys(_TEXTS, open_csv)
-    by_ending |= {
-        ".mat": array_table.open_mat,
-        ".nc": array_table.open_netcdf,
-        ".h5": array_table.open_hdf5,
-        ".hdf5": array_table.open_hdf5,
-        ".ulg": _one(ulog.open_ulog),
-        ".bin": _one(dataflash.open_dataflash),
-        ".bbl": open_blackbox,
-        ".bfl": open_blackbox,
-    }
-    by_ending |= dict.fromkeys((".npy", ".npz"), array_table.open_numpy)
-    by_ending |= dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), parquet_table.open_arrow)
-    by_ending |= dict.fromkeys((".json", ".jsonl", ".ndjson"), json_log.open_json)
-    if ending not in by_ending:
+    if ending not in _BY_NAME:
         raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
-    return by_ending[ending]
+    return _BY_NAME[ending]
 
 
 def _by_content(head: bytes) -> _Reader | None:
@@ -164,14 +151,9 @@ def _by_content(head: bytes) -> _Reader | None:
             return reader
     # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
     # mind what stands before the first.
-    if blackbox_fields.MARK in head:
-        return open_blackbox
+    if blackbox_frames.MARK in head:
+        return blackbox.open_blackbox
     return _one(dataflash.open_dataflash_text) if dataflash.is_dataflash_text(head) else None
-
-
-def _is_exported(head: bytes) -> bool:
-    """Whether a text begins with the formats of a DataFlash log, as no table does."""
-    return head.lstrip().startswith(b"FMT,") and dataflash.is_dataflash_text(head)
 
 
 def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
@@ -181,15 +163,27 @@ def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
 _READERS: tuple[tuple[bytes, _Reader], ...] = (
     (ulog.MAGIC, _one(ulog.open_ulog)),
     (dataflash.MAGIC, _one(dataflash.open_dataflash)),
-    (b"PAR1", parquet_table.open_parquet),
-    (b"MATLAB ", array_table.open_mat),
-    (b"CDF\x01", array_table.open_netcdf),
-    (b"CDF\x02", array_table.open_netcdf),
-    (array_table.HDF5_MAGIC, array_table.open_hdf5),
-    (array_table.NUMPY_MAGIC, array_table.open_numpy),
-    (parquet_table.ARROW_MARK, parquet_table.open_arrow),
+    (b"PAR1", arrow.open_parquet),
+    (library_arrays.MATLAB_MAGIC, library_arrays.open_mat),
+    *((magic, library_arrays.open_netcdf) for magic in library_arrays.NETCDF_MAGICS),
+    (library_arrays.HDF5_MAGIC, library_arrays.open_hdf5),
+    (numpy_arrays.MAGIC, numpy_arrays.open_numpy),
+    (arrow.ARROW_MARK, arrow.open_arrow),
 )
 """by what their files begin with"""
+_BY_NAME: dict[str, _Reader] = {
+    **dict.fromkeys(_TEXTS, csv_text.open_csv),
+    **dict.fromkeys((".feather", ".arrow", ".arrows", ".ipc"), arrow.open_arrow),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), json_records.open_json),
+    **dict.fromkeys((".npy", ".npz"), numpy_arrays.open_numpy),
+    **dict.fromkeys((".h5", ".hdf5"), library_arrays.open_hdf5),
+    **dict.fromkeys((".bbl", ".bfl"), blackbox.open_blackbox),
+    ".mat": library_arrays.open_mat,
+    ".nc": library_arrays.open_netcdf,
+    ".ulg": _one(ulog.open_ulog),
+    ".bin": _one(dataflash.open_dataflash),
+}
+"""by their ending"""
 
 
 # Files that hold flights and are not read: what each is, and what to make of it instead.

@@ -22,7 +22,7 @@ from heli_jax.flights.origins import with_origins, without_constants
 from heli_jax.flights.parts import is_too_short, stretches
 from heli_jax.flights.read_channels import clocks_of, on_all_the_time
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.slower import Timed
+from heli_jax.flights.resample import Timed
 from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opened
 from heli_jax.flights.table import wrong
 

@@ -14,7 +14,6 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.derived import marks_of_sources, why_missing
-from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
@@ -34,9 +33,8 @@ from heli_jax.flights.onto_grid import (
     sample_notes,
     window_note,
 )
-from heli_jax.flights.request import Request
-from heli_jax.flights.resample import new_clock
-from heli_jax.flights.slower import Timed, is_slower
+from heli_jax.flights.request import Request, other_units
+from heli_jax.flights.resample import Timed, is_slower, new_clock
 from heli_jax.flights.table import sample_count, shown, wrong
 
 _ALIKE = 1e-3

@@ -10,10 +10,18 @@ import numpy as np
 
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
-from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_guess import require_increasing, unit_notes
+from heli_jax.flights.clock import (
+    ROWS,
+    clock_scale,
+    contradicted_rate,
+    counted,
+    require_increasing,
+    unit_notes,
+    with_runs,
+)
 from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, rounding_of, without_overflow
 from heli_jax.flights.joined import joined_log
 from heli_jax.flights.log import ChannelLog
@@ -26,8 +34,6 @@ from heli_jax.flights.read_channels import (
     rows_in_window,
 )
 from heli_jax.flights.request import Request
-from heli_jax.flights.row_clock import ROWS, clock_scale, contradicted_rate, counted, with_runs
-from heli_jax.flights.stacked import NUMBER
 from heli_jax.flights.table import Table, column, shown, wrong
 from heli_jax.flights.time_units import require_likely
 
@@ -56,10 +62,10 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
     file = _below(table)
-    of_stack = isinstance(file, ArrayTable) and NUMBER in file.names
+    of_stack = isinstance(file, ArrayTable) and SEGMENT in file.names
     if of_stack and request.time.name == ROWS and not request.options.runs:
-        problem = f"its rows are of several runs, which {NUMBER!r} numbers"
-        remedy = f"expected time: {{rate: HZ, runs: {NUMBER}}}, which makes a flight of each"
+        problem = f"its rows are of several runs, which {SEGMENT!r} numbers"
+        remedy = f"expected time: {{rate: HZ, runs: {SEGMENT}}}, which makes a flight of each"
         raise wrong(table.path, f"{problem}; {remedy}")
     if request.time.name == ROWS:
         table = _over(table, counted(file))

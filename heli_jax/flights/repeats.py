@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from heli_jax.finding import Finding, note
-from heli_jax.flights.slower import Timed, usual_step
+from heli_jax.flights.resample import Timed, usual_step
 
 REPEATS = ("auto", "keep", "missing")
 """What is made of repeated values: missing samples where that is unmistakable, or as stated."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from heli_jax.flights.strays import Strays
+from heli_jax.flights.marks import Strays
 
 _PILE = 5.0
 """times as many samples at an extreme as at the values beside it, for a rail. A sine logged in

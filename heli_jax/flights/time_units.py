@@ -1,12 +1,29 @@
-"""Units of clocks as files write them: words, abbreviations, at the end of a column's name."""
+"""Times as files write them: units in words or at the end of a column's name, and times as text."""
 
+import datetime
 import re
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from heli_jax.finding import Finding
 from heli_jax.flights.table import column, shown, wrong
 
+TIME_NAMES = {
+    *(
+        "t",
+        "time",
+        "timestamp",
+        "timestamps",
+        "seconds",
+        "sec",
+        "elapsed",
+        "clock",
+        "zeit",
+        "temps",
+    ),
+}
+"""words in the names of clocks"""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
 """of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
 _WORDS = {
@@ -121,3 +138,105 @@ def _of_a_flight(unit: str, step: float, length: float) -> str:
             break
         unit = coarser
     return unit
+
+
+# Dates of ISO 8601 and of German spreadsheets, times of day, counts with a unit.
+
+_CLOCK = r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12})?)"
+_ISO = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ,]+\d\d:\d\d(?::\d\d.*)?")
+_GERMAN = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? (\d{1,2}:\d\d:\d\d(?:[.,]\d{1,6})?)")
+_TIME_OF_DAY = re.compile(_CLOCK)
+_SPAN = re.compile(rf"(\d{{1,5}}) ?days?,? +{_CLOCK}")
+"""0 days 00:00:01.25, as pandas and Python write what has passed"""
+_COUNT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([A-Za-zµμ]+)")
+"""0.01 sec, as MATLAB writes durations"""
+_LONGEST = 60
+"""characters of a time; of a damaged file a cell may be as long as itself"""
+
+
+def is_date(cell: str) -> bool:
+    """True for a date with a time of day, a time of day, or a time with its unit."""
+    return len(cell) <= _LONGEST and _reader(cell) is not None
+
+
+def seconds_of_dates(cells: Sequence[str | None]) -> np.ndarray | int:
+    """Seconds (N,) from the first midnight, NaN where a cell is empty.
+
+    Times of day go on behind midnight. All cells have to be of one kind, and dates with an offset
+    from UTC or without.
+
+    Returns:
+        The row of the first cell that is none, in place of the seconds.
+    """
+    filled = [i for i, cell in enumerate(cells) if cell is not None]
+    values = np.full(len(cells), np.nan)
+    if not filled:
+        return values
+    form = _reader(cells[filled[0]] or "")
+    begin = None
+    for i in filled:
+        cell = cells[i] or ""
+        if form is None or len(cell) > _LONGEST or _reader(cell) != form:
+            return i
+        try:
+            time = form(cell)
+            if isinstance(time, datetime.datetime):
+                begin = begin or time.replace(hour=0, minute=0, second=0, microsecond=0)
+                time = (time - begin).total_seconds()
+        # TypeError: dates with an offset from UTC and without cannot be compared.
+        except (ValueError, TypeError, OverflowError):
+            return i
+        values[i] = time
+    if form is _of_clock:
+        day = SECONDS["day"]
+        falls = np.diff(values[filled]) < -0.5 * day
+        values[filled] += np.cumsum(np.r_[0.0, np.where(falls, day, 0.0)])
+    return values
+
+
+type _Read = Callable[[str], datetime.datetime | float]
+
+
+def _reader(cell: str) -> _Read | None:
+    """What reads cells such as this one; None where it is no time."""
+    read = next((read for form, read in _FORMS if form.fullmatch(cell)), None)
+    if read is None and (match := _COUNT.fullmatch(cell)):
+        # 3D is what a receiver calls its fix, and no three days.
+        unit = None if match[2].casefold() in LETTERS else time_unit(match[2])
+        read = None if unit is None else _OF_COUNTS[unit]
+    return read
+
+
+def _of_iso(cell: str) -> datetime.datetime:
+    text = cell.replace("/", "-").removesuffix(" UTC").removesuffix(" GMT")
+    return datetime.datetime.fromisoformat(re.sub("[ ,]+", "T", text, count=1))
+
+
+def _of_german(cell: str) -> datetime.datetime:
+    date, clock = cell.replace(", ", " ").split(" ", 1)
+    day, month, year = map(int, date.split("."))
+    clock = clock.replace(",", ".").zfill(8)
+    return datetime.datetime.fromisoformat(f"{year}-{month:02d}-{day:02d}T{clock}")
+
+
+def _of_clock(cell: str) -> float:
+    hours, minutes, seconds = cell.replace(",", ".").split(":")
+    return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+
+
+def _of_clock_and_days(cell: str) -> float:
+    days, clock = cell.split("day")
+    return SECONDS["day"] * int(days) + _of_clock(clock.lstrip("s, "))
+
+
+def _of_count(unit: str) -> _Read:
+    return lambda cell: SECONDS[unit] * float(_COUNT.sub(r"\1", cell))
+
+
+_OF_COUNTS: dict[str, _Read] = {unit: _of_count(unit) for unit in SECONDS}
+_FORMS: tuple[tuple[re.Pattern[str], _Read], ...] = (
+    (_ISO, _of_iso),
+    (_GERMAN, _of_german),
+    (_TIME_OF_DAY, _of_clock),
+    (_SPAN, _of_clock_and_days),
+)

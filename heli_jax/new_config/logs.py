@@ -10,20 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.array_clocks import by_clocks
-from heli_jax.flights.array_table import ArrayTable
-from heli_jax.flights.clock_guess import (
+from heli_jax.flights.clock import (
     COUNTS_ROWS,
+    ROWS,
+    counted,
     is_called_time,
     require_increasing,
 )
 from heli_jax.flights.describe import LogInfo, describe_table
+from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
+from heli_jax.flights.joined import in_runs, rate_note
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.row_clock import ROWS, counted
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.flights.table_topics import in_runs, rate_note
 from heli_jax.new_config.guess import Series
 
 _ASSUMED = 100.0

@@ -7,7 +7,7 @@ import numpy as np
 from heli_jax.flights.derived import sources
 from heli_jax.flights.preset import model_inputs, model_outputs, preset
 from heli_jax.flights.repeats import carried_on, first_of_each
-from heli_jax.flights.slower import SLOWER, usual_step
+from heli_jax.flights.resample import SLOWER, usual_step
 from heli_jax.new_config.guess import Series
 
 _FASTEST = 100.0

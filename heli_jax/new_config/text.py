@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 from heli_jax import naming
 from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
+from heli_jax.flights.clock import ROWS
 from heli_jax.flights.describe import TimeInfo
 from heli_jax.flights.preset import Alternative, choose, model_outputs, preset
-from heli_jax.flights.row_clock import ROWS
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log
 from heli_jax.new_config.rate import two_digits

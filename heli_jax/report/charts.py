@@ -1,23 +1,18 @@
-"""What a drawn figure shows, panel by panel: as plain data, with which the page draws it anew
-so that it can be zoomed, and in words for who does not see it.
+"""What a figure of lines shows: one record, from which the page draws it (uPlot), Matplotlib draws
+the file, and words are made for who does not see it.
 
 A page holds each array once, in two or four bytes a number, as base64.
 """
 
 import base64
 import hashlib
-from typing import TYPE_CHECKING, Any, NamedTuple
+import itertools
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from heli_jax.numbers import number
-from heli_jax.report.style import BARS, thinned
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
 
 PIXELS = 88.0
 """of the page in an inch of a figure"""
@@ -27,17 +22,18 @@ class Series(NamedTuple):
     """A line, points, or what lies between two lines; arrays (n,)."""
 
     label: str
-    kind: str
-    """line, step, points, bars or band"""
-    color: str
-    width: float
-    dashed: bool
+    """empty where the axis says it"""
     x: np.ndarray
     y: np.ndarray
     """NaN where something is missing; of a band its lower edge"""
+    color: str
+    kind: Literal["line", "step", "points", "bars", "band"] = "line"
     low: np.ndarray | None = None
     """of bars and bands"""
     high: np.ndarray | None = None
+    width: float = 1.1
+    """of a line, or of a point"""
+    dashed: bool = False
 
 
 class Panel(NamedTuple):
@@ -45,145 +41,104 @@ class Panel(NamedTuple):
 
     label: str
     """of the y axis"""
-    limits: tuple[float, float]
-    height: float
-    """[pixel of a page]"""
     series: tuple[Series, ...]
+    limits: tuple[float, float]
+    height: float = 1.0
+    """[inch]"""
     levels: tuple[float, ...] = ()
     """horizontal lines"""
     marks: tuple[float, ...] = ()
     """vertical lines"""
     shades: tuple[tuple[float, float], ...] = ()
     """stretches of x that are shaded"""
+    logarithmic: bool = False
 
 
 class Chart(NamedTuple):
     """Panels below each other with one x axis."""
 
     title: str
-    note: str
     x_label: str
-    logarithmic: bool
     x_limits: tuple[float, float]
     panels: tuple[Panel, ...]
+    note: str = ""
+    logarithmic: bool = False
     of: str = ""
     """what its x belongs to, as a flight: charts of the same share cursor and zoom"""
 
 
-def chart_of(figure: "Figure") -> Chart:
-    """A figure of panels below each other as plain data.
+def panel(
+    label: str,
+    series: Sequence[Series],
+    height: float = 1.0,
+    *,
+    limits: tuple[float, float] | None = None,
+    **more: Any,
+) -> Panel:
+    """A panel; without `limits` they hold every series with a margin of 5 %."""
+    return Panel(label, tuple(series), limits or limits_of(series), height, **more)
+
+
+def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, float]:
+    """Limits that hold every series; from 0 to 1 where there is no number."""
+    parts = [v for s in series for v in (s.y, s.low, s.high) if v is not None and v.size]
+    y = np.concatenate(parts) if parts else np.empty(0)
+    y = y[np.isfinite(y)]
+    if not y.size:
+        return 0.0, 1.0
+    low, high = float(y.min()), float(y.max())
+    room = margin * (high - low) or 0.05 * abs(high) or 0.05
+    return low - room, high + room
+
+
+def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) -> Series:
+    """What was measured, NaN where it is missing: a line, or where few samples have neighbours a
+    dot for each, of which a line would show nothing."""
+    seen = ~np.isnan(y)
+    beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
+    if seen.any() and beside.mean() < 0.5:
+        return Series(label, x[seen], y[seen], color, "points", width=2.2)
+    return Series(label, x, y, color, width=width)
+
+
+def bars(label: str, x: np.ndarray, y: np.ndarray, reach: Any, color: str) -> Series:
+    """Dots with error bars; `reach`: of the bars down and up, (2, N), or of both, (N,)."""
+    down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
+    return Series(label, x, y, color, "bars", y - down, y + up, width=2.2)
+
+
+def band(x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, label: str = "") -> Series:
+    """What lies between two lines."""
+    return Series(label, x, low, color, "band", low, high, width=0.0)
+
+
+def time_limits(t: np.ndarray) -> tuple[float, float]:
+    """From the first time to the last; a record of one sample has no duration, but an axis has."""
+    return float(t[0]), float(t[-1] if t.size > 1 else t[0] + 1.0)
+
+
+def thinned(x: np.ndarray, y: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most `most` points of a line: the lowest and the highest of each bin.
+
+    No peak is lost, and the first and the last point stay.
 
     Args:
-        figure: drawn with lines, error bars, `fill_between` and spans; what else it holds is left
-            out.
+        x: (N,), ascending.
+        y: (N,)
+        most: points to keep, 4 at least.
     """
-    axes = figure.axes
-    first = axes[0]
-    notes = [t.get_text() for t in first.texts if getattr(t, "xy", None) == (0, 1)]
-    height = float(figure.get_size_inches()[1])
-    low, high = first.get_xlim()
-    return Chart(
-        first.get_title("left"),
-        "; ".join(notes),
-        axes[-1].get_xlabel(),
-        first.get_xscale() == "log",
-        (float(low), float(high)),
-        tuple(_panel(ax, height) for ax in axes),
-        str(figure.get_label()),
-    )
-
-
-def _panel(ax: "Axes", height: float) -> Panel:
-    low, high = ax.get_ylim()
-    flat, upright, lines = _straight(ax)
-    return Panel(
-        label=ax.get_ylabel(),
-        limits=(float(low), float(high)),
-        height=round(float(ax.get_position().height) * height * PIXELS),
-        series=(*_bands(ax), *_lines(ax, lines)),
-        levels=flat,
-        marks=upright,
-        shades=_shades(ax),
-    )
-
-
-def _straight(ax: "Axes") -> tuple[tuple[float, ...], tuple[float, ...], list["Line2D"]]:
-    """Heights of the lines across the axes, places of those from top to bottom, and all others."""
-    flat, upright, lines = [], [], []
-    for line in ax.get_lines():
-        # A line across has its x in parts of the axes, and only its y in numbers of the data.
-        by_x, by_y = line.get_transform().contains_branch_seperately(ax.transData)
-        if by_x and by_y:
-            lines.append(line)
-        elif by_y:
-            flat.append(float(np.asarray(line.get_ydata())[0]))
-        elif by_x:
-            upright.append(float(np.asarray(line.get_xdata())[0]))
-    return tuple(flat), tuple(upright), lines
-
-
-def _lines(ax: "Axes", lines: list["Line2D"]) -> list[Series]:
-    series: list[Series] = []
-    for line in lines:
-        if line.get_label() == BARS:
-            ends = np.asarray(line.get_ydata(), float)
-            series[-1] = series[-1]._replace(kind="bars", low=ends[::3], high=ends[1::3])
-        else:
-            series.append(_line(line, ax))
-    return [s for s in series if s.x.size]
-
-
-def _line(line: "Line2D", ax: "Axes") -> Series:
-    from matplotlib.colors import to_hex
-
-    kind = "step" if line.get_drawstyle() == "steps-post" else "line"
-    if line.get_linestyle() in ("None", "none", "", " "):
-        kind = "points"
-    return Series(
-        _name(str(line.get_label()), ax),
-        kind,
-        to_hex(line.get_color()),
-        float(line.get_linewidth()) if kind in ("line", "step") else float(line.get_markersize()),
-        line.get_linestyle() not in ("-", "None"),
-        np.asarray(line.get_xdata(), float),
-        np.asarray(line.get_ydata(), float),
-    )
-
-
-def _name(label: str, ax: "Axes") -> str:
-    """A line's label; that of the axis without its unit where it has none."""
-    return label if label and not label.startswith("_") else ax.get_ylabel().partition(" [")[0]
-
-
-def _bands(ax: "Axes") -> list[Series]:
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_hex
-
-    bands = []
-    for collection in ax.collections:
-        if not isinstance(collection, PolyCollection):
-            continue
-        for path in collection.get_paths():
-            # As fill_between lays them: one corner, the first edge, one corner, the second back.
-            corners = np.asarray(path.vertices)
-            n = (len(corners) - 3) // 2
-            one, other = corners[1 : n + 1], corners[n + 2 : 2 * n + 2][::-1]
-            color = to_hex(collection.get_facecolor()[0])  # type: ignore[arg-type,index]
-            low, high = np.minimum(one[:, 1], other[:, 1]), np.maximum(one[:, 1], other[:, 1])
-            bands.append(Series("", "band", color, 0.0, False, one[:, 0], low, low, high))
-    return bands
-
-
-def _shades(ax: "Axes") -> tuple[tuple[float, float], ...]:
-    from matplotlib.patches import Polygon, Rectangle
-
-    shades = []
-    for patch in ax.patches:
-        by_x, by_y = patch.get_transform().contains_branch_seperately(ax.transData)
-        if by_x and not by_y and isinstance(patch, Rectangle | Polygon):
-            box = patch.get_path().transformed(patch.get_patch_transform()).get_extents()
-            shades.append((float(box.x0), float(box.x1)))
-    return tuple(shades)
+    # Not every k-th sample: that aliases an oscillation and misses spikes.
+    n = y.size
+    if n <= most:
+        return x, y
+    bins = (most - 2) // 2  # two points each, and the two ends
+    edges = np.linspace(0, n, bins + 1).astype(int)
+    # A missing sample is neither the lowest nor the highest.
+    down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
+    low = [a + int(np.argmin(down[a:b])) for a, b in itertools.pairwise(edges)]
+    high = [a + int(np.argmax(up[a:b])) for a, b in itertools.pairwise(edges)]
+    keep = np.unique(np.concatenate([[0, n - 1], low, high]))
+    return x[keep], y[keep]
 
 
 _TOLD = 6
@@ -194,23 +149,21 @@ def described(chart: Chart) -> str:
     """Title, note, and of each panel which lines it has and from where to where they go."""
     low, high = chart.x_limits
     over = f"Over {chart.x_label}, {number(low, 3)} to {number(high, 3)}" if chart.x_label else ""
-    panels = [text for p in chart.panels if (text := _panel_in_words(p))]
-    sentences = [chart.title, chart.note, over, *panels]
-    return ". ".join(s for s in sentences if s) + "."
+    told = [text for p in chart.panels if (text := _panel_in_words(p))]
+    return ". ".join(s for s in (chart.title, chart.note, over, *told) if s) + "."
 
 
 def _panel_in_words(panel: Panel) -> str:
     series = [s for s in panel.series if s.kind != "band" and np.isfinite(s.y).any()]
-    words = [_range(s) for s in series[:_TOLD]]
+    words = []
+    for s in series[:_TOLD]:
+        y = s.y[np.isfinite(s.y)]
+        low, high = number(float(y.min()), 3), number(float(y.max()), 3)
+        name = s.label or panel.label.partition(" [")[0]
+        words.append(f"{name} {low}" + (f" to {high}" if low != high else ""))
     if len(series) > _TOLD:
         words.append(f"{len(series) - _TOLD} further lines")
     return f"{panel.label}: {', '.join(words)}" if words else ""
-
-
-def _range(series: Series) -> str:
-    y = series.y[np.isfinite(series.y)]
-    low, high = number(float(y.min()), 3), number(float(y.max()), 3)
-    return f"{series.label} {low}" + (f" to {high}" if low != high else "")
 
 
 _BYTES = 380_000
@@ -233,33 +186,32 @@ class Logged(NamedTuple):
 
 
 class Numbers:
-    """Arrays and figures of one page."""
+    """Arrays, charts and scenes of one page."""
 
     def __init__(self) -> None:
         self.arrays: list[dict[str, Any]] = []
-        self.charts: list[dict[str, Any]] = []
         self.scenes: list[dict[str, Any]] = []
         self._known: dict[bytes, int] = {}
-        self._waiting: list[tuple[Chart, dict[str, Logged]]] = []
+        self._charts: list[tuple[Chart, dict[str, Logged]]] = []
 
     def add_chart(self, chart: Chart, logged: dict[str, Logged] | None = None) -> int:
-        """Keep a figure; its number on the page."""
-        self._waiting.append((chart, logged or {}))
-        return len(self._waiting) - 1
+        """Keep a chart; its number on the page."""
+        self._charts.append((chart, logged or {}))
+        return len(self._charts) - 1
 
     def content(self) -> dict[str, Any]:
         """All as plain data for JSON."""
-        # Not before all figures are known: how many points a line may keep depends on how many
-        # lines there are. An input that five figures show counts once.
+        # Not before all charts are known: how many points a line may keep depends on how many
+        # lines there are. An input that five charts show counts once.
         lines = {
             hashlib.sha256(np.ascontiguousarray(s.y).tobytes()).digest(): s.y.size
-            for chart, _ in self._waiting
+            for chart, _ in self._charts
             for p in chart.panels
             for s in p.series
         }
         most = _most(list(lines.values()))
-        self.charts = [self._chart(chart, logged, most) for chart, logged in self._waiting]
-        return {"arrays": self.arrays, "charts": self.charts, "scenes": self.scenes}
+        charts = [self._chart(chart, logged, most) for chart, logged in self._charts]
+        return {"arrays": self.arrays, "charts": charts, "scenes": self.scenes}
 
     def array(self, values: np.ndarray, *, exact: bool = False) -> int:
         """Keep an array (n,); its number on the page.
@@ -276,20 +228,19 @@ class Numbers:
         return self._known[key]
 
     def _chart(self, chart: Chart, logged: dict[str, Logged], most: int) -> dict[str, Any]:
-        panels = [
-            {
-                **p._asdict(),
-                "logged": _logged_unit(p.label, logged),
-                "series": [self._series(s, most) for s in p.series],
-            }
-            for p in chart.panels
-        ]
+        panels = []
+        for p in chart.panels:
+            name, _, unit = p.label.partition(" [")
+            own = [unit.rstrip("]"), *logged[name]] if name in logged else None
+            series = [self._series(s, most, name) for s in p.series if s.x.size]
+            content = {"series": series, "logged": own, "height": round(p.height * PIXELS)}
+            panels.append({**p._asdict(), **content})
         return {**chart._asdict(), "panels": panels}
 
-    def _series(self, s: Series, most: int) -> dict[str, Any]:
+    def _series(self, s: Series, most: int, name: str) -> dict[str, Any]:
         x, y = (s.x, s.y) if s.low is not None else thinned(s.x, s.y, most)
         ends = {n: self.array(v) for n, v in (("low", s.low), ("high", s.high)) if v is not None}
-        kept = {"x": self.array(x, exact=True), "y": self.array(y), "width": round(s.width, 2)}
+        kept = {"x": self.array(x, exact=True), "y": self.array(y), "label": s.label or name}
         return {**s._asdict(), "low": None, "high": None, **kept, **ends}
 
 
@@ -300,11 +251,6 @@ def _most(sizes: list[int]) -> int:
     if sum(sizes) * 2 * 4 / 3 <= _BYTES:
         return max([_LEAST, *sizes])
     return max(_LEAST, int(_BYTES / (6 * 4 / 3) / len(sizes)))
-
-
-def _logged_unit(label: str, logged: dict[str, Logged]) -> list[Any] | None:
-    unit = logged.get(label.partition(" [")[0])
-    return None if unit is None else [label.partition(" [")[2].rstrip("]"), *unit]
 
 
 def _uniform(values: np.ndarray) -> dict[str, Any] | None:

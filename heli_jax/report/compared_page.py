@@ -14,14 +14,12 @@ from heli_jax import units
 from heli_jax.finding import sentences
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
-from heli_jax.report.charts import Numbers
+from heli_jax.report.charts import Chart, Numbers, Series, limits_of, panel, samples
 from heli_jax.report.compared_runs import ComparedRuns
-from heli_jax.report.figures import bode_overlay, time_label
-from heli_jax.report.figures.bode import OVERLAY_WORDS
+from heli_jax.report.figures import time_label
 from heli_jax.report.origin import origin
 from heli_jax.report.page import Picture, filled, picture
 from heli_jax.report.saved_fit import SavedFit
-from heli_jax.report.style import Panels, panels
 
 _FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
 _MOST_FIGURES = 24
@@ -84,11 +82,6 @@ def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Pictur
             missing = [label for label in compared.labels if label not in drawn]
             without = f"no {output} of that log in a flight named {name}, or no result"
             yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
-        for input in dict.fromkeys(n for _, s in by_run for n in s.inputs):
-            draw = functools.partial(bode_overlay, by_run, name, output, input)
-            made = picture("bode", draw, numbers)
-            if made is not None:
-                yield made, OVERLAY_WORDS
 
 
 def _overlaps(
@@ -130,32 +123,31 @@ def _unit(compared: ComparedRuns, output: str) -> str:
     return ""
 
 
-def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Panels:
-    (ax,) = panels(2.9, [1.0])
+def _overlay(by_run: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Chart:
     first = by_run[0][1]
     # By what was measured: one run that diverges would leave of all others a straight line.
     measured = first.measured[output][np.isfinite(first.measured[output])]
     middle = float(np.mean(measured)) if measured.size else 0.0
     size = float(np.ptp(measured)) if measured.size and np.ptp(measured) > 0 else 1.0
-    style.samples(
-        ax, first.log_times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
-    )
+    t, colours = first.log_times, style.CYCLE
+    series = [samples("measured", t, first.measured[output], style.PALE, 1.2)]
     for i, (label, signals) in enumerate(by_run):
-        color = style.CYCLE[i % len(style.CYCLE)]
-        dashes = ("-", "--", ":")[i // len(style.CYCLE) % 3]
         simulated = signals.simulated[output]
         far = np.abs(simulated - middle) > _FAR * size
         if far.any():
             label, simulated = f"{label} (diverges)", np.where(far, np.nan, simulated)
-        style.line(ax, signals.log_times, simulated, color=color, ls=dashes, lw=0.9, label=label)
-    ax.set_title(f"{output}, {style.short(name)}: simulated", loc="left")
-    ax.set_xlabel(time_label(first.log_start))
-    ax.figure.set_label(name)
-    low, high = ax.get_ylim()
-    ax.set_ylim(max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size))
-    ax.set_ylabel(f"{output} [{unit}]" if unit not in ("", "1") else output)
+        look = {"width": 0.9, "dashed": i // len(colours) % 2 == 1}
+        color = colours[i % len(colours)]
+        series.append(Series(label, signals.log_times, simulated, color, **look))
+    low, high = limits_of(series)
+    limits = max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size)
+    words = f"{output} [{unit}]" if unit not in ("", "1") else output
     begin = min(float(s.log_times[0]) for _, s in by_run)
     end = max(float(s.log_times[-1]) for _, s in by_run)
-    ax.set_xlim(begin, end if end > begin else begin + 1.0)
-    style.legend_above(ax)
-    return (ax,)
+    return Chart(
+        f"{output}, {style.short(name)}: simulated",
+        time_label(first.log_start),
+        (begin, end if end > begin else begin + 1.0),
+        (panel(words, series, 2.2, limits=limits),),
+        of=name,
+    )

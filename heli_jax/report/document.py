@@ -1,19 +1,28 @@
 """fit.json: one table of its keys, by which it is written, checked when it is read, and documented.
 
 A section is a class whose fields are keys. The value of a key is the attribute of its name, unless
-`Annotated` states another attribute or a function. A number that is not finite is null in the file,
-whatever its kind.
+`Annotated` states another attribute or a function. `model_of` makes a section's pydantic model,
+which writes and checks it. A number that is not finite is null in the file, whatever its kind.
 """
 
 import functools
+import json
 import math
 import operator
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
 import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+    model_validator,
+)
 
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import Handling, HandlingPair
@@ -365,9 +374,15 @@ def _start(kind: type) -> Callable[[Any], Any]:
 _NOISE = ("white", "coloured residuals")
 
 
+VERSION = 1
+"""of the format: a key that is removed, or that changes its meaning, makes another"""
+
+
 class FitFile(TypedDict):
     """fit.json."""
 
+    format: Annotated[int, lambda _: VERSION]
+    """version of this format; missing in files of earlier versions of the program"""
     status: Annotated[Status, "fit.status"]
     """whether the optimiser converged, and whether the data determine what was asked"""
     exit_code: Annotated[Literal[0, 3, 4], "fit.exit_code"]
@@ -586,6 +601,53 @@ def _holds(flight: Flight) -> dict[str, dict[str, str]]:
     return {n: {"hold": h, "reason": reason.get(n, "as stated")} for n, h in flight.hold.items()}
 
 
+class _Section(BaseModel):
+    """The pydantic model of a section: made of a mapping, or of an object by the keys' sources.
+
+    Keys may be missing, or be none of the table: another version has others.
+    """
+
+    model_config = ConfigDict(extra="allow", arbitrary_types_allowed=True, protected_namespaces=())
+    sources: ClassVar[dict[str, Callable[[Any], Any]]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _collected(cls, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            found = {n: source(value) for n, source in cls.sources.items()}
+            value = {n: v for n, v in found.items() if v is not ABSENT}
+        return plain(value)
+
+
+@functools.cache
+def model_of(section: Any) -> type[_Section]:
+    """The pydantic model of a section of the table, or of a class whose fields are keys."""
+    fields = _fields(section)
+    made = {n: (_validated(kind) | None, None) for n, (kind, _) in fields.items()}
+    model = create_model(section.__name__, __base__=_Section, **made)  # type: ignore[call-overload]
+    model.sources = {n: source for n, (_, source) in fields.items()}
+    return model
+
+
+def _validated(kind: Any) -> Any:
+    """A kind of the table as pydantic checks it; in place of any number there may be null."""
+    options = _options(kind)
+    if len(options) > 1:
+        return functools.reduce(operator.or_, map(_validated, options))
+    if _is_section(kind):
+        return model_of(kind)
+    if typing.get_origin(kind) in _MAPPINGS:
+        return dict[str, _validated(typing.get_args(kind)[1])]
+    items = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple and Ellipsis not in items:
+        return tuple[tuple(map(_validated, items))]  # type: ignore[misc]
+    if (inner := _item(kind)) is not None:
+        return list[_validated(inner)]
+    if kind in (float, int, bool, str):
+        return kind | None
+    return kind if kind is type(None) or typing.get_origin(kind) is Literal else Any
+
+
 def written(kind: Any, value: Any) -> Any:
     """A value as plain data for JSON; a number that is not finite becomes None.
 
@@ -593,27 +655,16 @@ def written(kind: Any, value: Any) -> Any:
         kind: of the table; a section, or a mapping or list of such.
         value: what has its keys as attributes, or in a mapping as they stand in the file.
     """
-    if value is None:
-        return None
-    for option in _options(kind):
-        if _is_section(option):
-            fields = _fields(option)
-            if isinstance(value, Mapping):
-                return {n: written(fields[n][0], v) for n, v in value.items()}
-            found = {n: source(value) for n, (_, source) in fields.items()}
-            return {n: written(fields[n][0], v) for n, v in found.items() if v is not ABSENT}
-        if typing.get_origin(option) in _MAPPINGS and isinstance(value, Mapping):
-            return {str(n): written(typing.get_args(option)[1], v) for n, v in value.items()}
-        if (inner := _item(option)) is not None and not isinstance(value, str | float):
-            return [written(inner, v) for v in value]
-    return plain(value)
+    adapter = TypeAdapter(_validated(kind))
+    made = adapter.validate_python(value)
+    return plain(adapter.dump_python(made, exclude_unset=True))
 
 
 def plain(value: Any) -> Any:
-    """Only what JSON has; a number that is not finite becomes None."""
+    """Only what JSON has, and records as they are; a number that is not finite becomes None."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
+    if isinstance(value, list | tuple | np.ndarray | map) and not hasattr(value, "_fields"):
         return [plain(v) for v in value]
     if isinstance(value, np.generic):
         value = value.item()
@@ -622,34 +673,19 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def checked(kind: Any, value: Any, place: str = "") -> None:
-    """Refuse plain data that is of another kind than the table says.
-
-    Keys may be missing, or be none of the table: another version has others.
+def checked(data: bytes) -> dict[str, Any]:
+    """The content of a fit.json; keys may be missing, or be none of the table.
 
     Raises:
-        ValueError: naming the place, what was expected and what was found.
+        ValueError: it is no JSON object, or a value is of another kind than the table says.
     """
-    if value is None:
-        return
-    for option in _options(kind):
-        if _is_section(option) and isinstance(value, Mapping):
-            fields = _fields(option)
-            for n in value.keys() & fields.keys():
-                checked(fields[n][0], value[n], f"{place}.{n}")
-            return
-        if typing.get_origin(option) in _MAPPINGS and isinstance(value, Mapping):
-            for n, v in value.items():
-                checked(typing.get_args(option)[1], v, f"{place}.{n}")
-            return
-        if (inner := _item(option)) is not None and isinstance(value, list):
-            for v in value:
-                checked(inner, v, f"{place}[]")
-            return
-        accepted = {float: float | int, bool: bool, int: int, str: str}.get(option, ())
-        if isinstance(value, accepted) or typing.get_origin(option) is Literal:
-            return
-    raise ValueError(f"{place.lstrip('.')}: expected {_kind(kind)}, got {str(value)[:40]}")
+    try:
+        model_of(FitFile).model_validate_json(data, strict=True)
+    except ValidationError as e:
+        first = e.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{place}: {first['msg']}, got {str(first['input'])[:40]}") from None
+    return json.loads(data)
 
 
 class Key(NamedTuple):

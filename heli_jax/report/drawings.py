@@ -3,90 +3,64 @@ for who does not see it."""
 
 import functools
 import re
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming, units
+from heli_jax import units
 from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
-from heli_jax.identification.problem import Problem
-from heli_jax.numbers import measured, number, percent, vaf_percent
+from heli_jax.identification.result import Signals
+from heli_jax.identification.validation.metrics import metrics
+from heli_jax.numbers import measured, percent, vaf_percent
 from heli_jax.report import figures
 from heli_jax.report.charts import Logged
 from heli_jax.report.figures.estimates import MOST, share_within
 from heli_jax.report.files import Analysis as Analysis
-from heli_jax.report.frequency import FittedFlight
-from heli_jax.report.page import Kind, Picture
-from heli_jax.report.style import Panels
-
-type Draw = Callable[[], Panels]
-"""draws a figure; () where there is nothing to draw"""
+from heli_jax.report.fitted_responses import FittedPair
+from heli_jax.report.page import Draw, Picture
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
 _MOST = 6
-"""correlations that are told one by one"""
-
-
-class Group(NamedTuple):
-    """Figures whose names begin alike."""
-
-    caption: str
-    """what a figure shows, after its title"""
-    kind: Kind = "image"
-    """those over time and over frequency the page draws itself, to be zoomed"""
+"""pairs that are told one by one"""
 
 
 # No group may begin another's name.
 GROUPS = {
-    "response": Group(
-        "From above, over time: measured and simulated, what is left between them, inputs.",
-        "live",
-    ),
-    "residual": Group(
-        "From above, by lag: its correlation with itself, then with each input; of white noise "
-        "99 % of the lags lie within the band.",
-        "panels",
-    ),
-    "bode": Group(
-        "Magnitude and phase of the fitted model,{rls} and of the record where its coherence "
-        "allows.",
-        "live",
-    ),
-    "match": Group(
-        "From above: gain and phase of model and data with 95 % intervals, partial coherence of "
-        "the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
-        "did not notice (Wood and Hodgkinson, 1980).",
-        "live",
-    ),
-    "held": Group(
-        "The same of all flights held out together: gain and phase of model and data with 95 % "
-        "intervals, partial coherence of the data, and data over model.",
-        "live",
-    ),
-    "correlation": Group("Near +1 or -1 the data hardly tell two parameters apart."),
-    "starts": Group("The misfit that each start of the optimiser reached, best first."),
-    "rls": Group("Each coefficient while the record goes by: one to be trusted settles.", "live"),
-    "intervals": Group("Of each parameter, by every method; the dotted line is the estimate."),
-    "trace": Group(
-        "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift."
-    ),
-    "pairs": Group(
-        "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its intervals' "
-        "sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do intervals "
-        "and correlations."
-    ),
+    "response": "From above, over time: measured and simulated, what is left between them, inputs.",
+    "residual": "From above, by lag: its correlation with itself, then with each input; of white "
+    "noise 99 % of the lags lie within the band.",
+    "match": "From above: gain and phase of model and data with 95 % intervals, and of the "
+    "recursive least squares without their hold; partial coherence of the data; data over model. "
+    "Grey: envelopes of what pilots of full-size aeroplanes did not notice (Wood and Hodgkinson, "
+    "1980).",
+    "held": "The same of all flights held out together: gain and phase of model and data with 95 % "
+    "intervals, partial coherence of the data, and data over model.",
+    "starts": "The misfit that each start of the optimiser reached, best first.",
+    "rls": "Each coefficient while the record goes by: one to be trusted settles.",
+    "trace": "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift.",
+    "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
+    "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
+    "intervals and correlations.",
 }
+"""what a figure shows, after its title, by what its name begins with"""
 
 
-def group_of(name: str) -> Group:
-    """The group of a figure by its file name."""
-    [group] = [group for begins, group in GROUPS.items() if name.startswith(begins)]
-    return group
+def worst_output(fit: Fit) -> tuple[Signals, str] | None:
+    """The fitted flight and output that the simulation explains least; None where none moves."""
+    shares = {
+        (i, output): metrics(measured, s.simulated[output]).vaf
+        for i, s in enumerate(fit.signals)
+        if not s.hold_out
+        for output, measured in s.measured.items()
+    }
+    known = {place: vaf for place, vaf in shares.items() if np.isfinite(vaf)} or shares
+    if not known:
+        return None
+    i, output = min(known, key=lambda place: known[place])
+    return fit.signals[i], output
 
 
 def drawings(analysis: Analysis) -> dict[str, Draw]:
@@ -96,7 +70,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, dict[str, Draw]()
     if (comparison := supplementary.intervals) is not None:
-        drawings["intervals"] = later(figures.intervals, comparison, fit)
         if comparison.posterior is not None:
             drawings["trace"] = later(figures.trace, comparison.posterior, fit)
             drawings["pairs_posterior"] = later(figures.posterior_pairs, comparison.posterior, fit)
@@ -116,8 +89,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                     together=len(fit.whiteness),
                     test=fit.whiteness.get(f"{s.flight}/{output}"),
                 )
-    if fit.signals[0].inputs:
-        drawings["bode"] = _bode(fit, problem, baseline)
     if (responses := supplementary.responses) is not None:
         about = (
             f"model linearised about {responses.about}" if responses.about else "continuous model"
@@ -130,9 +101,8 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
             for pair in pairs:
                 unit = figures.bode_unit(model, pair.output, pair.input)
                 name = f"{group}_{pair.output}-{pair.input}"
-                drawings[name] = later(figures.match, pair, unit, note)
-    if len(fit.verdict.names) > 1:
-        drawings["correlation"] = later(figures.correlation_matrix, fit.verdict)
+                rls = baseline if group == "match" and _of(baseline, pair) else None
+                drawings[name] = later(figures.match, pair, unit, note, rls)
     drawings["starts"] = later(figures.waterfall, fit.starts)
     if baseline is not None:
         # Time in the log of its flight's first sample [s].
@@ -162,16 +132,8 @@ def _parts(flights: list[str]) -> list[str]:
     ]
 
 
-def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
-    """The frequency response of the flight that the baseline saw, with what is known of it."""
-    # The first flight where there is no baseline.
-    i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
-    # What the flight states of the vehicle goes before the estimates, as in the fit.
-    # Signals hold the fitted flights first, in the order of `training`; those held out follow.
-    known = problem.training[i].known if i < len(problem.training) else {}
-    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
-    return functools.partial(figures.bode, flight, baseline)
+def _of(baseline: Baseline | None, pair: FittedPair) -> bool:
+    return baseline is not None and (baseline.input, baseline.output) == (pair.input, pair.output)
 
 
 def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
@@ -226,19 +188,15 @@ def from_si(signal: Signal) -> float:
         return 1.0
 
 
-def caption(picture: Picture, *, rls: bool) -> str:
-    """What a figure shows, and the name of its files; `rls`: whether there are least squares."""
-    words = group_of(picture.name).caption
-    words = words.replace("{rls}", " of the recursive least squares," if rls else "")
+def caption(picture: Picture) -> str:
+    """What a figure shows, and the name of its files."""
+    [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
 def alt_text(picture: Picture, analysis: Analysis) -> str:
     """What a figure of the report shows, for who does not see it."""
     fit, intervals = analysis.fit, analysis.supplementary.intervals
-    # Costs, intervals and chains are numbers of the tables beside.
-    if picture.name == "correlation":
-        return f"{picture.title}. {_correlations(fit)}."
     if picture.name == "pairs_posterior" and intervals and intervals.posterior:
         return f"{picture.title}. {_pairs(intervals.posterior.draws, fit)}."
     if picture.name == "pairs_bootstrap" and intervals and intervals.bootstrap:
@@ -263,12 +221,3 @@ def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
     count = next(iter(samples.values())).size
     within = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
     return f"{count} samples, mean and sd: {'; '.join(each)}{within}"
-
-
-def _correlations(fit: Fit) -> str:
-    names, correlation = fit.verdict.names, fit.verdict.correlation
-    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
-    known = [(i, j) for i, j in pairs if np.isfinite(correlation[i, j])]
-    largest = sorted(known, key=lambda p: -abs(correlation[p]))[:_MOST]
-    words = (f"{names[j]} and {names[i]} {number(float(correlation[i, j]), 3)}" for i, j in largest)
-    return f"Largest: {', '.join(words)}"

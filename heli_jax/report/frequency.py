@@ -1,4 +1,4 @@
-"""Frequency responses of a fit, of its baseline and of the record itself, and the coherence of a
+"""Frequency responses of the baseline and of the record itself, and the coherence of a
 record: of each input with the others taken out, and where the model lets expect it.
 
 A record shows coherence between an input and an output only where the one moves the other. Which
@@ -6,7 +6,7 @@ do, and in which band, the model says: of an output that an input hardly moves n
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +20,6 @@ from heli_jax.analysis.operating_point import (
     operating_point,
 )
 from heli_jax.analysis.spectra import (
-    Spectra,
-    is_own,
     partial_coherence,
     segment_transforms,
     size_of,
@@ -32,8 +30,6 @@ from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
 from heli_jax.simulation.simulate import substeps_for
-
-type Response = Callable[[np.ndarray], np.ndarray]
 
 # Parameters of a model are a class of the user's own: they are annotated Any.
 
@@ -53,20 +49,6 @@ _MEMORIES = 16
 """in a record at least, so that segments of one are enough for an average"""
 
 
-class Empirical(NamedTuple):
-    """Output over input as the record shows it; arrays (k,)."""
-
-    omega: np.ndarray
-    """rad/s"""
-    H: np.ndarray
-    coherence: np.ndarray
-    power: np.ndarray
-    """spectral density of the input"""
-    segments: int
-    lowest: float = 0.0
-    """rad/s that omega begins at where a mode is too slow for the segments, else 0"""
-
-
 class FittedFlight(NamedTuple):
     """A model at one of the flights that it was fitted to."""
 
@@ -76,11 +58,6 @@ class FittedFlight(NamedTuple):
     fit: Fit
     """what knows the gains and the time shift of the inputs"""
     signals: Signals
-
-
-def log_grid(low: float, high: float, n: int = 900) -> np.ndarray:
-    """Frequencies (n,) [rad/s], equally spaced in the logarithm."""
-    return np.geomspace(low, high, n)
 
 
 def sample_time(signals: Signals) -> float:
@@ -112,37 +89,6 @@ def at_record(flight: FittedFlight) -> OperatingPoint:
         dt,
         substeps=substeps_for(dt, flight.model.fastest),
     )
-
-
-def responses(
-    model: Model,
-    params: Any,
-    output: str,
-    input: str,
-    dt: float,
-    at: OperatingPoint = EVERYWHERE,
-) -> tuple[Response, Response]:
-    """H(i omega) and Hd(e^{i omega dt}) of the model linearised about a point, as functions.
-
-    The second holds the input over each sample: this, and not the first, is what a sampled record
-    can show.
-    """
-    # One linearisation serves both, and NumPy evaluates them: a figure is no reason to compile.
-    matrices = linear_matrices(model, params, at)
-    i = naming.names(model.Outputs).index(output)
-    j = naming.names(model.Inputs).index(input)
-    delay = dict(model.delays).get(input)
-    late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
-
-    # With the phase that the input's delay takes.
-    def continuous(omega: np.ndarray) -> np.ndarray:
-        A, B, C, D = matrices
-        return _transfer(1j * omega, A, B[:, j], C[i], D[i, j]) * np.exp(-1j * omega * late)
-
-    def sampled(omega: np.ndarray) -> np.ndarray:
-        return held(matrices, i, j, dt, omega) * np.exp(-1j * omega * late)
-
-    return continuous, sampled
 
 
 def linear_matrices(model: Model, params: Any, at: OperatingPoint) -> list[np.ndarray]:
@@ -201,13 +147,14 @@ def memory(
 
 
 def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
-    """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
+    """Hd(e^{i omega dt}) (k,) of the recursive least squares, without the hold of its input."""
     # On the unit circle, as it was identified: its continuous form is an approximation where no
     # inverse of the hold exists.
-    z = np.exp(1j * omega * baseline.dt)
+    turns = omega * baseline.dt
+    z, hold = np.exp(1j * turns), np.sinc(turns / (2.0 * np.pi)) * np.exp(-0.5j * turns)
     # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):
-        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z)
+        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z) / hold
 
 
 def _needed(dt: float, memory: float) -> int:
@@ -253,36 +200,6 @@ def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -
 
 def _count(samples: int, length: int) -> int:
     return 1 + (samples - length) // (length // 2)
-
-
-def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
-    """Welch's cross-spectrum over the input's spectrum, or why the record does not allow it.
-
-    Args:
-        u: the input (N,).
-        y: the output (N,).
-        dt: sample time [s].
-        memory: how long the machine remembers its input [s].
-    """
-    if not np.ptp(u) > 0:
-        return "the input does not move"
-    if np.isnan(y).any():
-        return "samples are missing"
-    # A segment shorter than the memory answers to what the stick did before it began: the average
-    # is then biased at its lowest frequencies, however many segments there are.
-    segments = segments_of(u.size, dt, memory)
-    if isinstance(segments, str):
-        return segments
-    of_both = segment_transforms(np.stack([u, y]), dt, segments.length)
-    omega, S = of_both.omega, of_both.density
-    Suu, Syy, Suy = np.real(S[:, 0, 0]), np.real(S[:, 1, 1]), S[:, 0, 1]
-    # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
-    # are coherent as well; and of zero frequency the segments' straight lines left nothing.
-    own = is_own(Suu) & is_own(Syy)
-    useful = (omega > 0) & (omega >= _BELOW * segments.lowest) & own & (Suu > 0) & (Syy > 0)
-    omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
-    coherence = np.abs(Suy) ** 2 / (Suu * Syy)
-    return Empirical(omega, Suy / Suu, coherence, Suu, segments.count, segments.lowest)
 
 
 def phase(H: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from heli_jax.report import statements, tables
+from heli_jax.report import figures, statements, tables
 from heli_jax.report.card import card, summary
 from heli_jax.report.charts import Numbers
 from heli_jax.report.drawings import (
@@ -13,9 +13,9 @@ from heli_jax.report.drawings import (
     alt_text,
     caption,
     drawings,
-    group_of,
     logged_outputs,
     logged_units,
+    worst_output,
 )
 from heli_jax.report.origin import Origin
 from heli_jax.report.page import Picture, filled, picture
@@ -50,18 +50,11 @@ def write_report(
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    numbers, shown, logged = Numbers(), [], logged_units(analysis)
+    numbers, shown, logged = Numbers(), list[Picture](), logged_units(analysis)
     # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
-        made = picture(
-            name,
-            draw,
-            numbers,
-            folder=folder,
-            logged=logged.get(name),
-            kind=group_of(name).kind,
-            png=png,
-        )
+        units = logged.get(name)
+        made = picture(name, draw, numbers, folder=folder, logged=units, png=png)
         if made is not None:
             shown.append(made._replace(alt=alt_text(made, analysis)))
     page = render(analysis, title, vehicle_constants, shown, numbers, origin)
@@ -78,28 +71,33 @@ def render(
     origin: Origin | None = None,
 ) -> str:
     """The page as text."""
-    rls = analysis.baseline is not None
+    fit, problem = analysis.fit, analysis.problem
+    numbers, first = numbers or Numbers(), None
+    if (worst := worst_output(fit)) is not None:
+        chart = figures.overview(*worst, problem.model)
+        first = picture("overview", lambda: chart, numbers)
     return filled(
         "report.html.j2",
         title=title,
-        fit=analysis.fit,
-        problem=analysis.problem,
+        fit=fit,
+        problem=problem,
         baseline=analysis.baseline,
         more=analysis.supplementary,
         # Once: it takes spectra of every pair of signals.
-        card=card(analysis.problem, analysis.fit),
+        card=card(problem, fit),
         summary=summary,
         # The template asks these modules for its words and rows.
         statements=statements,
         tables=tables,
         logged=logged_outputs(analysis),
-        constants=tables.constants(analysis.problem, vehicle_constants),
+        constants=tables.constants(problem, vehicle_constants),
         versions=versions(),
         origin=origin,
-        unshown=max(0, len(analysis.fit.signals) - MOST_FLIGHTS),
+        unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
+        overview=first,
         pictures={
-            group: [(p, caption(p, rls=rls)) for p in pictures if p.name.startswith(group)]
+            group: [(p, caption(p)) for p in pictures if p.name.startswith(group)]
             for group in GROUPS
         },
-        numbers=(numbers or Numbers()).content(),
+        numbers=numbers.content(),
     )

@@ -1,25 +1,27 @@
 """Pages from the templates beside this file; whatever text is put into one is escaped.
 
-A figure is there as an image that every browser shows, as words for who does not see it, and as
-numbers for the page's own drawing.
+A figure of lines is there as numbers, which the page draws, and as words for who does not see it.
 """
 
+import contextlib
 import functools
 import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jinja2
 import markupsafe
 
 from heli_jax.numbers import page_sentence
 from heli_jax.report import style
-from heli_jax.report.charts import Logged, Numbers, as_base64, chart_of, described
+from heli_jax.report.charts import Chart, Logged, Numbers, as_base64, described
 
 if TYPE_CHECKING:
-    from heli_jax.report.style import Panels
+    from matplotlib.figure import Figure
 
+type Draw = "Callable[[], Chart | Figure | None]"
+"""draws a figure; None where there is nothing to draw"""
 
 _FOLDER = Path(__file__).parent
 _SCRIPTS = ("uplot/uPlot.iife.min.js", "charts.js", "flight.js", "tables.js")
@@ -59,22 +61,21 @@ def _policy() -> str:
     return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {hashes}"
 
 
-type Kind = Literal["live", "panels", "image"]
-
-
 class Picture(NamedTuple):
-    """A figure of a page."""
+    """A figure of a page: a chart that the page draws, or an image of a file."""
 
     name: str
     title: str
-    image: str
-    """a data: address"""
-    size: tuple[int, int]
-    """width and height [pixel]"""
     alt: str
     """what the figure shows, in words and numbers"""
     chart: int | None = None
-    """its number among the page's charts; None where the image is all"""
+    """its number among the page's charts; None of an image"""
+    image: str = ""
+    """a data: address; empty of a chart, and of what is a file alone"""
+    size: tuple[int, int] = (0, 0)
+    """of the image, width and height [pixel]"""
+    file: str = ""
+    """beside the page"""
 
 
 def of_file(png: Path, title: str, alt: str) -> Picture:
@@ -83,44 +84,37 @@ def of_file(png: Path, title: str, alt: str) -> Picture:
 
     with Image.open(png) as image:
         size = image.size
-    return Picture(png.stem, title, _address("png", png.read_bytes()), size, alt)
+    return Picture(png.stem, title, alt, None, _address("png", png.read_bytes()), size)
 
 
 def picture(
     name: str,
-    draw: Callable[[], "Panels"],
+    draw: Draw,
     numbers: Numbers,
     *,
     folder: Path | None = None,
     logged: Mapping[str, Logged] | None = None,
-    kind: Kind = "live",
     png: bool = False,
 ) -> Picture | None:
     """Draw a figure for a page; None where there is nothing to draw.
 
     Args:
         folder: for NAME.svg, and NAME.png where that is asked for; no files unless given.
-        kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
-            `panels` words are made alone; of an `image` the title is all.
     """
-    with style.in_style():
-        drawn = style.figure_of(draw())
-        if drawn is None:
-            return None
-        # Saving thins the lines: the chart is taken from them before.
-        chart = None if kind == "image" else chart_of(drawn)
-        svg = style.as_svg(drawn)
-        if folder is not None:
-            (folder / f"{name}.svg").write_bytes(svg)
-            if png:
-                (folder / f"{name}.png").write_bytes(style.as_png(drawn))
-    title = drawn.axes[0].get_title("left")
-    width, height = (round(96 * v) for v in drawn.get_size_inches())
-    words = title if chart is None else described(chart)
-    number = None
-    if chart is not None and kind == "live":
-        number = numbers.add_chart(chart, dict(logged or {}))
-    return Picture(name, title, _address("svg+xml", svg), (width, height), words, number)
+    # Charts alone need no Matplotlib, which takes a second to load.
+    with style.in_style() if folder else contextlib.nullcontext():
+        made = draw()
+        svg = style.save(lambda: made, folder / name, png=png) if folder else None
+    if made is None:
+        return None
+    file = f"{folder.name}/{name}.svg" if folder else ""
+    if isinstance(made, Chart):
+        number = numbers.add_chart(made, dict(logged or {}))
+        return Picture(name, made.title, described(made), number, file=file)
+    title, size = made.axes[0].get_title("left"), made.get_size_inches()
+    width, height = (round(96 * v) for v in size)
+    image = _address("svg+xml", svg) if svg else ""
+    return Picture(name, title, title, None, image, (width, height), file)
 
 
 def _address(kind: str, data: bytes) -> str:

@@ -17,13 +17,12 @@ from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
-from heli_jax.report.charts import Numbers
+from heli_jax.report.charts import Chart, Numbers
 from heli_jax.report.document import handling_content
 from heli_jax.report.figures.bode import branch_of, draw_response, seen_of
 from heli_jax.report.files import as_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled, picture
-from heli_jax.report.style import Panels
 from heli_jax.report.tables import Table
 
 _FILES = (
@@ -109,7 +108,7 @@ def _averages(responses: FlightResponses, request: Wanted) -> str:
     return NOTHING if output is None else number(output.averages, 3)
 
 
-def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Panels:
+def _draw(responses: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Chart:
     measured = responses.outputs[output]
     curves = [
         (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(responses.omega, responses.holds[input]))

@@ -1,7 +1,6 @@
 """A fit read back from its run directory: plain data, no model and no log."""
 
 import csv
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.numbers import adequacy_of
 from heli_jax.regular_file import read_regular
-from heli_jax.report.document import FitFile, checked
+from heli_jax.report.document import checked
 from heli_jax.summaries import Summary, as_html, as_text, of_estimates
 
 if TYPE_CHECKING:
@@ -103,9 +102,9 @@ def load_fit(directory: str | Path) -> SavedFit:
         raise InputError(
             f"{directory}: expected the run directory of a fit (heli-jax fit --out DIR), got {got}"
         )
-    content = _content(directory / "fit.json")
+    data = read_regular(directory / "fit.json", "the fit.json of a run directory", _LIMIT_BYTES)
     try:
-        checked(FitFile, content)
+        content = checked(data)
         # Fixed ones are listed for who looks for them; they are no estimates.
         estimates = _estimates(
             {n: e for n, e in content["parameters"].items() if not e.get("fixed", False)}
@@ -135,22 +134,19 @@ def load_fit(directory: str | Path) -> SavedFit:
     except InputError:
         raise
     # A key is missing or holds another kind, a row is cut off, a cell is no number.
-    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, csv.Error) as e:
+    except (
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+        csv.Error,
+    ) as e:
         raise InputError(
             f"{directory}: expected fit.json and signals.csv as heli-jax fit writes them, got "
             f"other content ({type(e).__name__}: {e})"
         ) from e
-
-
-def _content(path: Path) -> dict[str, Any]:
-    data = read_regular(path, "the fit.json of a run directory", _LIMIT_BYTES)
-    try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as e:  # no JSON, or no text
-        raise InputError(f"{path}: expected JSON, got {str(e)[:80]}") from e
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected a JSON object, got a {type(content).__name__}")
-    return content
 
 
 # By name and these fields alone: a file may have keys that a later version added.

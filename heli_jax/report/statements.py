@@ -1,5 +1,6 @@
-"""The verdict in one line, what a reader has to know before the numbers, and what it means."""
+"""The three statements at the head of the page, and what they mean."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,27 +15,48 @@ from heli_jax.identification.validation.adequacy import (
     FAR_FROM_WHITE,
     NEARLY_WHITE,
 )
-from heli_jax.numbers import percent
+from heli_jax.numbers import percent, vaf_percent
 from heli_jax.vehicle import of_helicopter
 
 
-class Headline(NamedTuple):
-    """The verdict in one line."""
+class Line(NamedTuple):
+    """One of the three statements at the head of the page."""
 
     level: str
-    """good, warning or bad"""
+    """good, warning, bad or none"""
     word: str
     text: str
+    """one sentence"""
 
 
-def headline(fit: Fit) -> Headline:
-    """Did the optimiser converge; what do the data determine; is the model adequate.
-
-    The light is that of the exit code.
-    """
-    code = fit.exit_code
-    level = "good" if code == 0 else "bad" if code == 4 or fit.not_identifiable else "warning"
-    return Headline(level, *fit.outcome)
+def lines(fit: Fit) -> tuple[Line, Line, Line]:
+    """Did the optimiser converge; what do the data determine; is the model adequate."""
+    if fit.status == "not-converged":
+        stopped = "The optimiser stopped before an optimum, and these numbers are no result."
+        return (
+            Line("bad", "Not converged", stopped),
+            Line("none", "Identifiability not judged", "The data determine numbers at an optimum."),
+            Line("none", "Adequacy not judged", "A model is judged at an optimum."),
+        )
+    best, runs = sum(row.optimum == 1 for row in fit.starts), len(fit.starts)
+    reached = f"The optimiser reached an optimum in {fit.steps} steps."
+    if runs > 1:
+        reached = f"{best} of {runs} runs of the optimiser reached this optimum."
+    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
+    determined = Line("good", "Identifiable", text)
+    if fit.status == "not-identifiable" or fit.not_identifiable:
+        determined = Line("bad", "Not identifiable", text)
+    elif fit.untrusted:
+        determined = Line("warning", "Identifiable, not trusted", text)
+    adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
+    if fit.adequate:
+        shares = {n: m.vaf for n, m in fit.metrics.items() if math.isfinite(m.vaf)}
+        told = "Nothing in the record speaks against the model."
+        if shares:
+            worst = min(shares, key=lambda n: shares[n])
+            told = f"{told[:-1]}; simulated, VAF of {worst} {vaf_percent(shares[worst])}."
+        adequate = Line("good", "Adequate", told)
+    return Line("good", "Converged", reached), determined, adequate
 
 
 def whiteness_note(fit: Fit) -> str:

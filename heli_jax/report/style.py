@@ -1,23 +1,21 @@
-"""How figures look: colours, one set of rcParams, thinning of long lines, saving."""
+"""Figures as files: colours, one set of rcParams, how Matplotlib draws a chart, saving."""
 
 import io
-import itertools
 import re
 import warnings
-import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+
+from heli_jax.report.charts import Chart, Panel, thinned
 
 # Imported where it draws: `info` and `--help` need none of it, and would wait half a second for it.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 # Okabe and Ito's palette: told apart with every common kind of colour blindness, and in grey.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -66,23 +64,16 @@ STYLE: dict[Any, Any] = {
     "path.simplify_threshold": 0.2,
 }
 
-type Panels = tuple[Axes, ...]
-
 WIDTH = 7.4
 """width of a figure [inch]"""
-TOP = 0.5
-"""margin above the first panel [inch]: a title and a row below it"""
 ROW = 15.0 / 72.0
-"""height of a row between title and axes [inch]: a subtitle or a legend"""
-BOTTOM = 0.48
-"""margin below the last panel [inch]"""
-MOST_POINTS = 800
-"""points of a drawn line at most: the lowest and the highest of every 1.5 pixels of a page"""
-_POINTS = 72.0
-"""in an inch"""
+"""height of a row above the axes [inch]: title, note, legend"""
+_BOTTOM, _GAP = 0.48, 0.22
+"""below the last panel, and between two of them [inch]"""
+_LEFT, _RIGHT = 0.82, 0.2
+_POINTS, _CORNERS = 800, 4000
+"""of a drawn line at most (lowest and highest of every 1.5 pixels), and of all lines of a figure"""
 _DPI = 110
-_CORNERS = 4000
-"""of the long lines of a figure together"""
 # A hundredth of a point is enough, and half as long as a millionth.
 _PLACES, _FURTHER = re.compile(rb' (?:d|x|y)="[^"]+"'), re.compile(rb"(?<=\.\d\d)\d+| \n")
 _NOT_XML = bytes(set(range(32)) - {9, 10, 13})
@@ -101,119 +92,86 @@ def figure(height: float, width: float = WIDTH, *, constrained: bool = False) ->
     return drawing
 
 
-def panels(
-    height: float,
-    ratios: Sequence[float],
-    *,
-    sharex: bool = True,
-    right: float = 0.2,
-    top: float = TOP,
-) -> Panels:
-    """Panels below each other in a new figure, their labels in line.
-
-    Args:
-        height: of the figure [inch].
-        right: margin [inch].
-    """
+def figure_of(chart: Chart) -> "Figure":
+    """A chart as Matplotlib draws it for a file; within `in_style`."""
     from matplotlib.transforms import ScaledTranslation
 
-    n, drawing = len(ratios), figure(height)
-    axes = drawing.subplots(n, 1, sharex=sharex, squeeze=False, height_ratios=ratios)[:, 0]
-    # Margins are fixed, for a layout engine draws every tick twice more and takes half the report's
-    # time. Panels with an x axis each need room for its tick labels. Matplotlib takes margins as
-    # parts of the figure, and gaps as parts of a panel's height.
-    gap = 0.22 if sharex else 0.36
-    each = (height - top - BOTTOM - gap * (n - 1)) / n
+    panels, n = chart.panels, len(chart.panels)
+    named = [tuple(s.label for s in p.series if s.label) for p in panels]
+    # Panels that show the same by the same names share the legend of the first.
+    legends = [len(names) > 1 and (k == 0 or names != named[0]) for k, names in enumerate(named)]
+    heads = [1 + bool(chart.note) + legends[0], *legends[1:]]
+    gap = _GAP + ROW * any(legends[1:])
+    top = ROW * heads[0] + 0.08
+    height = top + sum(p.height for p in panels) + gap * (n - 1) + _BOTTOM
+    drawing = figure(height)
+    ratios = [p.height for p in panels]
+    axes = drawing.subplots(n, 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
+    # Margins are fixed: a layout engine draws every tick twice more and takes half the report's
+    # time. Matplotlib takes margins as parts of the figure, and gaps as parts of a mean panel.
     drawing.subplots_adjust(
-        left=0.82 / WIDTH,
-        right=1.0 - right / WIDTH,
+        left=_LEFT / WIDTH,
+        right=1.0 - _RIGHT / WIDTH,
         top=1.0 - top / height,
-        bottom=BOTTOM / height,
-        hspace=gap / each,
+        bottom=_BOTTOM / height,
+        hspace=gap * n / sum(ratios),
     )
-    # As far away in every figure: `align_ylabels` measures the tick labels of every panel at each
-    # drawing, and figures of the same kind would differ with their numbers' widths.
-    for ax in axes:
+    lines = sum(2 if s.kind == "step" else 1 for p in panels for s in p.series)
+    most = max(4, min(_POINTS, _CORNERS // max(lines, 1)))
+    for ax, p, legend in zip(axes, panels, legends, strict=True):
+        # As far away in every figure, whatever the tick labels' widths.
         at = ax.transAxes + ScaledTranslation(-0.57, 0.0, drawing.dpi_scale_trans)
         ax.yaxis.set_label_coords(0.0, 0.5, transform=at)
-    return tuple(axes)
+        _draw(ax, p, most)
+        if legend:
+            place = {"loc": "lower right", "bbox_to_anchor": (1.005, 1.0), "ncols": 6}
+            ax.legend(borderaxespad=0.2, handlelength=1.6, columnspacing=1.2, **place)
+    first, above = axes[0], 72.0 * ROW * legends[0]
+    first.set_title(chart.title, loc="left", pad=6 + above + 13 * bool(chart.note))
+    if chart.note:
+        subtitle(first, chart.note, above=above)
+    if chart.logarithmic:
+        first.set_xscale("log")
+    first.set_xlim(*chart.x_limits)
+    if chart.logarithmic:
+        plain_log_ticks(first)
+    axes[-1].set_xlabel(chart.x_label)
+    return drawing
 
 
-def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most `most` points of a line: the lowest and the highest of each bin.
+def _draw(ax: "Axes", p: Panel, most: int) -> None:
+    from matplotlib.ticker import MaxNLocator
 
-    No peak is lost, and the first and the last point stay.
-
-    Args:
-        x: (N,), ascending.
-        y: (N,)
-        most: points to keep, 4 at least.
-    """
-    # Not every k-th sample: that aliases an oscillation and misses spikes.
-    n = y.size
-    if n <= most:
-        return x, y
-    bins = (most - 2) // 2  # two points each, and the two ends
-    edges = np.linspace(0, n, bins + 1).astype(int)
-    # A missing sample is neither the lowest nor the highest.
-    down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
-    low = [a + int(np.argmin(down[a:b])) for a, b in itertools.pairwise(edges)]
-    high = [a + int(np.argmax(up[a:b])) for a, b in itertools.pairwise(edges)]
-    keep = np.unique(np.concatenate([[0, n - 1], low, high]))
-    return x[keep], y[keep]
-
-
-_LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()
-"""lines that may be thinned: their x ascends"""
-
-
-def thin(drawn: "Figure") -> None:
-    """Thin the long lines of a figure to what can be seen of them."""
-    # Not when they are drawn: the page's own drawing of a figure, which is zoomed, has all points.
-    lines = [v for ax in drawn.axes for v in ax.get_lines() if v in _LONG]
-    corners = [1 if v.get_drawstyle() == "default" else 2 for v in lines]
-    # Noise in many panels has no short outline: its lines share what a figure may have.
-    most = min(MOST_POINTS, _CORNERS // max(sum(corners), 1))
-    for v in lines:
-        v.set_data(*thinned(np.asarray(v.get_xdata()), np.asarray(v.get_ydata()), max(most, 4)))
-
-
-def line(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw a line of any length; it is thinned when the figure is saved."""
-    _LONG.update(ax.plot(np.asarray(x), np.asarray(y), **line_style))
-
-
-def samples(ax: "Axes", x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw what was measured, NaN where it is missing: a line, or where few samples have neighbours
-    a dot for each, of which a line would show nothing."""
-    x, y = np.asarray(x), np.asarray(y)
-    seen = ~np.isnan(y)
-    beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
-    if seen.any() and beside.mean() < 0.5:
-        line_style = {**line_style, "lw": 0.0, "ls": "none", "marker": "o", "ms": 2.2}
-        x, y = x[seen], y[seen]
-    line(ax, x, y, **line_style)
-
-
-def bars(
-    ax: "Axes",
-    x: np.ndarray,
-    y: np.ndarray,
-    reach: ArrayLike,
-    *,
-    color: str,
-    label: str | None = None,
-) -> None:
-    """Draw dots with error bars; `reach`: of the bars down and up, (2, N), or of both, (N,)."""
-    ax.plot(x, y, "o", ms=2.2, mew=0.0, color=color, label=label)
-    down, up = np.broadcast_to(np.asarray(reach, float), (2, y.size))
-    # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.
-    ends = np.stack([y - down, y + up, np.full(y.size, np.nan)], axis=1).ravel()
-    ax.plot(np.repeat(x, 3), ends, lw=0.6, color=color, label=BARS)
-
-
-BARS = "_bars"
-"""label of the bars of the dots that were drawn before them"""
+    for begin, end in p.shades:
+        ax.axvspan(begin, end, color=ORANGE, alpha=0.22, lw=0, zorder=0)
+    for s in p.series:
+        look: dict[str, Any] = {"color": s.color, "label": s.label or None}
+        if s.kind == "band" and s.low is not None and s.high is not None:
+            ax.fill_between(s.x, s.low, s.high, alpha=0.4, lw=0, **look)
+        elif s.kind == "bars" and s.low is not None and s.high is not None:
+            ax.plot(s.x, s.y, "o", ms=s.width, mew=0.0, **look)
+            # One path, broken by NaN: `errorbar` writes two elements into the SVG for each bar.
+            ends = np.stack([s.low, s.high, np.full(s.y.size, np.nan)], axis=1).ravel()
+            ax.plot(np.repeat(s.x, 3), ends, lw=0.6, color=s.color)
+        elif s.kind == "points":
+            ax.plot(s.x, s.y, "o", ms=s.width, mew=0.0, **look)
+        else:
+            steps = "steps-post" if s.kind == "step" else "default"
+            look |= {"lw": s.width, "ls": (0, (4, 2)) if s.dashed else "-", "drawstyle": steps}
+            ax.plot(*thinned(s.x, s.y, most), **look)
+    for y in p.levels:
+        ax.axhline(y, color="#444444", lw=0.7, ls="-" if y == 0.0 else ":")
+    for x in p.marks:
+        ax.axvline(x, color=GREY, lw=0.9, ls="-.")
+    ax.set_ylabel(p.label)
+    if p.logarithmic:
+        ax.set_yscale("log")
+    elif p.label.endswith("[deg]"):
+        # Steps of 15, 30, 45 and 90 degrees: a phase is read in parts of a right angle.
+        ax.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
+    ax.set_ylim(*p.limits)
+    if p.logarithmic:
+        plain_log_ticks(ax, "y")
 
 
 def pretty(unit: str | None) -> str:
@@ -228,23 +186,12 @@ def label(name: str, unit: str | None) -> str:
     return f"{name} [{pretty(unit)}]" if unit is not None else name
 
 
-def subtitle(ax: "Axes", text: str, *, raised: bool = False) -> None:
-    """A quiet line between the title and the axes."""
-    row = _POINTS * ROW if raised else 0.0
-    ax.set_title(ax.get_title("left"), loc="left", pad=19 + row)
-    ax.annotate(
-        text,
-        (0, 1),
-        xytext=(0, 6 + row),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=8,
-        color=GREY,
-    )
+def subtitle(ax: "Axes", text: str, *, above: float = 0.0) -> None:
+    """A quiet line between the title and the axes, `above` them [points]."""
+    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    ax.annotate(text, (0, 1), xytext=(0, 6 + above), fontsize=8, color=GREY, **place)
 
 
-_BESIDE = 42
-"""letters of a title that leave room for a legend at its right"""
 _NAME = 26
 """letters of a name in a title"""
 
@@ -253,29 +200,6 @@ def short(name: str) -> str:
     """A name from a log, which may have any length, as a title has it."""
     half = _NAME // 2
     return name if len(name) <= _NAME else f"{name[:half]}…{name[-half:]}"
-
-
-def legend_above(ax: "Axes", *, raised: bool = False) -> None:
-    """A legend on top of the axes at the right, where no data are; `raised` beside the title
-    where a subtitle lies between.
-
-    Beside a short title is room for two or three entries; more belong below a raised subtitle.
-    """
-    title = ax.get_title("left")
-    if not raised and len(title) > _BESIDE:
-        ax.set_title(title, loc="left", pad=19)
-    from matplotlib.transforms import ScaledTranslation
-
-    up = ScaledTranslation(0.0, ROW if raised else 0.0, ax.figure.dpi_scale_trans)
-    ax.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.005, 1.0),
-        bbox_transform=ax.transAxes + up,
-        ncols=5,
-        borderaxespad=0.2,
-        handlelength=1.6,
-        columnspacing=1.2,
-    )
 
 
 def plain_log_ticks(ax: "Axes", which: Literal["x", "y"] = "x") -> None:
@@ -300,24 +224,6 @@ def few_ticks(ax: "Axes", which: Literal["x", "y"], most: int, *, integer: bool 
     axis.set_major_locator(MaxNLocator(nbins=most, integer=integer))
 
 
-def phase_ticks(ax: "Axes") -> None:
-    """Steps of 15, 30, 45 and 90 degrees up the axis: a phase is read in parts of a right angle."""
-    from matplotlib.ticker import MaxNLocator
-
-    ax.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
-
-
-def figure_of(axes: Panels) -> "Figure | None":
-    """The figure of panels; None where there are none."""
-    return axes[0].figure if axes else None  # type: ignore[return-value]
-
-
-def styled(draw: Callable[[], Panels]) -> "Figure | None":
-    """Draw panels in the style; None where there is nothing to draw."""
-    with in_style():
-        return figure_of(draw())
-
-
 @contextmanager
 def in_style() -> Iterator[None]:
     """Matplotlib's settings for the style, as long as the context lasts."""
@@ -329,40 +235,34 @@ def in_style() -> Iterator[None]:
         yield
 
 
-def as_svg(drawn: "Figure") -> bytes:
-    """A figure that was drawn in the style, within it, as SVG."""
-    thin(drawn)
-    buffer = io.BytesIO()
-    # Without a date: the same fit gives the same file.
-    drawn.savefig(buffer, format="svg", metadata={"Date": None})
-    text = _PLACES.sub(lambda m: _FURTHER.sub(b"", m[0]), buffer.getvalue())
-    # What XML cannot hold, from a name of a log.
-    return text.translate(None, _NOT_XML)
+def styled(draw: Callable[[], "Chart | Figure | None"]) -> "Figure | None":
+    """Draw in the style; None where there is nothing to draw."""
+    with in_style():
+        made = draw()
+        return figure_of(made) if isinstance(made, Chart) else made
 
 
-def as_png(drawn: "Figure") -> bytes:
-    """A figure that was drawn in the style, within it, as PNG."""
-    thin(drawn)
-    buffer = io.BytesIO()
-    drawn.savefig(buffer, format="png", dpi=_DPI)
-    return buffer.getvalue()
-
-
-def save(draw: Callable[[], "Figure | None"], path: Path) -> tuple[str, bytes] | None:
-    """Draw a figure in the style and write `path`.svg and `path`.png.
-
-    Returns its first title and the SVG; None where there was nothing to draw.
-    """
+def save(
+    draw: Callable[[], "Chart | Figure | None"], path: Path, *, png: bool = True
+) -> bytes | None:
+    """Draw in the style and write `path`.svg and `path`.png; returns the SVG, or None where there
+    is nothing to draw."""
     # Saving reads the settings again (fonts, the SVG's salt): it belongs inside the context too.
     with in_style():
-        drawn = draw()
+        drawn = styled(draw)
         if drawn is None:
             return None
         if drawn.get_layout_engine() is not None:
             # Once, and not for each of the files.
             drawn.draw_without_rendering()
             drawn.set_layout_engine("none")
-        data = as_svg(drawn)
+        buffer = io.BytesIO()
+        # Without a date: the same fit gives the same file.
+        drawn.savefig(buffer, format="svg", metadata={"Date": None})
+        text = _PLACES.sub(lambda m: _FURTHER.sub(b"", m[0]), buffer.getvalue())
+        # What XML cannot hold, from a name of a log.
+        data = text.translate(None, _NOT_XML)
         path.with_suffix(".svg").write_bytes(data)
-        path.with_suffix(".png").write_bytes(as_png(drawn))
-    return drawn.axes[0].get_title("left"), data
+        if png:
+            drawn.savefig(path.with_suffix(".png"), format="png", dpi=_DPI)
+    return data

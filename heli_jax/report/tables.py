@@ -58,6 +58,81 @@ def pairs(content: Mapping[str, object], unit: str = "") -> Table:
     )
 
 
+class Bar(NamedTuple):
+    """An estimate with its 95 % interval as a bar; places in percent of the bar's width."""
+
+    name: str
+    value: str
+    unit: str
+    low: float | None
+    """None where there is no interval"""
+    high: float | None
+    words: str
+    """the interval as text"""
+
+
+class Bars(NamedTuple):
+    """The estimates on one axis: their relative deviation from the estimate."""
+
+    rows: tuple[Bar, ...]
+    reach: str
+    """of the axis to either side"""
+
+
+def bars(fit: Fit) -> Bars:
+    """The free parameters, each with its interval in parts of its estimate."""
+    stopped, rows = fit.status == "not-converged", []
+    for name, e in fit.estimates.items():
+        cells = (where_it_stopped(e), "", "", "") if stopped else _cells(e)
+        known = not stopped and e.sd is not None and e.lower95 is not None
+        ends = (e.lower95, e.upper95) if known else None
+        interval = "" if cells[3] == NOTHING else cells[3]
+        rows.append((Bar(name, cells[0], pretty(e.unit), None, None, interval), ends, e.value))
+    return _on_one_axis(rows)
+
+
+def interval_bars(comparison: Intervals, fit: Fit) -> Bars:
+    """The intervals by every method, as `bars`; a row for each parameter and method."""
+    rows = []
+    for name, by_method in comparison.by_parameter.items():
+        e = fit.estimates[name]
+        for method, ends in by_method.items():
+            low, high, _ = measured(e.sd, *ends)
+            words = f"{low} to {high}"
+            rows.append((Bar(name, _METHODS[method], "", None, None, words), ends, e.value))
+    return _on_one_axis(rows)
+
+
+def _on_one_axis(rows: Sequence[tuple[Bar, Any, float]]) -> Bars:
+    """Bars with their places, by their ends and estimates."""
+    parts = []
+    for _, ends, value in rows:
+        pair = [end / value - 1.0 for end in ends or () if end is not None and value]
+        parts.append(sorted(pair) if len(pair) == 2 and all(map(math.isfinite, pair)) else None)
+    most = max((abs(v) for pair in parts if pair for v in pair), default=0.0)
+    # A vague one must not press the others flat: beyond the axis a bar is cut off.
+    reach = next((r for r in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if most <= r), 1.0)
+    placed = []
+    for (bar, _, _), pair in zip(rows, parts, strict=True):
+        if pair is not None:
+            low, high = (50.0 + 50.0 * min(max(v / reach, -1.0), 1.0) for v in pair)
+            bar = bar._replace(low=low, high=high)
+        placed.append(bar)
+    return Bars(tuple(placed), percent(reach, 0))
+
+
+def correlation(fit: Fit) -> list[tuple[str, list[tuple[str, float]]]]:
+    """Rows of the matrix of correlations: name, and the text and number of each cell."""
+    rows = []
+    for name, values in zip(fit.verdict.names, fit.verdict.correlation, strict=True):
+        # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
+        # parameter, sqrt(1 - r^2); at two digits both are 1.00.
+        numbers = [float(r) if math.isfinite(r) else 0.0 for r in values]
+        cells = [(_signed(r, 5 if 0.995 < abs(r) < 1.0 else 2), r) for r in numbers]
+        rows.append((name, cells))
+    return rows
+
+
 _SHARE = 0.005
 """of the posterior variance: less is 0 % in the table, or 0.00"""
 
@@ -155,10 +230,17 @@ def combinations(fit: Fit) -> Table:
     return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
 
 
+_METHODS = {
+    "gaussian": "Gaussian",
+    "profile": "profile",
+    "bootstrap": "bootstrap",
+    "nuts": "NUTS",
+}
+
+
 def intervals(comparison: Intervals, fit: Fit) -> Table:
     """95 % intervals by parameter and method."""
-    methods = ("gaussian", "profile", "bootstrap", "nuts")
-    present = [m for m in methods if any(m in by for by in comparison.by_parameter.values())]
+    present = [m for m in _METHODS if any(m in by for by in comparison.by_parameter.values())]
     rows = []
     for name, by_method in comparison.by_parameter.items():
         cells = []
@@ -168,8 +250,7 @@ def intervals(comparison: Intervals, fit: Fit) -> Table:
             low, high, _ = measured(fit.estimates[name].sd, *ends)
             cells.append(f"{low} to {high}" if m in by_method else NOTHING)
         rows.append((name, *cells, pretty(fit.estimates[name].unit)))
-    heads = {"gaussian": "Gaussian", "nuts": "NUTS"}
-    return Table(("parameter", *(heads.get(m, m) for m in present), "unit"), rows)
+    return Table(("parameter", *(_METHODS[m] for m in present), "unit"), rows)
 
 
 def sampling(posterior: Posterior) -> Table:

@@ -16,6 +16,7 @@ from heli_jax.identification.validation.logging_rate import fast_modes
 from heli_jax.report import frequency
 from heli_jax.report.frequency import FittedFlight
 from tests.dynamics import whole_helicopter as oracle
+from tests.responses import continuous
 
 N, DT = 500, 0.04
 STILL = dict.fromkeys(("x_roll", "x_pitch", "x_yaw", "x_throttle"), np.zeros(N))
@@ -55,7 +56,7 @@ def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering)
     model = models.helicopter("consistent")
     at = frequency.at_record(FittedFlight(model, xcell, NO_NUISANCE, signals({"z": np.zeros(N)})))
     assert at.words == "the trim in hover"
-    H, _ = frequency.responses(model, xcell, "z", "x_throttle", DT, at)
+    H = continuous(model, xcell, "z", "x_throttle", at)
     assert abs(hovering(1.0)) > 10.0
     for w in (0.5, 1.0, 5.0):
         assert H(np.array([w]))[0] == pytest.approx(hovering(w), rel=1e-4)
@@ -121,7 +122,7 @@ def test_own_models_are_linearised_at_the_records_mean():
     assert at.words == "the record's mean"
     assert float(at.inputs.force) == pytest.approx(gain * u.mean())
     assert float(at.state.v) == pytest.approx(run.y[0].mean(), rel=1e-3)
-    H, _ = frequency.responses(sled, Params(drag), "speed", "force", DT, at)
+    H = continuous(sled, Params(drag), "speed", "force", at)
     pole = 2.0 * drag * run.y[0].mean()
     assert H(np.array([1.0]))[0] == pytest.approx(1.0 / (1j + pole), rel=1e-3)
     assert frequency.memory(sled, Params(drag), at, 1e6) == pytest.approx(4.0 / pole, rel=1e-3)
@@ -174,15 +175,3 @@ def test_headings_on_either_side_of_south_are_one_heading(xcell):
     outputs = {"dx": np.full(N, -8.0), "dy": np.zeros(N), "yaw": psi}
     at = operating_point(models.helicopter("consistent"), xcell, STILL, outputs, DT)
     assert at.words == "the trim at 8 m/s ahead"
-
-
-def test_what_the_windows_sidelobes_bring_is_no_response():
-    """A slow stick and a slower answer: at high frequencies there are sidelobes alone."""
-    rng, n, dt = np.random.default_rng(3), 4000, 0.01
-    sos = scipy.signal.butter(8, 2.2, fs=1 / dt, output="sos")
-    u = scipy.signal.sosfiltfilt(sos, rng.standard_normal(n))
-    y = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
-    found = frequency.empirical(u, y, dt, 0.5)
-    exact = np.abs(0.1 / (1.0 - 0.9 * np.exp(-1j * found.omega * dt)))
-    assert found.omega[-1] < 40.0  # rad/s, of 314
-    np.testing.assert_allclose(np.abs(found.H), exact, rtol=0.15)

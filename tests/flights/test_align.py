@@ -10,7 +10,7 @@ from heli_jax import config
 from heli_jax.errors import InputError
 from heli_jax.flights import Also, Signal, read_flight
 from heli_jax.flights.align import NotAligned, lag_between
-from heli_jax.flights.slower import Timed
+from heli_jax.flights.resample import Timed
 
 from .test_configured_logs import BENCH
 

@@ -9,8 +9,8 @@ import scipy.io
 from heli_jax import cli, load_config
 from heli_jax.config import read_flights
 from heli_jax.flights import describe_log
-from heli_jax.flights.array_clocks import by_clocks
-from heli_jax.flights.array_table import open_hdf5, open_mat
+from heli_jax.flights.formats.arrays import by_clocks
+from heli_jax.flights.formats.library_arrays import open_hdf5, open_mat
 
 FAST, SLOW = 5.0 + 0.01 * np.arange(1000), 5.0 + 0.02 * np.arange(500)
 STICK = np.where(SLOW < 6, 0.0, 0.4 * np.sign(np.sin(2.1 * SLOW)))

@@ -11,7 +11,8 @@ import scipy.io
 import xarray
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Signal, array_table, describe_log, read_flight
+from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights.formats import library_arrays
 from heli_jax.flights.open_log import open_log, open_table
 
 N = 50
@@ -119,7 +120,7 @@ def test_a_file_over_which_its_reader_dies_or_loops_is_no_log(tmp_path, monkeypa
     for fault in ("import os; os.abort()", "while True: pass"):
         (tmp_path / "h5py").mkdir(exist_ok=True)
         (tmp_path / "h5py" / "__init__.py").write_text(fault)
-        monkeypatch.setattr(array_table, "_SECONDS", 1)
+        monkeypatch.setattr(library_arrays, "_SECONDS", 1)
         monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
         with pytest.raises(InputError):
             open_log(path)
@@ -198,7 +199,9 @@ def an_object(name: str, kind: str) -> bytes:
 
     inner = element(6, struct.pack("<2I", 17, 0)) + element(1, name.encode())
     inner += element(1, b"MCOS") + element(1, kind.encode())
-    return element(14, inner + element(14, bytes(40)))
+    data = element(6, struct.pack("<2I", 13, 0)) + element(5, struct.pack("<2i", 2, 1))
+    data += element(1, b"") + element(6, struct.pack("<2I", 0xDD000000, 1))
+    return element(14, inner + element(14, data))
 
 
 @pytest.mark.parametrize(("name", "kind"), [("T", "timetable"), ("x", "my.class")])

@@ -7,10 +7,10 @@ import pytest
 from scipy.signal import lfilter
 
 from heli_jax.errors import InputError
-from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Signal
+from heli_jax.flights.marks import strays as strays_of
+from heli_jax.flights.parts import part
 from heli_jax.flights.read import read_flight
-from heli_jax.flights.strays import strays as strays_of
 from heli_jax.identification.diagnostics.quality import (
     quantisation,
     saturation,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight
-from heli_jax.flights.blackbox_fields import decode
+from heli_jax.flights.formats.blackbox_frames import decode
 from heli_jax.flights.open_log import open_flights, open_log
 
 from . import log_writers as writers

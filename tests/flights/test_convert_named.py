@@ -7,7 +7,7 @@ from heli_jax.cli import main
 from heli_jax.config import load
 from heli_jax.config.logs import as_configured
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.named import by_preset
+from heli_jax.flights.preset import by_preset
 
 from .test_convert_and_info import table_of
 from .test_presets import ARDUPILOT, PHI, STICK, P, ardupilot_log

@@ -11,9 +11,9 @@ import pytest
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight, table
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.csv_dates import seconds_of_dates
-from heli_jax.flights.csv_table import open_csv
+from heli_jax.flights.formats.csv_text import open_csv
 from heli_jax.flights.open_log import open_log
+from heli_jax.flights.time_units import seconds_of_dates
 
 N = 40
 T = 0.02 * np.arange(N)

@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
-from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.derived import body_velocity, euler_angles, with_derived
+from heli_jax.flights.derived import Swashplate, body_velocity, euler_angles, unmix, with_derived
 from heli_jax.flights.open_log import open_log
 
 from . import log_writers as writers

@@ -17,7 +17,7 @@ import scipy.io
 
 from heli_jax import stages
 from heli_jax.errors import InputError
-from heli_jax.flights import parquet_table
+from heli_jax.flights.formats import arrow
 from heli_jax.flights.open_log import open_log, open_table
 from tests.flights import log_writers as writers
 
@@ -43,7 +43,7 @@ def test_columns_of_parquet_in_pieces_are_whole(tmp_path, monkeypatch, kind):
     clock = pa.array(1e-3 * np.arange(1003))
     pyarrow.parquet.write_table(pa.table({"t": clock, "x": column}), tmp_path / "log.parquet")
     whole = open_table(tmp_path / "log.parquet").numbers(["x", "t"])
-    monkeypatch.setattr(parquet_table, "_AT_ONCE", 20)
+    monkeypatch.setattr(arrow, "_AT_ONCE", 20)
     pieces = open_table(tmp_path / "log.parquet").numbers(["x", "t"])
     expected = np.where(gaps, np.nan, numbers != 0 if kind == "bool" else numbers)
     assert list(pieces) == ["x", "t"]

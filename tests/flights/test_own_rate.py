@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heli_jax.flights.slower import Timed, at_own_rate
+from heli_jax.flights.resample import Timed, at_own_rate
 
 DT = 0.01
 TIMES = DT * np.arange(2000)

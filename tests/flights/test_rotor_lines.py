@@ -10,7 +10,7 @@ import scipy.signal
 from heli_jax.cli import main
 from heli_jax.flights import vibration
 from heli_jax.flights.open_log import open_log
-from heli_jax.flights.rotor_lines import rotor_lines
+from heli_jax.flights.vibration import rotor_lines
 
 from . import log_writers as writers
 

@@ -9,9 +9,9 @@ import scipy.io
 from heli_jax.config.schema import TimeConfig
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight
+from heli_jax.flights.clock import by_rate
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.describe import describe_log
-from heli_jax.flights.row_clock import by_rate
 
 N, RATE = 400, 40.0
 U = np.repeat([0.0, 1.0, 0.0, -1.0], N // 4)

@@ -8,9 +8,9 @@ import pytest
 from heli_jax import cli
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, read_flight, read_parts
+from heli_jax.flights.clock import by_rate, restarts
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.describe import describe_log
-from heli_jax.flights.row_clock import by_rate, restarts
 
 DT, SIZES = 0.02, (150, 120, 200)
 RUN = np.repeat([1, 2, 3], SIZES)

@@ -13,8 +13,7 @@ from heli_jax.flights import Flight, Signal, read_flight
 from heli_jax.flights.holds import Decision, is_low_passed
 from heli_jax.flights.onto_grid import at_times
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.resample import held_mean, hold, interpolate
-from heli_jax.flights.slower import Timed
+from heli_jax.flights.resample import Timed, held_mean, hold, interpolate
 
 
 def read(path, stamps: list[str], x: np.ndarray | None = None, **request) -> Flight:

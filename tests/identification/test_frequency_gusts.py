@@ -10,9 +10,9 @@ import scipy.signal
 from heli_jax.identification.diagnostics.loop import moved_by_feedback
 from heli_jax.identification.estimation.frequency_noise import (
     Machine,
+    inverse_roots,
     smoothed,
     whitening_by,
-    whitening_of,
 )
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
@@ -57,7 +57,7 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
         return np.linalg.eigvalsh(covariance)
 
     by = sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0])
-    plain = sizes(whitening_of(smoothed(errors))[0])
+    plain = sizes(inverse_roots(smoothed(errors)[0]))
     assert np.mean(by) == pytest.approx(1.0, abs=0.1)
     # What an integration shows twice is known far better than a mean over lines has it.
     assert np.quantile(by, [0.0, 0.01, 0.99, 1.0]) == pytest.approx([0.4, 0.7, 1.2, 1.2], abs=0.2)

@@ -11,7 +11,7 @@ from heli_jax.config import load
 from heli_jax.config import problem as configured
 from heli_jax.errors import InputError
 from heli_jax.flights import Source
-from heli_jax.flights.cut import part
+from heli_jax.flights.parts import part
 from heli_jax.identification.design.windows import why_excluded
 from heli_jax.identification.fit import check, windows
 from tests.identification.test_enough import DT, problem, response, steps

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
-from heli_jax.flights.slower import Timed, at_nearest
+from heli_jax.flights.resample import Timed, at_nearest
 from heli_jax.identification.equation_error.records import segments
 from heli_jax.identification.equation_error.rls import baseline
 from heli_jax.identification.validation.follows_response import untested

@@ -6,13 +6,12 @@ import pytest
 from heli_jax import naming
 from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
-from heli_jax.report import frequency
 from heli_jax.report.drawings import Analysis, drawings
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import NO_RESPONSES, fitted_responses
 from heli_jax.report.html import render
-from heli_jax.report.style import styled
 from heli_jax.report.tables import handling_lines
+from tests import responses
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +29,7 @@ def test_the_model_s_response_is_that_of_the_bode_figure_and_moves_with_its_para
     names = (pair.output, pair.input)
 
     def continuous(params):
-        H, _ = frequency.responses(problem.model, params, *names, 0.05)
-        return H(pair.omega)
+        return responses.continuous(problem.model, params, *names)(pair.omega)
 
     H = continuous(fit.params)
     np.testing.assert_allclose(pair.model.response, H, rtol=1e-9)
@@ -58,10 +56,8 @@ def test_they_are_drawn_told_and_written(sound, shown):
     supplementary = SupplementaryAnalyses(responses=shown)
     analysis = Analysis(fit, problem, baseline, supplementary)
     (name,) = [n for n in drawings(analysis) if n.startswith("match")]
-    figure = styled(drawings(analysis)[name])
-    assert [ax.get_ylabel() for ax in figure.axes][2:] == [
-        "coherence", "error [dB]", "error [deg]",
-    ]  # fmt: skip
+    chart = drawings(analysis)[name]()
+    assert [p.label for p in chart.panels][2:] == ["coherence", "error [dB]", "error [deg]"]
     page = render(analysis, "title", {}, [])
     assert "Handling qualities" in page
     (line,) = handling_lines(shown.handling)

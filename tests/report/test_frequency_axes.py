@@ -26,11 +26,11 @@ def _pair() -> FittedPair:
 
 def test_bins_that_are_coherent_by_chance_do_not_widen_the_axis() -> None:
     pair = _pair()
-    axes = match(pair, "dB re rad/s", "")
+    chart = match(pair, "dB re rad/s", "")
     # Both in Hz, as bands are stated.
-    assert axes[0].get_xlim()[1] < 6.0
-    assert axes[0].get_xlim()[0] == pytest.approx(0.1)
-    assert axes[-1].get_xlabel() == "frequency [Hz]"
+    assert chart.x_limits[1] < 6.0
+    assert chart.x_limits[0] == pytest.approx(0.1)
+    assert chart.x_label == "frequency [Hz]"
     measured = type("Measured", (), {**pair._asdict(), "picture": np.full(OMEGA.size, np.nan)})
-    axes = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
-    assert axes[0].get_xlim()[1] < 6.0
+    chart = draw_response(("lat", "p"), OMEGA, measured, "rad/s", "", 20.0)
+    assert chart.x_limits[1] < 6.0

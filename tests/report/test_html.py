@@ -65,16 +65,42 @@ def test_page_holds_everything_itself(sound_page):
     links = Links(text)
     assert "@import" not in text
     assert "url(" not in text
-    loaded = [v for v in links.addresses if not v.startswith("#") and v not in FILES]
-    assert loaded
-    assert all(v.startswith(("data:image/svg+xml;base64,", "data:image/png;")) for v in loaded)
-    assert links.tags.count("img") == len(names) == 6
+    files = {f"figures/{name}.svg" for name in names}
+    loaded = [v for v in links.addresses if not v.startswith("#") and v not in {*FILES, *files}]
+    assert loaded == []
+    # Every figure is one that the page draws, as is the worst output of the first screen.
+    assert len(names) == 4
+    assert text.count("<figure data-chart=") == 5
+    assert links.tags.count("img") == 0
     anchors = {v[1:] for v in links.addresses if v.startswith("#")}
     assert anchors <= set(re.findall(r'id="([^"]+)"', text))
     for name in names:
         assert (folder / "figures" / f"{name}.svg").stat().st_size > 1000
-        assert text.count(f"(figures/{name}.svg)</figcaption>") == 1
-    assert len(text) < 500_000
+        assert text.count(f"(figures/{name}.svg)<") == 1
+    assert len(text) < 300_000
+
+
+def test_the_first_screen_has_verdict_estimates_worst_output_and_three_findings(sound, tmp_path):
+    doubts = tuple(note(f"a.{k}", f"finding {k}") for k in range(5))
+    text, _ = page(sound, tmp_path, findings=doubts)
+    first = text[
+        text.index('<div class="first">') : text.index('<nav class="quiet" aria-label="Parts')
+    ]
+    assert first.count('<p class="line ') == 3
+    order = [first.index(part) for part in ("Converged.", "Identifiable.", "Adequate.")]
+    assert order == sorted(order)
+    bars = re.findall(r'<rect x="([\d.]+)" y="3" width="([\d.]+)"', first)
+    assert len(bars) == len(sound[0].estimates)
+    for (x, width), e in zip(bars, sound[0].estimates.values(), strict=True):
+        # An interval holds its estimate, which is the middle of the axis.
+        assert 0.0 <= float(x) < 50.0 < float(x) + float(width) <= 100.0
+        shares = e.upper95 / e.value - 1.0, 1.0 - e.lower95 / e.value
+        assert (float(x) + float(width) - 50.0) / (50.0 - float(x)) == pytest.approx(
+            shares[0] / shares[1], rel=0.05
+        )
+    assert first.count("<figure data-chart=") == 1
+    assert [f"finding {k}" in first.lower() for k in range(5)] == [True] * 3 + [False] * 2
+    assert "Is this log enough?" in text[text.index("</nav>", text.index(first[-50:])) :]
 
 
 def test_text_from_logs_and_configurations_is_escaped(sound_page):
@@ -94,7 +120,8 @@ def test_text_from_logs_and_configurations_is_escaped(sound_page):
 
 def test_undetermined_parameters_have_no_numbers(not_identifiable, not_identifiable_page):
     fit = not_identifiable[0]
-    assert f"✗ {': '.join(fit.outcome)}" in words(not_identifiable_page)
+    assert "✗ Not identifiable." in words(not_identifiable_page)
+    assert fit.verdict.text in words(not_identifiable_page)
     for row in tables.parameters(fit).rows:
         assert row[1] == "not determined"
         assert row[2:5] == ("–",) * 3
@@ -124,7 +151,7 @@ def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     fit = dataclasses.replace(fit, **changes)
     names = write_report(tmp_path, Analysis(fit, problem), "bench", {})
     assert not {"rls", "starts"} & set(names)
-    assert statements.headline(fit).level == "bad"
+    assert [line.level for line in statements.lines(fit)] == ["bad", "none", "none"]
     # Of numbers that are no result there are no intervals to speak of.
     row = next(row for row in tables.parameters(fit).rows if row[0] == "If")
     assert row[1:5] == ("−1.23·10⁻⁴ (no result)", "–", "–", "–")

@@ -113,7 +113,7 @@ def test_nothing_is_written_or_drawn_where_nothing_was_sampled(white, sampled, t
     # No record could be fitted: no file that would be empty.
     failed = dataclasses.replace(none, bootstrap=Bootstrap({"Ixx": np.array([])}, 5))
     assert sample_files(failed) == ()
-    assert figures.bootstrap_pairs(failed.bootstrap, white[0]) == ()
+    assert figures.bootstrap_pairs(failed.bootstrap, white[0]) is None
 
 
 def test_the_ellipse_holds_95_percent_of_the_gaussian(white):

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.finding import Finding, found
-from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight, labels
+from heli_jax.flights.parts import part
 from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.design.accuracy import (
     FREE,

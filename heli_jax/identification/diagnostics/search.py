@@ -6,8 +6,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.finding import Finding, found
-from heli_jax.flights.flight import labels
-from heli_jax.flights.instruments import own_instruments, own_said
+from heli_jax.flights.flight import labels, own_instruments, own_said
 from heli_jax.identification.diagnostics.context import Context
 
 STOPPED = "search.stopped"

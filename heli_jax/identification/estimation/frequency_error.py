@@ -62,6 +62,7 @@ from heli_jax.identification.estimation.frequency_lines import (
 )
 from heli_jax.identification.estimation.frequency_noise import (
     log_determinants,
+    once_a_length,
     whitening_alone,
     whitening_by,
     whitening_without_model,
@@ -167,9 +168,7 @@ class FrequencyError(Objective):
         # A model that is not linear is linearised where its nuisances put it.
         if not layout.model.linear:
             z = in_time(layout, data, noise, z)
-        # Records of one length have one spectrum.
-        by_id = {id(W): -2.0 * log_determinants(W) for W in whitening}
-        logs = np.concatenate([by_id[id(W)] for W in whitening])
+        logs = -2.0 * np.concatenate(once_a_length(log_determinants, whitening))
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
@@ -197,9 +196,7 @@ class FrequencyError(Objective):
         # A row for each unknown of interest, and one for all that is left of the errors.
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
         squares = float(np.sum(np.square(rows)))
-        by_id = {id(W): W for W in noise.whitening}
-        by_id = {k: float(np.sum(log_determinants(np.asarray(W)))) for k, W in by_id.items()}
-        logs = sum(by_id[id(W)] for W in noise.whitening)
+        logs = float(np.sum(np.concatenate(once_a_length(log_determinants, noise.whitening))))
         lines = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))
 

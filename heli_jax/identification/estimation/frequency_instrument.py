@@ -16,10 +16,9 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.flight import Flight
-from heli_jax.flights.instruments import own_instruments, own_said
+from heli_jax.flights.flight import Flight, own_instruments, own_said
 from heli_jax.identification.estimation.frequency_lines import in_time_of, lines_of
-from heli_jax.identification.estimation.frequency_noise import smoothed
+from heli_jax.identification.estimation.frequency_noise import once_a_length, smoothed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data
 
@@ -123,10 +122,9 @@ def _parts(
 ) -> list[Float[np.ndarray, "N u"]]:
     """By flight what of some columns follows signals, about the columns' means."""
     U, R = ([lines_of(v) for v in one] for one in (of, signals))
-    responses, u = {}, U[0].shape[1]
-    for joint in smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART):
-        if len(joint) in responses:
-            continue
+    u = U[0].shape[1]
+
+    def response(joint: np.ndarray) -> np.ndarray:
         S, with_them = joint[:, u:, u:], joint[:, :u, u:]
         size = np.sqrt(np.real(np.einsum("kii->ki", S)))
         size = np.where(size > 0, size, 1.0)[:, None, :]
@@ -134,8 +132,11 @@ def _parts(
         shared = S / (size.swapaxes(1, 2) * size) + _ALONE * np.eye(S.shape[1])
         # From the right, which the transposes have on their left.
         turned = np.linalg.solve(shared.swapaxes(1, 2), (with_them / size).swapaxes(1, 2))
-        responses[len(joint)] = turned.swapaxes(1, 2) / size
-    made = [np.einsum("kur,kr->ku", responses[len(lines)], lines) for lines in R]
+        return turned.swapaxes(1, 2) / size
+
+    spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
+    each = zip(once_a_length(response, spectra), R, strict=True)
+    made = [np.einsum("kur,kr->ku", H, lines) for H, lines in each]
     return [in_time_of(v, len(w)) + w.mean(axis=0) for v, w in zip(made, of, strict=True)]
 
 

@@ -471,7 +471,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
         jnp.zeros((m_ends, m_ends), m.Ad.dtype),
     )
     W, H, gram = blocks.over(more, nothing)
-    return Resolved(blocks, z, T, V, W, H, ends, _orthonormal(gram))
+    return Resolved(blocks, z, T, V, W, H, ends, orthonormal(gram))
 
 
 def _basis(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Array, "s m"]:
@@ -479,8 +479,10 @@ def _basis(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Arr
     return made.reshape(2 * H.shape[0] * H.shape[1], -1)
 
 
-def _orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """S with S^T G S the identity, but for directions without effect, which are zero."""
+def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """S with S^T G S the identity, but for directions without effect, which are zero: for columns
+    with the products G, those times S are orthonormal.
+    """
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
     # A state that no output shows has a column of rounding: that would make some direction of it,
     # another at each step, and what is taken off by it makes the sum of squares rough.

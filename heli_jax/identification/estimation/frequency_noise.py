@@ -2,7 +2,8 @@
 
 import functools
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -69,6 +70,16 @@ def smoothed(
     return [spectra[len(v)] for v in lines]
 
 
+def once_a_length(make: Callable[..., Any], *records: Sequence[Any]) -> list[Any]:
+    """By record what is made of arrays that records of one length share, like their spectra."""
+    made: dict[int, Any] = {}
+    each = list(zip(*records, strict=True))
+    for v in each:
+        if len(v[0]) not in made:
+            made[len(v[0])] = make(*v)
+    return [made[len(v[0])] for v in each]
+
+
 def summed_powers(v: Complex[np.ndarray, "f K p"]) -> Complex[np.ndarray, "K p p"]:
     """The sum of e e^H over records."""
     at_line = v.transpose(1, 2, 0)
@@ -83,13 +94,16 @@ def whitening_alone(
     Raises:
         numpy.linalg.LinAlgError: a signal is zero throughout.
     """
-    made = {}
+
+    def own(S: np.ndarray) -> np.ndarray:
+        roots = _positive(np.real(np.einsum("kii->ki", S))) ** -0.5
+        return roots[:, :, None] * np.eye(S.shape[1], dtype=complex)
+
     # The records of a bootstrap may have other outputs.
+    made = {}
     for p in {v.shape[1] for v in lines}:
-        for S in smoothed([v for v in lines if v.shape[1] == p]):
-            if (len(S), p) not in made:
-                own = _positive(np.real(np.einsum("kii->ki", S)))
-                made[len(S), p] = own[:, :, None] ** -0.5 * np.eye(p, dtype=complex)
+        alike = [v for v in lines if v.shape[1] == p]
+        made |= {(len(W), p): W for W in once_a_length(own, smoothed(alike))}
     return tuple(made[v.shape] for v in lines)
 
 
@@ -153,17 +167,6 @@ def averages(
     return np.interp(np.arange(K), at, total**2 / squares)
 
 
-def whitening_of(
-    spectra: Iterable[Complex[np.ndarray, "K p p"]],
-) -> tuple[Complex[np.ndarray, "K p p"], ...]:
-    """By record L^-1, where S = L L^H: L^-1 e is white."""
-    # Records of one length share their spectrum.
-    spectra = tuple(spectra)
-    made = {id(S): S for S in spectra}
-    made = {key: inverse_roots(S) for key, S in made.items()}
-    return tuple(made[id(S)] for S in spectra)
-
-
 def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
     """L^-1, where S = L L^H.
 
@@ -194,7 +197,7 @@ def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
     """log |det W| of what makes noise white: products of triangles, whose diagonals say it."""
-    return np.sum(np.log(np.abs(np.diagonal(W, axis1=1, axis2=2))), axis=1)
+    return np.sum(np.log(np.abs(np.diagonal(np.asarray(W), axis1=1, axis2=2))), axis=1)
 
 
 # The noise's spectrum by what the machine makes of gusts, and a mean over lines of what is left.
@@ -249,12 +252,14 @@ def whitening_by(
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
-    p, made = errors[0].shape[1], {}
-    for W in whitening_of(left):
-        if (K := len(W)) not in made:
-            n = np.maximum(averages(K, tuple(counts.items()), GUST_PART, GUST_LEAST), p + 1.0)
-            made[K] = ((n - p) / n)[:, None, None] * (W @ before[K])
-    return tuple(made[len(e)] for e in errors)
+    p = errors[0].shape[1]
+
+    def whitening(S: np.ndarray) -> np.ndarray:
+        n = averages(len(S), tuple(counts.items()), GUST_PART, GUST_LEAST)
+        n = np.maximum(n, p + 1.0)
+        return ((n - p) / n)[:, None, None] * (inverse_roots(S) @ before[len(S)])
+
+    return tuple(once_a_length(whitening, left))
 
 
 def _prewhitening(
@@ -395,17 +400,16 @@ def whitening_without_model(layout: Layout, data: Data) -> tuple[np.ndarray, ...
     # What the ends of a record add is smooth over the lines around: a constant beside the inputs.
     size = np.sqrt(np.mean(powers[:p]) / sum(len(v) for v in lines))
     lines = [np.column_stack([v[:, :p], *_powers(v[:, moving], size, order)]) for v in lines]
-    counts = tuple(sorted({len(v): sum(len(w) == len(v) for w in lines) for v in lines}.items()))
-    spectra = smoothed(lines)
-    left = {}
-    for S in spectra:
-        if id(S) in left:
-            continue
-        n, regressors = averages(len(S), counts), S.shape[1] - p
-        if np.min(n) <= regressors + p:
-            return None
-        left[id(S)] = _left(S, p) * (n / (n - regressors))[:, None, None]
-    return whitening_of(left[id(S)] for S in spectra)
+    counts, spectra = tuple(Counter(len(v) for v in lines).items()), smoothed(lines)
+    regressors = spectra[0].shape[1] - p
+    if min(np.min(averages(K, counts)) for K, _ in counts) <= regressors + p:
+        return None
+
+    def whitening(S: np.ndarray) -> np.ndarray:
+        n = averages(len(S), counts)
+        return inverse_roots(_left(S, p) * (n / (n - regressors))[:, None, None])
+
+    return tuple(once_a_length(whitening, spectra))
 
 
 def _powers(inputs: np.ndarray, size: float, order: int) -> list[np.ndarray]:

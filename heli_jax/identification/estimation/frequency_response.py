@@ -44,6 +44,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     alike,
     by_flight,
     machines_of,
+    orthonormal,
     shared_of,
     with_shared,
 )
@@ -81,10 +82,6 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.simulation.blocks import blockwise
 from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs
-
-_NO_END = 1e-10
-"""part of the largest effect of an end below which a state has none"""
-
 
 # The model through the windows of the record.
 #
@@ -148,22 +145,6 @@ def simulated_outputs(
     args = ZeroOrderHoldArgs(None, tuple(signals.U.T), dt, None, Discrete(m.Ad, m.B, None))
     states = jnp.stack(blockwise(args, block, tuple(x0)))
     return m.C @ states + m.D @ signals.acting.T
-
-
-def span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
-    """Orthonormal directions of a space, zero where a column is none of its own, and what makes the
-    columns' factors of components along them.
-    """
-    sizes = jnp.linalg.norm(basis, axis=0)
-    # A state that no output shows has a column of rounding, which would take some direction off.
-    seen = sizes > max(_NO_END, 10.0 * float(jnp.finfo(basis.dtype).eps)) * jnp.max(sizes)
-    over = jnp.where(seen, 1.0 / jnp.where(seen, sizes, 1.0), 0.0)
-    Q, R = jnp.linalg.qr(basis * over[None, :])
-    U, values, Vt = jnp.linalg.svd(R)
-    kept = values > _NO_END * values[0]
-    root = jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)
-
-    return jnp.where(kept[None, :], Q @ U, 0.0), over[:, None] * (Vt.T * root[None, :])
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
@@ -345,9 +326,11 @@ def rows_of_responses(
         ]
         if not columns:
             return rows, None, [None] * len(groups)
-        Q, solution = span(_whitened(weights, jnp.concatenate(columns, axis=3)))
+        basis = _whitened(weights, jnp.concatenate(columns, axis=3))
+        S = orthonormal(basis.T @ basis)
+        Q = basis @ S
         along = Q.T @ rows
-        each = iter(jnp.split(solution @ along, np.cumsum([c.shape[3] for c in columns])[:-1]))
+        each = iter(jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1]))
         ends = [None if e is None else next(each).reshape(len(e), -1) for e in effects]
         return rows - Q @ along, Q, ends
 
@@ -392,8 +375,9 @@ def errors_in_windows(
             v = jnp.moveaxis(v * scale[:, None], 1, -1).reshape(-1, v.shape[1])
             return jnp.concatenate([jnp.real(v), jnp.imag(v)])
 
-        Q, solution = span(rows(effects))
-        ends = solution @ (Q.T @ rows(E[:, None])[:, 0])
+        basis = rows(effects)
+        S = orthonormal(basis.T @ basis)
+        ends = S @ (S.T @ (basis.T @ rows(E[:, None])[:, 0]))
         return (E - jnp.einsum("n,pnwk->pwk", ends.astype(E.dtype), effects)) * seen
 
     for group in _groups(layout, data, weights):
@@ -446,8 +430,10 @@ class FrequencyResponse(Objective):
         """The spectrum of what no response explains of the errors."""
         z = in_time(layout, data, noise, z)
         u, weights = unpack(layout, data, z), back(noise.whitening)
-        weights = weights._replace(simulated=_forgetful(layout, data, u, weights))
-        weights = weights._replace(begun=(u.states, u.offsets))
+        drives = [driven(layout, data, u, i) for i in range(len(data.flights))]
+        flown = [(d.params, naming.asdict(d.inputs)) for d in drives]
+        simulated = outputs_that_forget(layout.model, flown, weights.windows)
+        weights = weights._replace(simulated=simulated, begun=(u.states, u.offsets))
         errors = np.asarray(errors_in_windows(layout, data, on_device(weights), z))
         shape = gusts_through(layout, data, z, weights.windows)
         density = noise_density(weights.windows, weights.averages, errors, shape)
@@ -518,19 +504,6 @@ class FrequencyResponse(Objective):
             w.instruments,
             (*left_out, *(() if w.together else (APART,))),
         )
-
-
-def _forgetful(
-    layout: Layout, data: Data, u: Unknowns, weights: ResponseWeights
-) -> tuple[bool, ...]:
-    """By output whether the model at the unknowns may be simulated over every flight."""
-    drives = [driven(layout, data, u, i) for i in range(len(data.flights))]
-    return outputs_that_forget(
-        layout.model,
-        [naming.asdict(d.params) for d in drives],
-        [{n: np.asarray(v) for n, v in naming.asdict(d.inputs).items()} for d in drives],
-        weights.windows,
-    )
 
 
 def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple[dict, ...]:

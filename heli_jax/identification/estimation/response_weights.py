@@ -408,17 +408,12 @@ class ResponseWeights(NamedTuple):
 
     def variance(self) -> np.ndarray:
         """(k, p, m) of the complex error of each response"""
-        C = covariance(Averages(*(np.asarray(v) for v in self.averages)), np.asarray(self.density))
+        C = covariance(self.averages, self.density)
         return np.real(np.einsum("kixix->kix", C))
 
 
-def first_weights(
-    problem: Problem, flights: Sequence[Flight], simulated: tuple[bool, ...] | None = None
-) -> ResponseWeights:
+def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeights:
     """Of what is measured alone: the noise is what no response explains of the outputs.
-
-    Args:
-        simulated: by output of the model; by the model at its start values unless given.
 
     Raises:
         ValueError: windows, band or pairs do not fit the flights, or too little is left.
@@ -437,7 +432,9 @@ def first_weights(
     at = at._replace(P=np.nan_to_num(at.P))
     asked = pairs_used(w, options, coherence, sound)
     _require_lines(w, options, asked)
-    forgetful = forgetful_outputs(problem, flights, w) if simulated is None else simulated
+    start = problem.start_params()
+    flown = [(naming.replace(start, **f.known), f.inputs) for f in flights]
+    forgetful = outputs_that_forget(problem.model, flown, w)
     density = noise_density(w, at, w.Y)
     begun = _at_rest(problem, len(flights))
     weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, None, begun)
@@ -462,45 +459,32 @@ def weighed(
     # What goes through the same windows as the record may be of their sidelobes: so is the other.
     # A response at one frequency is not told from the window's shape by less than two periods.
     through = np.asarray(simulated, bool)[None, :, None]
-    own = np.asarray(w.own) & (w.lines >= 2)[:, None, None]
-    used = np.asarray(weights.asked) & (through | own)
-    at = Averages(*(np.asarray(v) for v in weights.averages))
-    each = np.moveaxis(at.share, 0, 1)
+    own = w.own & (w.lines >= 2)[:, None, None]
+    used = weights.asked & (through | own)
+    each = np.moveaxis(weights.averages.share, 0, 1)
     share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
     share = np.where(share > 0, share, 1.0)
-    W = whitening(at, density, used) * np.sqrt(share)[:, None, None]
+    W = whitening(weights.averages, density, used) * np.sqrt(share)[:, None, None]
     return weights._replace(
         simulated=simulated, used=used, density=density, whitening=W, share=share
     )
 
 
-def forgetful_outputs(problem: Problem, flights: Sequence[Flight], w: Windowed) -> tuple[bool, ...]:
-    """By output in windows whether the model at its start values may be simulated."""
-    start = problem.start_params()
-    parameters = [naming.asdict(naming.replace(start, **f.known)) for f in flights]
-    return outputs_that_forget(problem.model, parameters, [f.inputs for f in flights], w)
-
-
-# model is a Model and parameters are by name: records of any model.
+# model is a Model and parameters are its Params: records of any model.
 def outputs_that_forget(
-    model: Any,
-    parameters: Sequence[dict[str, Any]],
-    inputs: Sequence[dict[str, np.ndarray]],
-    w: Windowed,
+    model: Any, flights: Sequence[tuple[Any, dict[str, Any]]], w: Windowed
 ) -> tuple[bool, ...]:
     """By output in windows whether the model may be simulated over every flight.
 
     Args:
-        parameters: by flight, by name, SI.
-        inputs: by flight, by name, (N,).
+        flights: parameters, and inputs by name (N,).
     """
     fine = np.ones(len(w.outputs), bool)
     rows = [naming.names(model.Outputs).index(n) for n in w.outputs]
-    for values, u in zip(parameters, inputs, strict=True):
+    for params, u in flights:
         sizes = np.array([np.std(np.asarray(u[n])) for n in naming.names(model.Inputs)])
-        matrices = jacobians(model, model.Params(**values))
         samples = len(next(iter(u.values())))
-        fine &= forgets(matrices, w.dt, sizes, w.length, samples)[rows]
+        fine &= forgets(jacobians(model, params), w.dt, sizes, w.length, samples)[rows]
     return tuple(bool(v) for v in fine)
 
 

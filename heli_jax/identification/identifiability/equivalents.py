@@ -27,8 +27,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution
 
-# The smallest sum of squares with some coordinates held: how a profile, a valley and the search for
-# the same responses move all other unknowns.
+# The smallest sum of squares with some coordinates held: how all other unknowns follow.
 
 
 class Rows(NamedTuple):
@@ -62,13 +61,7 @@ _HUGE = 1e50
 
 
 def descend(
-    rows: Callable[[np.ndarray], Rows],
-    z: np.ndarray,
-    moving: np.ndarray,
-    *,
-    floor: float = _RIDGE,
-    enough: float = _ENOUGH,
-    steps: int = _STEPS,
+    rows: Callable[[np.ndarray], Rows], z: np.ndarray, moving: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return the point (q,) of the least squares near z by Levenberg and Marquardt, and the sum
     there less what a further step promises, infinite where nothing finite is found.
@@ -76,13 +69,10 @@ def descend(
     Args:
         z: (q,) where the search begins.
         moving: (q,) the coordinates that may change.
-        floor: to which the ridge falls: zero where all directions are determined.
-        enough: squares that a further step may promise at the end.
-        steps: at most.
     """
     now, ridge, promised = rows(z), _RIDGE, math.inf
     squares = squares_of(now.r)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         J = now.J[:, moving]
         # Past that the squares of a simulation that has diverged are no numbers.
         if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
@@ -94,18 +84,18 @@ def descend(
         step = np.zeros(z.size)
         step[moving] = np.linalg.lstsq(damped, target, rcond=None)[0]
         promised = float(left @ left - np.sum((left - R @ step[moving]) ** 2))
-        if promised < enough:
+        if promised < _ENOUGH:
             break
         then = rows(z + step)
         gained = squares - squares_of(then.r)
         # Negated: also what is not finite is no step.
         if gained > 0:
             z, now, squares = z + step, then, squares - gained
-            ridge = max(floor, ridge / 10.0)
+            ridge = max(_RIDGE, ridge / 10.0)
         elif ridge > _RIDGE * 1e4:
             break
         else:
-            ridge = max(10.0 * ridge, _RIDGE)
+            ridge *= 10.0
     return z, squares - promised
 
 
@@ -286,6 +276,8 @@ _MAKES = 0.05
 """of the change of two modes that parameters make, the least beside the largest"""
 _REACH = math.log(300.0)
 """how far a parameter may be put"""
+_VISITS = 3
+"""times that all unknowns follow after an exchange"""
 _DIFFERENCE = 1e-5
 """relative, of a parameter"""
 
@@ -310,15 +302,19 @@ def second_solutions(
         return ()
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
-        # Held until the others have followed, or the modes would change back.
-        near = valley.visit(held, {}, same=not optimum, priors=True)
-        if near is None:
-            continue
-        point = valley.visit({}, {n: near.values[n] for n in here}, same=not optimum, priors=True)
+        # Held until the others have followed, or the modes would change back; then all of them
+        # follow more than once, until they stay.
+        before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
+        for _ in range(_VISITS):
+            if point is not None:
+                before = {n: point.values[n] for n in here}
+                point = valley.visit({}, before, same=not optimum, priors=True)
         # What the slopes expect to be within the interval is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue
         there = {n: point.values[n] for n in here}
+        if not all(map(_alike, before.values(), there.values())):
+            continue
         changed = tuple(n for n, v in here.items() if not _alike(v, there[n]))
         known = (all(map(_alike, s.values.values(), there.values())) for s in solutions)
         if changed and not any(known):

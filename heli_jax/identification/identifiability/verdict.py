@@ -47,13 +47,13 @@ class Unknown(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """Of zero from the value in its relative coordinate, where it may have either sign; 1 where
-        that coordinate is log |value|."""
+        """Distance of zero from the value in its relative coordinate; 1 of one that keeps its
+        sign."""
         return abs(self.value) / self.reference if self.symmetric else 1.0
 
     @property
     def per_log(self) -> float:
-        """What turns its relative coordinate into log |value|."""
+        """Factor that turns its relative coordinate into log |value|."""
         # In units of the reference it becomes that by the reference over the value.
         return 1.0 / self.distance if self.logarithmic else 1.0
 
@@ -78,7 +78,7 @@ class Combination(NamedTuple):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether its 95 % interval is one: of a product within the factor of ten, as of a
+        """True if its 95 % interval is one: of a product within the factor of ten, as of a
         parameter."""
         if not all(map(math.isfinite, (self.value, self.sd, self.lower95, self.upper95))):
             return False
@@ -124,7 +124,7 @@ class Weakest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What the data (with the priors) determine."""
+    """The findings on what the data (with the priors) determine."""
 
     unknowns: tuple[Unknown, ...]
     """(q,)"""
@@ -176,7 +176,7 @@ class Verdict:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the unknowns (q,)."""
+        """Names of the unknowns (q,)."""
         return tuple(u.name for u in self.unknowns)
 
     @property
@@ -201,7 +201,7 @@ class Verdict:
         return tuple(dict.fromkeys(n.label for group in groups for n in group.exchanged))
 
     def nothing(self, sentence: str) -> "Verdict":
-        """No parameter determined, for a reason."""
+        """Return the verdict with no parameter determined, for a reason."""
         return replace(
             self,
             identifiable=False,

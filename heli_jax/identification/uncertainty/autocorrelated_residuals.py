@@ -83,8 +83,8 @@ class Sandwich(NamedTuple):
         return whole / np.outer(self.norms, self.norms)
 
     def _scaled(self, along: np.ndarray | None) -> np.ndarray:
-        """The combinations (k, q) by unknowns of unit columns, their largest parts one: the size of
-        a combination changes neither inflation nor quantile."""
+        """Return the combinations (k, q) by unknowns of unit columns, their largest parts one: the
+        size of a combination changes neither inflation nor quantile."""
         if along is None:
             return np.eye(self.norms.size)
         along = along / self.norms
@@ -106,7 +106,7 @@ class Sandwich(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What one flight adds: sensitivities and residuals as spectra over f frequencies."""
+    """Sensitivities and residuals of one flight as spectra over f frequencies."""
 
     J: Complex[np.ndarray, "f outputs q"]
     S: Complex[np.ndarray, "f outputs outputs"]
@@ -123,7 +123,7 @@ class _Part(NamedTuple):
     """samples"""
 
     def variance(self, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of D' J' r for the columns of D (q, k), and its degrees of freedom."""
+        """Return the variance of D' J' r for the columns of D (q, k), with degrees of freedom."""
         W = self.J @ D
         by_output = np.real(W.conj() * (self.S @ W))
         power = np.sum(by_output, axis=1)

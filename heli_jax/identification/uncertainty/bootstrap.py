@@ -1,4 +1,4 @@
-"""Bootstrap: records about the estimated machine's response are identified again, many times."""
+"""Bootstrap: records about the estimated vehicle's response are identified again, many times."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -52,7 +52,12 @@ class Refits(NamedTuple):
     too few"""
 
 
-def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
+def refit(
+    fit: Fit,
+    records: Sequence[Sequence[Flight] | Flight],
+    *,
+    say: Callable[[str], None] = lambda _: None,
+) -> Refits:
     """Estimate the parameters of a fit anew from other records, side by side.
 
     Each record has the flights of the fit, of the same length and rate, with inputs and outputs of
@@ -63,6 +68,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
     Args:
         fit: with output error or filter error.
         records: each a Flight, or as many as the fit has.
+        say: called with a sentence where many records are not fitted by programs of machine code.
 
     Raises:
         TypeError: a record that is no flights.
@@ -84,7 +90,7 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight]) -> Refits:
         each = {n: stacked(lambda f, n=n: f.inputs[n], i) for n in names}
         inputs.append(at.layout.model.Inputs(**each))
         outputs.append({n: stacked(lambda f, n=n: f.outputs[n], i) for n in flight.outputs})
-    optima, _ = _optima(at, len(flights), tuple(outputs), tuple(inputs))
+    optima = _optima(at, len(flights), tuple(outputs), tuple(inputs), say=say)
     # Of every output as many samples as `fit` asks for; there are none but the fit's outputs.
     enough = np.array(
         [
@@ -103,9 +109,10 @@ def _optima(
     outputs: tuple[dict[str, Array], ...],
     inputs: tuple[Any, ...] | None = None,
     prior_means: Array | None = None,
-) -> tuple[Optimum, str]:
+    say: Callable[[str], None] = lambda _: None,
+) -> Optimum:
     """Fit `count` records in time, from the optimum; outputs (and inputs, and the means of priors
-    where they are others) have the records as leading axis. Also returns a note on how."""
+    where they are others) have the records as leading axis."""
 
     def data(record: Any) -> Data:
         by_flight, driven, means = record
@@ -115,11 +122,9 @@ def _optima(
         changed = at.data._replace(flights=tuple(flights))
         return changed if means is None else changed._replace(prior_mean=means)
 
-    notes: list[str] = []
     starts = jnp.tile(at.z[None, :], (count, 1))
     each = (outputs, inputs, prior_means)
-    optima = optimise_many(at, data, starts, each, batch=_BATCH, say=notes.append)
-    return optima, " ".join(notes)
+    return optimise_many(at, data, starts, each, batch=_BATCH, say=say)
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:
@@ -140,13 +145,12 @@ def _like(at: Solution, record: Any, where: str) -> list[Flight]:
         raise ValueError(f"{where}: expected {len(at.data.flights)} flights, got {len(flights)}")
     names = naming.names(at.layout.model.Inputs)
     for flight, own, hold in zip(flights, at.data.flights, at.layout.holds, strict=True):
-        if missing := [n for n in names if n not in flight.inputs]:
-            raise ValueError(f"{where}: expected the input {missing[0]}, got none")
         expected = {
             "samples": (next(iter(own.outputs.values())).shape[0], flight.n_samples),
             "dt": (float(own.dt), float(flight.dt)),
+            "inputs": (list(names), [n for n in names if n in flight.inputs]),
             "outputs": (sorted(own.outputs), sorted(flight.outputs)),
-            "hold": (list(hold), [flight.hold[n] for n in names]),
+            "hold": (list(hold), [flight.hold.get(n) for n in names]),
             "known": tuple({n: float(v) for n, v in f.known.items()} for f in (own, flight)),
         }
         for name, (value, got) in expected.items():
@@ -164,21 +168,24 @@ class Bootstrap(NamedTuple):
     """runs that did not converge"""
     records: tuple[int, ...] = ()
     """the numbers of the records that these are of"""
-    note: str = ""
-    """why many records were not fitted by programs of machine code, where they were not"""
 
     def interval(self, name: str) -> tuple[float, float]:
-        """2.5 and 97.5 % of the values."""
+        """Return 2.5 and 97.5 % of the values."""
         low, high = np.percentile(self.values[name], [2.5, 97.5])
         return float(low), float(high)
 
 
-def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
+def bootstrap(
+    fit: Fit, runs: int = 200, *, seed: int = 0, say: Callable[[str], None] = lambda _: None
+) -> Bootstrap:
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
     are autocorrelated, noise with their covariance over time and between outputs. The methods in
     frequency draw residuals line by line, and estimate the spectrum anew.
+
+    Args:
+        say: called with a sentence where many records are not fitted by programs of machine code.
 
     Raises:
         ValueError: no run; the time shift is free in a fit in time, or the data do not determine
@@ -192,7 +199,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
         raise ValueError("bootstrap: not available with a free time shift")
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
-    rng, note = np.random.default_rng(seed), ""
+    rng = np.random.default_rng(seed)
     # Priors are measurements too, of another kind: their means are drawn anew as well.
     values = np.array([fit.estimates[n].value for n in at.layout.free])
     prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
@@ -201,13 +208,13 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     if in_frequency:
         z, converged = _fit_by_lines(at, means, rng)
     else:
-        optima, note = _optima(at, runs, records, None, jnp.asarray(means, at.z.dtype))
+        optima = _optima(at, runs, records, None, jnp.asarray(means, at.z.dtype), say)
         z, converged = optima.z, np.asarray(optima.converged)
     # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
     # than they are uncertain.
     fitted = np.flatnonzero(converged)
     estimates = _values(at, np.asarray(z)[fitted])
-    return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)), note)
+    return Bootstrap(estimates, runs - fitted.size, tuple(map(int, fitted)))
 
 
 def _records(
@@ -242,7 +249,7 @@ def _records(
 # Whitened by its spectrum the residual at one frequency is as good as that at any other, with any
 # phase. So the model's response and the ends of each record stay, and to every line comes a
 # residual that another one had, at the size that the spectrum gives it there. Nothing is simulated
-# in time: unstable machines are no exception. The spectrum is estimated anew with each record.
+# in time: unstable vehicles are no exception. The spectrum is estimated anew with each record.
 #
 # Source: Franke and Härdle (1992), On bootstrapping kernel spectral estimates.
 

@@ -81,9 +81,7 @@ def intervals(
     if runs:
         report(f"bootstrap, {runs} records")
         with stage("bootstrap", total=runs):
-            booted = bootstrap(fit, runs, seed=seed)
-        if booted.note:
-            report(booted.note)
+            booted = bootstrap(fit, runs, seed=seed, say=report)
     if draws:
         report(f"NUTS, 4 chains of {draws} draws")
         with stage("NUTS"):
@@ -106,7 +104,7 @@ def intervals(
 
 
 def apart(first: _Ends, second: _Ends) -> float:
-    """The larger distance between the ends of two intervals, over the width of the first."""
+    """Return the larger distance between the ends of two intervals, over the width of the first."""
     ends = np.abs(np.array(first) - np.array(second))
     return float(np.max(ends) / abs(first[1] - first[0])) if np.isfinite(ends).all() else np.inf
 

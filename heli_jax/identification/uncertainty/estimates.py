@@ -50,7 +50,7 @@ from heli_jax.identification.unknowns.layout import (
 
 
 class StandardErrors(NamedTuple):
-    """How sure the numbers at the optimum are."""
+    """Standard deviations and verdict at an optimum."""
 
     verdict: Verdict
     wider: Float[np.ndarray, " q"]

@@ -36,7 +36,7 @@ _TARGET = 0.8
 
 
 class Convergence(NamedTuple):
-    """How well the chains agree on one parameter."""
+    """Agreement of the chains on one parameter."""
 
     rhat: float
     effective: float
@@ -68,7 +68,7 @@ class Posterior:
         return self.rhat < RHAT and self.effective > EFFECTIVE and self.divergent == 0
 
     def interval(self, name: str) -> tuple[float, float]:
-        """2.5 and 97.5 % of the draws."""
+        """Return 2.5 and 97.5 % of the draws."""
         low, high = np.percentile(self.draws[name], [2.5, 97.5])
         return float(low), float(high)
 

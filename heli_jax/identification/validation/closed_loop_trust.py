@@ -28,6 +28,7 @@ Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is
 Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole asks for.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -44,7 +45,12 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instruments_of,
 )
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines, lines_of, records_of
-from heli_jax.identification.estimation.frequency_noise import LEAST, machine_of, smoothed
+from heli_jax.identification.estimation.frequency_noise import (
+    LEAST,
+    machine_of,
+    once_a_length,
+    smoothed,
+)
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Problem
@@ -302,32 +308,24 @@ def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.nd
         white = [np.einsum("kij,kj->ki", W, v) for v in (y - e, e)]
         pairs.append(np.concatenate(white, axis=1))
     p, per_line, records = lines.W[0].shape[1], 2.0 * np.pi**0.5, len(pairs)
-    shares, chances = {}, {}
-    spectra = smoothed(pairs, _PART)
-    for S in spectra:
-        # Records of one length have one spectrum.
-        if len(S) in shares:
-            continue
+
+    def coherent(S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         crossed = S[:, p:, :p]
         solved = np.linalg.solve(S[:, p:, p:], crossed)
         explained = np.einsum("kia,kia->k", np.conj(crossed), solved)
-        shares[len(S)] = np.real(explained / np.einsum("kii->k", S[:, :p, :p]))
         width = np.maximum(LEAST, _PART * np.arange(1, len(S) + 1))
-        chances[len(S)] = np.minimum(p / (per_line * width * records), 1.0)
-    each = [[of[len(S)] for S in spectra] for of in (shares, chances)]
-    return each[0], each[1], per_line * LEAST * records
+        share = np.real(explained / np.einsum("kii->k", S[:, :p, :p]))
+        return share, np.minimum(p / (per_line * width * records), 1.0)
+
+    each = once_a_length(coherent, smoothed(pairs, _PART))
+    return [s for s, _ in each], [c for _, c in each], per_line * LEAST * records
 
 
 def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency the part of the input that a constant gain may have brought in."""
     joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
     spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
-    direct, made = np.array(lines.direct), {}
-    for W, S, See in zip(*spectra, strict=True):
-        # Records of one length have one spectrum, and one whitening.
-        if len(S) not in made:
-            made[len(S)] = _room(W, S, See, direct)
-    return [made[len(W)] for W in lines.W]
+    return once_a_length(functools.partial(_room, direct=np.array(lines.direct)), *spectra)
 
 
 def _room(

@@ -7,7 +7,8 @@
   // Of Okabe and Ito's colours those that are too dark on a dark page, and the greys.
   const NIGHT = { "#000000": "#e4e4e2", "#0072b2": "#5cb3ea", "#56b4e9": "#bfe3fb", "#d55e00": "#ff8a3d", "#a8a8a8": "#8a8a8a",
     "#6b6b6b": "#a0a0a0", "#444444": "#b0b0b0", "#7f7f7f": "#a0a0a0", "#009e73": "#2fc79a" };
-  const shown = color => night.matches ? NIGHT[color] ?? color : color;
+  const paper = () => document.documentElement.classList.contains("printing");
+  const shown = color => night.matches && !paper() ? NIGHT[color.toLowerCase()] ?? color : color;
   const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   function bytes(text) {
@@ -175,9 +176,9 @@
     const u = new uPlot({
       width: Math.max(260, place.clientWidth), height: panel.height + (last ? 52 : 10),
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
-      scales: { x: { time: false, distr: chart.logarithmic ? 3 : 1, range: xRange }, y: { range } },
+      scales: { x: { time: false, distr: chart.logarithmic ? 3 : 1, range: xRange }, y: { range, distr: panel.logarithmic ? 3 : 1 } },
       axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.x_label : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.logarithmic ? decades : undefined, filter: chart.logarithmic ? (u, s) => s : undefined,
-        values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 20, values: (u, splits) => ticks(splits) }],
+        values: last ? chart.logarithmic ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 20, values: (u, splits) => panel.logarithmic ? splits.map(v => v == null ? null : `${+v.toPrecision(2)}`) : ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {
@@ -267,15 +268,9 @@
 
   function build(figure) {
     const chart = numbers.charts[+figure.dataset.chart];
-    // Of a figure without any line the image says as much.
-    if (!chart.panels.some(p => p.series.length)) return;
     // Figures over the same quantity move together; over time those of one flight.
     chart.group = (chart.x_label || "x") + (chart.of ? `, ${chart.of}` : "");
-    const box = document.createElement("div");
-    box.className = "live";
-    box.tabIndex = 0;
-    box.setAttribute("role", "group");
-    box.setAttribute("aria-label", figure.querySelector("img").alt);
+    const box = figure.querySelector(".live");
     const title = document.createElement("h4");
     title.textContent = chart.title;
     const spoken = document.createElement("p");
@@ -289,7 +284,6 @@
       box.append(note);
     }
     tools(chart, box);
-    figure.prepend(box);
     figure.classList.add("drawn");
     if (!groups.has(chart.group)) groups.set(chart.group, []);
     chart.panels.forEach((panel, k) => {
@@ -309,15 +303,24 @@
   for (const figure of document.querySelectorAll("figure[data-chart]")) build(figure);
   const all = () => [...groups.values()].flat();
   night.addEventListener("change", () => all().forEach(u => u.redraw(true, true)));
-  let width = 0;
+  // Where a figure is folded away its place has no width.
+  const fit = width => all().forEach(u => {
+    const place = width ?? u.root.parentElement.clientWidth;
+    if (place) u.setSize({ width: Math.max(260, place), height: u.height });
+  });
+  let seen = 0;
   new ResizeObserver(() => {
-    if (document.body.clientWidth === width) return;
-    width = document.body.clientWidth;
-    // Where a figure is folded away its place has no width.
-    for (const u of all()) {
-      const place = u.root.parentElement.clientWidth;
-      if (place) u.setSize({ width: Math.max(260, place), height: u.height });
-    }
+    if (document.body.clientWidth === seen) return;
+    seen = document.body.clientWidth;
+    fit();
   }).observe(document.body);
+  // On paper: dark on white, whole, and no wider than a sheet.
+  const print = on => {
+    document.documentElement.classList.toggle("printing", on);
+    fit(on ? 660 : undefined);
+    all().forEach(u => u.redraw(true, true));
+  };
+  addEventListener("beforeprint", () => print(true));
+  addEventListener("afterprint", () => print(false));
   window.heliCharts = { numbers, array, point, groups, text, listen: f => listeners.push(f) };
 })();

@@ -1,19 +1,19 @@
-"""The report's figures: plain data in, Matplotlib Axes out, each on a figure of its own.
+"""The report's figures: plain data in, a `Chart` out; None where there is nothing to draw.
 
-Draw within `style.in_style()` to get the report's look.
+Pairs of samples are no lines: they are Matplotlib's, drawn within `style.in_style()`, and images on
+the page.
 """
 
-from heli_jax.report.figures.bode import bode, bode_overlay, bode_unit, draw_response, match
+from heli_jax.report.figures.bode import bode_unit, draw_response, match
 from heli_jax.report.figures.estimates import (
     bootstrap_pairs,
-    correlation_matrix,
-    intervals,
     posterior_pairs,
     trace,
     waterfall,
 )
 from heli_jax.report.figures.signals import (
     motion,
+    overview,
     residual_correlation,
     response,
     rls_history,
@@ -22,15 +22,12 @@ from heli_jax.report.figures.signals import (
 )
 
 __all__ = [
-    "bode",
-    "bode_overlay",
     "bode_unit",
     "bootstrap_pairs",
-    "correlation_matrix",
     "draw_response",
-    "intervals",
     "match",
     "motion",
+    "overview",
     "posterior_pairs",
     "residual_correlation",
     "response",

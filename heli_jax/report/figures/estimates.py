@@ -1,4 +1,4 @@
-"""Figures of the estimates: correlation, intervals, what each start reached, what was sampled."""
+"""Figures of the estimates: what each start reached, what was sampled."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -6,141 +6,62 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.identification.identifiability.profile import Profile
-from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.result import Estimate, Fit, StartRow
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
-from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
-from heli_jax.report.style import Panels, legend_above, panels, subtitle
+from heli_jax.report.charts import Chart, Series, panel
+from heli_jax.report.style import subtitle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-def correlation_matrix(verdict: Verdict) -> Panels:
-    """How the estimates of the parameters are correlated: near +1 or -1 the data cannot tell two
-    of them apart."""
-    names, r = verdict.names, verdict.correlation
-    side = min(style.WIDTH, 1.5 + 0.62 * len(names))
-    # Names of any length stand beside the matrix, and no fixed margin suits all.
-    ax = style.figure(side, min(style.WIDTH, side + 0.5), constrained=True).subplots()
-    # Two colours of equal weight, told apart with every common kind of colour blindness.
-    ax.pcolormesh(r, cmap="PuOr", vmin=-1.0, vmax=1.0, edgecolors="white", linewidth=1.5)
-    ax.set_aspect("equal")
-    # The first parameter on top, as a matrix is read; pcolormesh counts from below.
-    ax.invert_yaxis()
-    centres = np.arange(len(names)) + 0.5
-    ax.set_xticks(centres, names, rotation=35 if max(map(len, names)) > 4 else 0)
-    ax.set_yticks(centres, names)
-    ax.grid(visible=False)
-    ax.tick_params(length=0)
-    ax.spines[:].set_visible(False)
-    size = 8.5 if len(r) < 9 else 6.0
-    for (i, j), value in np.ndenumerate(r):
-        color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
-        text = "1" if i == j else _cell_text(float(value))
-        ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
-    ax.set_title("Correlation of the estimates", loc="left")
-    if verdict.undetermined:
-        subtitle(ax, "directions that are not identifiable are left out")
-    return (ax,)
-
-
-def _cell_text(r: float) -> str:
-    """A correlation in two digits, five where the last ones count."""
-    if not np.isfinite(r):
-        return ""
-    # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
-    # parameter, sqrt(1 - r^2); at two digits both are 1.00.
-    text = f"{r:+.5f}" if abs(r) > 0.995 else f"{r:+.2f}"
-    return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
+    from matplotlib.figure import Figure
 
 
 _DRAWN = 1e100
 """cost up to which a start is drawn at its own height"""
 
 
-def waterfall(starts: tuple[StartRow, ...]) -> Panels:
-    """The cost that each start reached, best first; () where there is one start or none."""
+def waterfall(starts: tuple[StartRow, ...]) -> Chart | None:
+    """The cost that each start reached, best first; None where there is one start or none."""
     if len(starts) < 2:
-        return ()
-    [ax] = panels(2.8, [1.0])
+        return None
     rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost, x = np.array([s.cost for s in rows]), np.arange(1, len(rows) + 1)
+    cost, x = np.array([s.cost for s in rows]), np.arange(1.0, len(rows) + 1.0)
     # A cost that is next to infinite leaves an axis no room.
     finite, ok = cost < _DRAWN, np.array([s.converged for s in rows])
     low, top = (cost[finite].min(), cost[finite].max()) if finite.any() else (1.0, 1.0)
-    logarithmic = low > 0 and top > 30 * low
+    logarithmic = bool(low > 0 and top > 30 * low)
     # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
     # differences where there are none.
     span = max(top - low, 0.02 * abs(top), 1e-300)
     shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
-    ax.plot(x[finite], shown[finite], color=style.PALE, lw=0.8, zorder=1)
-    ax.plot(x[ok], shown[ok], "o", ms=6, color=style.BLUE, label="converged")
-    if not ok.all():
-        ax.plot(x[~ok], shown[~ok], "X", ms=7, color=style.VERMILLION, label="failed")
-    if logarithmic:
-        ax.set_yscale("log")
-        ax.margins(y=0.25)
-        style.plain_log_ticks(ax, "y")
-    else:
-        ax.set_ylim(0.5 * (top + low) - 0.9 * span, 0.5 * (top + low) + 1.1 * span)
-        # The cost itself, not its difference from a number that stands elsewhere on the axis.
-        ax.ticklabel_format(axis="y", useOffset=False)
-    ax.set_xlim(0.4, len(rows) + 0.6)
-    style.few_ticks(ax, "x", 16, integer=True)
-    ax.set_xlabel("start, sorted by cost")
-    ax.set_ylabel("cost")
+    middle = 0.5 * (top + low)
+    series = [
+        Series("", x[finite], shown[finite], style.PALE, width=0.8),
+        Series("converged", x[ok], shown[ok], style.BLUE, "points", width=6.0),
+        Series("failed", x[~ok], shown[~ok], style.VERMILLION, "points", width=6.0),
+    ]
+    limits = (0.5 * low, 5.0 * top) if logarithmic else (middle - 0.9 * span, middle + 1.1 * span)
     best, failed = sum(r.optimum == 1 for r in rows), np.count_nonzero(~ok)
     title = f"{best} of {len(rows)} starts reached the best optimum"
-    ax.set_title(f"{title}, {failed} failed" if failed else title, loc="left")
-    if not finite.all():
-        subtitle(ax, f"starts that ended without a cost below {_DRAWN:g} are drawn on top")
-    legend_above(ax, raised=not finite.all())
-    return (ax,)
-
-
-_METHODS = {
-    "gaussian": ("Gaussian", style.BLUE),
-    "profile": ("profile", style.VERMILLION),
-    "bootstrap": ("bootstrap", style.GREEN),
-    "nuts": ("NUTS", style.PURPLE),
-}
-
-
-def intervals(comparison: Intervals, fit: Fit) -> Panels:
-    """95 % intervals by every method, and the likelihood of the profile; one panel a parameter."""
-    names = list(comparison.by_parameter)
-    if not names:
-        return ()
-    axes = np.atleast_1d(style.figure(1.9, constrained=True).subplots(1, len(names)))
-    # The methods that any parameter has, so that a row is the same method in every panel.
-    present = [m for m in _METHODS if any(m in by for by in comparison.by_parameter.values())]
-    for ax, name in zip(axes, names, strict=True):
-        by_method, estimate = comparison.by_parameter[name], fit.estimates[name]
-        for k, m in enumerate(present):
-            if m in by_method:
-                ax.plot(by_method[m], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
-        ax.axvline(estimate.value, color=style.GREY, lw=0.8, ls=":")
-        if name in comparison.profiles:
-            _draw_likelihood(ax, comparison.profiles[name], len(present))
-        ax.set_yticks([-k for k in range(len(present))], [_METHODS[m][0] for m in present])
-        ax.tick_params(axis="y", labelleft=name == names[0])
-        ax.set_ylim(-len(present) + 0.4, 0.6)
-        style.few_ticks(ax, "x", 3)
-        ax.set_xlabel(style.label(name, estimate.unit))
-    axes[0].set_title("95 % intervals", loc="left")
-    return tuple(axes)
-
-
-def _draw_likelihood(ax: "Axes", profile: Profile, rows: int) -> None:
-    # A deviance of 9 is three standard deviations: further out lies what sets no interval.
-    near = profile.deviance < 9.0
-    # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.
-    height = 0.2 - (rows - 1) * (1.0 - np.exp(-0.5 * profile.deviance[near]))
-    ax.plot(profile.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
+    return Chart(
+        f"{title}, {failed} failed" if failed else title,
+        "start, sorted by cost",
+        (0.4, len(rows) + 0.6),
+        (
+            panel(
+                "cost",
+                [s for s in series if s.x.size],
+                1.9,
+                limits=(float(limits[0]), float(limits[1])),
+                logarithmic=logarithmic,
+            ),
+        ),
+        ""
+        if finite.all()
+        else f"starts that ended without a cost below {_DRAWN:g} are drawn on top",
+    )
 
 
 MOST = 6
@@ -150,38 +71,34 @@ _RADIUS = 2.4477
 root of chi-squared's 95 % point at two degrees of freedom"""
 _DOTS = 1500
 """samples of which dots are drawn: of more they hide one another"""
+_MARKS = 200
+"""divergent steps that are marked"""
 
 
-def trace(posterior: Posterior, fit: Fit) -> Panels:
+def trace(posterior: Posterior, fit: Fit) -> Chart:
     """The chains by draw, one panel for each of the first parameters."""
-    names = list(posterior.draws)[:MOST]
-    # Draws differ in their last digits, and ticks with all of them need the room they need.
-    drawing = style.figure(0.9 + 1.05 * len(names), constrained=True)
-    axes = tuple(drawing.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
-    for ax, name in zip(axes, names, strict=True):
-        for i, chain in enumerate(posterior.draws[name]):
-            style.line(ax, np.arange(chain.size), chain, color=style.CYCLE[i], lw=0.5)
-        ax.axhline(fit.estimates[name].value, color=style.GREY, lw=0.9, ls=":")
-        style.few_ticks(ax, "y", 4)
-        ax.set_ylabel(style.label(name, fit.estimates[name].unit))
-    _mark_divergent(axes[-1], posterior)
-    axes[-1].set_xlabel("draw")
-    axes[0].set_title("Draws of the chains", loc="left")
-    subtitle(axes[0], f"dotted: the estimate{_left_out(len(posterior.draws))}")
-    return axes
-
-
-def _mark_divergent(ax: "Axes", posterior: Posterior) -> None:
+    panels, count = [], next(iter(posterior.draws.values())).shape[1]
+    draw = np.arange(float(count))
     diverging = posterior.statistics.get("diverging")
-    if diverging is None or not np.any(diverging):
-        return
-    at = np.flatnonzero(np.any(diverging, axis=0))
-    # At the foot of the last panel, whatever the draws' values.
-    foot = ax.get_xaxis_transform()
-    ax.plot(at, np.zeros(at.size), "|", color=style.BLACK, ms=9, transform=foot, clip_on=False)
+    marks = np.flatnonzero(np.any(diverging, axis=0)) if diverging is not None else ()
+    for name in list(posterior.draws)[:MOST]:
+        series = [
+            Series(f"chain {i + 1}", draw, np.asarray(chain), style.CYCLE[i % 8], width=0.5)
+            for i, chain in enumerate(posterior.draws[name])
+        ]
+        words, estimate = style.label(name, fit.estimates[name].unit), fit.estimates[name].value
+        panels.append(panel(words, series, 0.9, levels=(float(estimate),)))
+    # At most as many as can be told apart.
+    divergent = tuple(float(m) for m in marks[:_MARKS])
+    panels[-1] = panels[-1]._replace(marks=divergent)
+    note = f"dotted: the estimate{_left_out(len(posterior.draws))}"
+    note += "; upright lines: divergent steps" if divergent else ""
+    return Chart(
+        "Draws of the chains", "draw", (0.0, float(max(count - 1, 1))), tuple(panels), note
+    )
 
 
-def posterior_pairs(posterior: Posterior, fit: Fit) -> Panels:
+def posterior_pairs(posterior: Posterior, fit: Fit) -> "Figure":
     """Draws by pairs of parameters, divergent ones marked."""
     draws = {name: np.asarray(v).ravel() for name, v in posterior.draws.items()}
     diverging = posterior.statistics.get("diverging")
@@ -189,11 +106,11 @@ def posterior_pairs(posterior: Posterior, fit: Fit) -> Panels:
     return _pairs(draws, fit, "Draws from the posterior", style.PURPLE, marked)
 
 
-def bootstrap_pairs(booted: Bootstrap, fit: Fit) -> Panels:
-    """Estimates from simulated records by pairs of parameters; () where fewer than two were
-    fitted."""
+def bootstrap_pairs(booted: Bootstrap, fit: Fit) -> "Figure | None":
+    """Estimates from simulated records by pairs of parameters; None where fewer than two
+    were fitted."""
     if len(next(iter(booted.values.values()), ())) < 2:
-        return ()
+        return None
     return _pairs(booted.values, fit, "Estimates of the bootstrap", style.GREEN, None)
 
 
@@ -203,14 +120,14 @@ def _pairs(
     title: str,
     color: str,
     marked: np.ndarray | None,
-) -> Panels:
+) -> "Figure":
     names = list(samples)[:MOST]
     n = len(names)
     side = min(style.WIDTH, 2.2 + 1.3 * n)
     drawing = style.figure(side if n > 1 else 2.6, side, constrained=True)
     # The title is wider than the cell that it stands above: it has a row of its own.
     height = float(drawing.get_size_inches()[1])
-    drawing.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - style.TOP / height))
+    drawing.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 1.0 - 0.5 / height))
     grid = drawing.subplots(n, n, squeeze=False, sharex="col")
     shown = slice(None, None, max(1, -(-next(iter(samples.values())).size // _DOTS)))
     for i, below in enumerate(names):
@@ -229,12 +146,12 @@ def _pairs(
             ax.set_visible(False)
     _label(grid, names, fit)
     first = grid[0, 0]
-    heading = first.set_title(title, loc="left")
+    heading = first.set_title(title, loc="left", pad=19)
     diverged = "; ×: divergent" if marked is not None and marked.any() else ""
     subtitle(first, f"blue: Gaussian, dotted: its 95 % ends{diverged}{_left_out(len(samples))}")
     for text in (heading, first.texts[-1]):
         text.set_in_layout(False)
-    return tuple(ax for i in range(n) for ax in grid[i, : i + 1])
+    return drawing
 
 
 def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:

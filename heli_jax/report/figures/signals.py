@@ -1,9 +1,7 @@
 """Figures over time and by lag: outputs with residuals and inputs, coefficients of the RLS,
 whiteness, and a manoeuvre."""
 
-import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,42 +23,52 @@ from heli_jax.identification.validation.metrics import (
 )
 from heli_jax.numbers import number, percent, vaf_percent
 from heli_jax.report import style
+from heli_jax.report.charts import (
+    Chart,
+    Panel,
+    Series,
+    band,
+    limits_of,
+    panel,
+    samples,
+    time_limits,
+)
 from heli_jax.report.frequency import sample_time
-from heli_jax.report.style import Panels, label, legend_above, line, panels, samples, subtitle
+from heli_jax.report.style import label
 from heli_jax.simulation.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
-
-def response(signals: Signals, output: str, model: Model) -> Panels:
+def response(signals: Signals, output: str, model: Model) -> Chart:
     """Measured and simulated output, the residual, and the inputs, over time."""
+    unit, t = naming.unit(model.Outputs, output), signals.log_times
+    residual = samples("", t, signals.residual(output), style.VERMILLION, 0.7)
     # In the model's order: a log may have its columns in any, and figures shall be comparable.
     inputs = [n for n in naming.names(model.Inputs) if n in signals.inputs]
-    axes = panels(4.0 + 0.8 * len(inputs), [2.4, 1.0, *[0.8] * len(inputs)])
+    held = {n: Series("", t, signals.inputs[n], style.BLACK, "step", width=0.8) for n in inputs}
+    panels = (
+        panel(label(output, unit), _measured_and_simulated(signals, output), 1.9),
+        panel(label("residual", unit), [residual], 0.8, levels=(0.0,)),
+        *(panel(label(n, naming.unit(model.Inputs, n)), [s], 0.6) for n, s in held.items()),
+    )
+    # Only panels of one flight share cursor and zoom: those of two have no moment in common.
+    of, words = signals.flight, time_label(signals.log_start)
+    return Chart(_agreement(signals, output), words, time_limits(t), panels, of=of)
+
+
+def overview(signals: Signals, output: str, model: Model) -> Chart:
+    """Measured and simulated output over time, and nothing else."""
     unit = naming.unit(model.Outputs, output)
-    top, below, *rest = axes
-    t = signals.log_times
+    panels = (panel(label(output, unit), _measured_and_simulated(signals, output), 2.2),)
+    words, limits = time_label(signals.log_start), time_limits(signals.log_times)
+    return Chart(_agreement(signals, output), words, limits, panels, of=signals.flight)
+
+
+def _measured_and_simulated(signals: Signals, output: str) -> tuple[Series, Series]:
     # The measured line is the wider and lies behind, so that it still shows as a rim where the
     # simulation covers it.
-    samples(top, t, signals.measured[output], color=style.PALE, lw=1.9, label="measured")
-    line(top, t, signals.simulated[output], color=style.BLUE, lw=0.9, label="simulated")
-    top.set_ylabel(label(output, unit))
-    top.set_title(_agreement(signals, output), loc="left")
-    legend_above(top)
-    residual = signals.residual(output)
-    samples(below, t, residual, color=style.VERMILLION, lw=0.7)
-    below.axhline(0.0, color="#444444", lw=0.6)
-    below.set_ylabel(label("residual", unit))
-    for ax, name in zip(rest, inputs, strict=True):
-        line(ax, t, signals.inputs[name], color=style.BLACK, lw=0.8, drawstyle="steps-post")
-        ax.set_ylabel(label(name, naming.unit(model.Inputs, name)))
-    axes[-1].set_xlabel(time_label(signals.log_start))
-    # Only panels of one flight share cursor and zoom: those of two have no moment in common.
-    axes[0].figure.set_label(signals.flight)
-    # A record of one sample has no duration, and matplotlib warns of an axis without length.
-    top.set_xlim(t[0], t[-1] if t.size > 1 else t[0] + 1.0)
-    return axes
+    t = signals.log_times
+    simulated = Series("simulated", t, signals.simulated[output], style.BLUE, width=0.9)
+    return samples("measured", t, signals.measured[output], style.PALE, 1.9), simulated
 
 
 def time_label(log_start: float | None) -> str:
@@ -76,37 +84,26 @@ def _agreement(signals: Signals, output: str) -> str:
     return f"{output}, {style.short(signals.flight)}: {source}{vaf}"
 
 
-def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Panels:
+def rls_history(baseline: Baseline, *, log_start: float | None = None) -> Chart:
     """Every coefficient of the recursive least squares over time, the a's above the b's.
 
     Args:
         log_start: time in the log of its flight's first sample [s], where there is a log.
     """
-    n, history = baseline.order, baseline.history
-    begin = log_start or 0.0
+    n, history, begin = baseline.order, baseline.history, log_start or 0.0
     t = begin + baseline.dt * np.arange(history.shape[0])
-    # The right margin holds the legends, which have a line for each of up to n + 1 coefficients.
-    axes = panels(4.4, [1.0, 1.0], right=0.75)
-    groups = (
-        (axes[0], range(n), [f"-a{i + 1}" for i in range(n)]),
-        (axes[1], range(n, history.shape[1]), [f"b{i}" for i in range(history.shape[1] - n)]),
+    panels = (
+        _coefficients("-a", t, history[:, :n], [f"-a{i + 1}" for i in range(n)]),
+        # b_i is output over input in SI, and each has the same unit; the a's are plain numbers.
+        _coefficients("b (SI)", t, history[:, n:], [f"b{i}" for i in range(history.shape[1] - n)]),
     )
-    for ax, columns, names in groups:
-        _draw_coefficients(ax, t, history[:, list(columns)], names)
-    axes[0].set_title(f"RLS coefficients over the record, order {n}", loc="left")
-    subtitle(
-        axes[0], f"{baseline.input} to {baseline.output}; scaled to the second half of the record"
-    )
-    axes[0].set_ylabel("-a")
-    # b_i is output over input in SI, and each has the same unit; the a's are plain numbers.
-    axes[1].set_ylabel("b (SI)")
-    axes[1].set_xlabel(time_label(log_start))
-    axes[0].figure.set_label(baseline.flight)
-    axes[0].set_xlim(begin, max(t[-1], begin + baseline.dt))
-    return axes
+    note = f"{baseline.input} to {baseline.output}; scaled to the second half of the record"
+    title = f"RLS coefficients over the record, order {n}"
+    limits = begin, max(float(t[-1]), begin + baseline.dt)
+    return Chart(title, time_label(log_start), limits, panels, note, of=baseline.flight)
 
 
-def _draw_coefficients(ax: "Axes", t: np.ndarray, values: np.ndarray, names: list[str]) -> None:
+def _coefficients(words: str, t: np.ndarray, values: np.ndarray, names: list[str]) -> Panel:
     """Columns of values (N, k) over t (N,), by their names."""
     # What they do in the second half of the record, and as much room again; where one alone has
     # come to rest the range is zero: then a part of its value. The first samples, with P(0) = 1e12
@@ -115,13 +112,14 @@ def _draw_coefficients(ax: "Axes", t: np.ndarray, values: np.ndarray, names: lis
     later = later[np.isfinite(later)]
     low, high = (float(later.min()), float(later.max())) if later.size else (0.0, 0.0)
     margin = 0.5 * (high - low) or 0.1 * abs(high) or 1.0
-    ax.set_ylim(low - margin, high + margin)
-    for k, name in enumerate(names):
-        inside = np.clip(values[:, k], low - 5 * margin, high + 5 * margin)
+    inside = np.clip(values, low - 5 * margin, high + 5 * margin)
+    colours = style.CYCLE
+    series = [
         # A high order has more coefficients than the palette has colours.
-        dashes = "-" if k < len(style.CYCLE) else "--"
-        line(ax, t, inside, color=style.CYCLE[k % len(style.CYCLE)], ls=dashes, label=name)
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0)
+        Series(name, t, inside[:, k], colours[k % len(colours)], dashed=k >= len(colours))
+        for k, name in enumerate(names)
+    ]
+    return panel(words, series, 1.45, limits=(low - margin, high + margin))
 
 
 def residual_correlation(
@@ -130,7 +128,7 @@ def residual_correlation(
     *,
     together: int = 1,
     test: Whiteness | None = None,
-) -> Panels:
+) -> Chart:
     """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
     input, with 99 % bands.
 
@@ -146,59 +144,47 @@ def residual_correlation(
         seen = np.flatnonzero(~np.isnan(whole))
         dt *= float(np.median(np.diff(seen)))
     n, lags = residual.size, lags_for(residual.size)
-    inputs = list(signals.inputs)
-    axes = panels(2.4 + 1.6 * len(inputs), [1.2, *[1.0] * len(inputs)], sharex=False)
     # What the test of whiteness counts, missing samples left out; without lag 0, at which an
     # autocorrelation is 1 whatever the residual.
-    at, r, pairs, whole = seen_autocorrelation(residual)
-    _stems(axes[0], dt * at, r * whole, band99(pairs, whole))
-    axes[0].set_xlim(0.0, dt * (at[-1] + 0.5))
-    axes[0].set_ylabel("autocorrelation")
-    _head(axes[0], signals, output, test or whiteness(residual, together))
-    for ax, name in zip(axes[1:], inputs, strict=True):
+    at, r, pairs, parts = seen_autocorrelation(residual)
+    panels = [_stems("autocorrelation", dt * at, r * parts, band99(pairs, parts))]
+    for name in signals.inputs:
         # Both signs: correlation at negative lags means that the input answers the residual (a
         # pilot, a controller), or that the clocks of the two differ.
         c = cross_correlation(signals.inputs[name][seen], residual, lags)
-        band = np.full(c.size, BAND99 / np.sqrt(n))
-        _stems(ax, dt * np.arange(-lags, lags + 1), c, band)
-        ax.set_xlim(-dt * (lags + 0.5), dt * (lags + 0.5))
-        ax.set_ylabel(f"with {name}")
-    axes[-1].set_xlabel("lag [s]" + (" (positive: the input came first)" if inputs else ""))
-    return axes
-
-
-def _head(ax: "Axes", signals: Signals, output: str, test: Whiteness) -> None:
-    """Title and subtitle: what of which flight, and the test of whiteness."""
+        limit = np.full(c.size, BAND99 / np.sqrt(n))
+        panels.append(_stems(f"with {name}", dt * np.arange(-lags, lags + 1), c, limit))
+    test = test or whiteness(residual, together)
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"
-    flight = style.short(signals.flight)
-    ax.set_title(f"{what} of {output}, {flight}: {result}", loc="left")
     lag1 = f"{test.lag1:+.2f}".replace("-", "−")
-    subtitle(
-        ax,
+    words = "lag [s]" + (" (positive: the input came first)" if signals.inputs else "")
+    reach = dt * (max(lags, int(at[-1])) + 0.5)
+    return Chart(
+        f"{what} of {output}, {style.short(signals.flight)}: {result}",
+        words,
+        (-reach if signals.inputs else 0.0, reach),
+        tuple(panels),
         f"{percent(test.outside, 1)} of {test.lags} lags outside the 99 % band; "
         f"{lag1} at one sample; Ljung-Box p = {number(test.p_value, 2)}",
+        of=signals.flight,
     )
 
 
-def _stems(ax: "Axes", x: np.ndarray, y: np.ndarray, band: np.ndarray) -> None:
-    """Stems from zero over a band (lags,); those outside it in another colour and thicker."""
-    ax.fill_between(x, -band, band, color=style.SKY, alpha=0.35, lw=0, label="99 % band")
-    outside = np.abs(y) > band
-    for which, color, width, words in (
-        (~outside, style.GREY, 0.6, "within the 99 % band"),
-        (outside, style.VERMILLION, 0.9, "outside it"),
+def _stems(words: str, x: np.ndarray, y: np.ndarray, limit: np.ndarray) -> Panel:
+    """Stems from zero over a band (lags,); those outside it in another colour."""
+    outside = np.abs(y) > limit
+    series = [band(x, -limit, limit, style.SKY)]
+    for which, color, name in (
+        (~outside, style.GREY, "within the 99 % band"),
+        (outside, style.VERMILLION, "outside it"),
     ):
-        # One path, broken by NaN: stem() and vlines() write an element into the SVG for each of up
-        # to a thousand stems.
-        feet, gaps = np.zeros(which.sum()), np.full(which.sum(), np.nan)
-        stems = np.stack([feet, y[which], gaps], axis=1).ravel()
-        ax.plot(np.repeat(x[which], 3), stems, color=color, lw=width, label=words)
-    ax.axhline(0.0, color="#444444", lw=0.6)
+        ends = np.minimum(y[which], 0.0), np.maximum(y[which], 0.0)
+        series.append(Series(name, x[which], y[which], color, "bars", *ends, width=1.4))
     # Twice the band at least: where all is white, the band shall look like one.
-    most = 2.0 * float(band.max())
-    low, high = min(-most, float(np.min(y))), max(most, float(np.max(y)))
-    ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+    least = 2.0 * float(limit.max()) * np.array([-1.0, 1.0])
+    limits = limits_of([*series, Series("", least, least, "")])
+    return panel(words, series, 1.1, limits=limits, levels=(0.0,))
 
 
 _APART = "rotor_speed"
@@ -215,14 +201,10 @@ _STILL = 0.05
 and not drawn as if it were not"""
 _LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
 """by unit the span of an axis at least: about what the sensors of such a machine tell apart"""
-_HEIGHT, _MARGINS = 1.25, 1.1
-"""of a panel, and what is around them [inch]"""
-_LEGEND = 1.05
-"""right margin that holds the legends [inch]"""
 # States and signals of a model are classes of the user's own, with arrays (N,): annotated Any.
 
 
-def motion(run: Trajectory, model: Model) -> Panels:
+def motion(run: Trajectory, model: Model) -> Chart:
     """The outputs over time, those of a unit together: position, velocity, attitude, rates.
 
     Shaded where the model's range was left.
@@ -231,11 +213,11 @@ def motion(run: Trajectory, model: Model) -> Panels:
     groups = []
     for unit, names in _by_unit(model.Outputs, shown):
         kind = _KINDS.get(unit or "", names[0]) if len(names) > 1 else names[0]
-        groups.append((kind, unit, {n: getattr(run.outputs, n) for n in names}, {}))
+        groups.append((kind, unit, {n: getattr(run.outputs, n) for n in names}))
     return _over_time(run, f"Motion of {model.name}", groups)
 
 
-def sticks(run: Trajectory, model: Model) -> Panels:
+def sticks(run: Trajectory, model: Model) -> Chart:
     """The inputs as they acted, and the rotor's speed where the model has it."""
     groups = []
     for unit, names in _by_unit(model.Inputs, list(naming.names(model.Inputs))):
@@ -243,12 +225,10 @@ def sticks(run: Trajectory, model: Model) -> Panels:
         if unit == "m":
             unit, values = _short(values)
         kind = "wind" if names[0].startswith("wind") else "sticks"
-        # Held from its sample to the next, as the simulation has it.
-        held = {"drawstyle": "steps-post"}
-        groups.append((kind if len(names) > 1 else names[0], unit, values, held))
+        groups.append((kind if len(names) > 1 else names[0], unit, values))
     if _APART in naming.names(model.Outputs):
         values = {_APART: getattr(run.outputs, _APART)}
-        groups.append(("rotor speed", naming.unit(model.Outputs, _APART), values, {}))
+        groups.append(("rotor speed", naming.unit(model.Outputs, _APART), values))
     return _over_time(run, f"Sticks of {model.name}", groups)
 
 
@@ -270,45 +250,42 @@ def _short(values: dict[str, np.ndarray]) -> tuple[str, dict[str, np.ndarray]]:
     return unit, {name: factor * v for name, v in values.items()}
 
 
-# Of each panel the words and the unit of its axis, what it shows by name, and how lines look.
-type _Shown = tuple[str, str | None, Mapping[str, ArrayLike], Mapping[str, Any]]
+# Of each panel the words and the unit of its axis, and what it shows by name.
+type _Shown = tuple[str, str | None, Mapping[str, ArrayLike]]
 
 
-def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Panels:
-    n, t = len(groups), np.asarray(run.times)
-    axes = panels(_MARGINS + _HEIGHT * n, [1.0] * n, right=_LEGEND)
-    for ax, (kind, unit, values, look) in zip(axes, groups, strict=True):
-        for (name, y), color in zip(values.items(), itertools.cycle(style.CYCLE), strict=False):
-            line(ax, t, y, color=color, lw=1.1, label=name, **look)
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2, borderaxespad=0.4)
-        ax.set_ylabel(label(kind, unit))
-        _not_magnified(ax, np.concatenate([np.ravel(np.asarray(v)) for v in values.values()]), unit)
-    axes[0].set_title(title, loc="left")
-    axes[-1].set_xlabel("time [s]")
-    axes[0].set_xlim(t[0], t[-1] if t.size > 1 else t[0] + 1.0)
+def _over_time(run: Trajectory, title: str, groups: Sequence[_Shown]) -> Chart:
+    t, note, shades = np.asarray(run.times), "", []
     left = [name for name, out in run.outside.items() if np.any(out)]
     if left:
         # One shade for all limits together: their names stand above, and several would only darken.
-        subtitle(axes[0], f"shaded where the model's range is left: {', '.join(left)}")
+        note = f"shaded where the model's range is left: {', '.join(left)}"
         outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
         # A zero at either end makes an edge of a stretch that begins or ends with the record.
         edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(int), [0]])))
         for begin, end in edges.reshape(-1, 2).tolist():
             # Up to the next sample, so that a single one outside can be seen.
-            for ax in axes:
-                last = float(t[min(end, t.size - 1)])
-                ax.axvspan(float(t[begin]), last, color=style.ORANGE, alpha=0.22, lw=0, zorder=0)
-    return axes
+            shades.append((float(t[begin]), float(t[min(end, t.size - 1)])))
+    panels = []
+    for kind, unit, values in groups:
+        # Inputs are held from a sample to the next, as the simulation has it.
+        series = [
+            Series(name, t, np.asarray(y), style.CYCLE[k % len(style.CYCLE)])
+            for k, (name, y) in enumerate(values.items())
+        ]
+        if set(values) <= set(naming.names(type(run.inputs))):
+            series = [s._replace(kind="step") for s in series]
+        limits = _not_magnified(series, unit)
+        panels.append(panel(label(kind, unit), series, 1.1, limits=limits, shades=tuple(shades)))
+    return Chart(title, "time [s]", time_limits(t), tuple(panels), note)
 
 
-def _not_magnified(ax: "Axes", values: np.ndarray, unit: str | None) -> None:
-    """An axis that does not blow up what is nearly constant to the height of its panel."""
-    seen = values[np.isfinite(values)]
-    if not seen.size:
-        return
-    low, high = float(seen.min()), float(seen.max())
+def _not_magnified(series: Sequence[Series], unit: str | None) -> tuple[float, float]:
+    """Limits that do not blow up what is nearly constant to the height of its panel."""
+    seen = np.concatenate([s.y[np.isfinite(s.y)] for s in series])
+    low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 0.0)
     least = max(_STILL * max(abs(low), abs(high)), _LEAST.get(unit or "", 0.0))
     if high - low < least:
         middle = 0.5 * (low + high)
-        # With the margin of 5 % that matplotlib leaves to either side.
-        ax.set_ylim(middle - 0.55 * least, middle + 0.55 * least)
+        return middle - 0.55 * least, middle + 0.55 * least
+    return limits_of(series)

@@ -16,8 +16,8 @@ import numpy as np
 
 from heli_jax.finding import note
 from heli_jax.flights import progress
-from heli_jax.flights.digest import Digest
 from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
+from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 

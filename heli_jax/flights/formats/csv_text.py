@@ -20,8 +20,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
-from heli_jax.flights.csv_dates import is_date, seconds_of_dates
-from heli_jax.flights.digest import Digest
+from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import (
     Budget,
     Survey,
@@ -32,7 +31,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import time_unit
+from heli_jax.flights.time_units import is_date, seconds_of_dates, time_unit
 from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which

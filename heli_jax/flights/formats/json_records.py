@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from heli_jax.finding import LEFT_OUT, note
-from heli_jax.flights.array_table import ArrayTable, DataSets
-from heli_jax.flights.csv_dates import is_date, seconds_of_dates
+from heli_jax.flights.formats.arrays import ArrayTable, DataSets
 from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.flights.time_units import is_date, seconds_of_dates
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 500 * 10**6
@@ -45,7 +45,7 @@ def open_json(path: Path) -> ArrayTable:
         _add(sets, name, values, texts)
     if texts:
         words = f"left out, since they hold text: {listed(map(shown, texts))}"
-        sets.note(note(LEFT_OUT, words, *texts))
+        sets.notes.append(note(LEFT_OUT, words, *texts))
     return sets.table(where, "json", data)
 
 

@@ -1,0 +1,1 @@
+"""Readers of logs, one file a format: each opens a path and returns a `Table` or `ChannelLog`s."""

@@ -1,0 +1,283 @@
+"""Logs in columns of Apache: Parquet, and Arrow's own files and streams (.feather, .arrow)."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+from heli_jax.finding import Finding
+from heli_jax.flights.progress import Digest
+from heli_jax.flights.table import (
+    Budget,
+    Survey,
+    column,
+    require_columns,
+    require_few_columns,
+    wrong,
+)
+from heli_jax.regular_file import open_regular, read_regular, size_words
+
+# Imported again within the functions that need it, as in `csv_text`.
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ARROW_MARK = b"ARROW1"
+"""what files of Arrow begin with, and those of Feather"""
+_STREAM = b"\xff\xff\xff\xff"
+_LARGEST, _LARGEST_ARROW = 16 * 10**9, 10**9
+"""bytes: of Parquet the columns asked for go into memory, of Arrow the whole file"""
+_LONGEST_FOOTER = 64 * 10**6
+_AT_ONCE = 2 * 10**6
+"""cells that are decoded before their rows are counted: 16 MB of numbers"""
+
+
+def open_parquet(path: Path) -> "ColumnTable":
+    """Open a Parquet file and read its schema; only the columns asked for are read later.
+
+    Raises:
+        InputError: it is no Parquet file, it is broken, or larger than a log may be.
+        OSError: it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    where = str(path)
+    with open_regular(path, "a log in Parquet", _LARGEST) as opened:
+        size = os.fstat(opened.fileno()).st_size
+        # Before anything goes through the whole file: what ends otherwise is none of Parquet.
+        _check_end(where, opened, size)
+        try:
+            file = pq.ParquetFile(path)
+            schema, metadata = file.schema_arrow, file.metadata
+        # pyarrow raises UnicodeDecodeError where the name of a column is no text.
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
+            raise wrong(where, "is no whole Parquet file") from e
+        require_few_columns(where, metadata.num_columns)
+        # Text stays as its dictionary: a few words that every row repeats can be large.
+        texts = [f.name for f in schema if pa.types.is_string(f.type) or pa.types.is_binary(f.type)]
+        if texts:
+            file = pq.ParquetFile(path, read_dictionary=texts)
+
+    def pieces(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+        # Counted: a damaged column can claim, and decode to, any number of rows.
+        rows = 0
+        try:
+            for piece in file.iter_batches(
+                max(_AT_ONCE // max(len(names), 1), 1), columns=list(names)
+            ):
+                rows += piece.num_rows
+                if rows > metadata.num_rows:
+                    break
+                piece.validate(full=True)  # a damaged page can decode to lengths that do not fit
+                yield piece
+        except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
+            raise wrong(where, "is no whole Parquet file") from e
+        if rows != metadata.num_rows:
+            raise wrong(where, "is no whole Parquet file")
+
+    # Of groups of rows: what is said of a single column is not asked, since of some damage to it
+    # pyarrow ends the whole process.
+    groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
+    unpacked = sum(group.total_byte_size for group in groups)
+    count, digest = metadata.num_rows, Digest(path)
+    return ColumnTable(where, "parquet", size, digest, schema, count, pieces, unpacked)
+
+
+def _check_end(path: str, file: BinaryIO, size: int) -> None:
+    """Refuse a file whose end is not that of a Parquet file, or says that it is mostly header."""
+    # A Parquet file ends with its metadata, their length (4 bytes, little-endian) and its mark:
+    # PAR1, or PARE where the metadata are encrypted. 12 bytes are both marks and the length.
+    file.seek(max(size - 8, 0))
+    end = file.read(8)
+    length = int.from_bytes(end[:4], "little")
+    if end[4:] not in (b"PAR1", b"PARE") or length + 12 > size:
+        raise wrong(path, "is no whole Parquet file")
+    if length > _LONGEST_FOOTER:
+        words = f"{size_words(_LONGEST_FOOTER)}, got {size_words(length)}"
+        raise wrong(path, f"expected a footer of at most {words}")
+
+
+def open_arrow(path: Path) -> "ColumnTable":
+    """Read a file or a stream of Arrow.
+
+    Raises:
+        InputError: it is none, it is broken, or larger than a log may be.
+        OSError: it cannot be read.
+    """
+    import pyarrow as pa
+
+    where = str(path)
+    data = read_regular(path, "a log in Arrow's format", _LARGEST_ARROW)
+    if not data.startswith((ARROW_MARK, _STREAM)):
+        raise wrong(where, "is no file of Arrow, expected one that begins with its mark")
+    source, budget, pieces = pa.BufferReader(pa.py_buffer(data)), Budget(where, len(data)), []
+    try:
+        if data.startswith(_STREAM):
+            file = batches = pa.ipc.open_stream(source)
+        else:
+            file = pa.ipc.open_file(source)
+            batches = (file.get_batch(i) for i in range(file.num_record_batches))
+        for batch in batches:
+            budget.take(max(batch.nbytes, 8 * batch.num_rows * batch.num_columns))
+            batch.validate(full=True)
+            pieces.append(batch)
+        table = pa.Table.from_batches(pieces, file.schema)
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, UnicodeDecodeError, MemoryError) as e:
+        raise wrong(where, f"is no whole file of Arrow ({type(e).__name__})") from e
+    require_few_columns(where, len(table.schema))
+
+    def of_columns(names: Sequence[str]) -> "Iterator[pa.RecordBatch]":
+        # By place: of two columns of one name `select` takes neither.
+        flat = (not pa.types.is_nested(f.type) for f in table.schema)
+        kept = [i for i, f in enumerate(flat) if f and table.column_names[i] in names]
+        yield from table.select(kept).to_batches()
+
+    digest = Digest(data)
+    return ColumnTable(
+        where, "arrow", len(data), digest, table.schema, table.num_rows, of_columns, 0
+    )
+
+
+class ColumnTable:
+    """A `Table` on columns of Arrow, which come in pieces."""
+
+    notes: tuple[Finding, ...] = ()
+
+    def __init__(
+        self,
+        path: str,
+        kind: str,
+        size: int,
+        digest: Digest,
+        schema: "pa.Schema",
+        n_rows: int,
+        pieces: "Callable[[Sequence[str]], Iterator[pa.RecordBatch]]",
+        unpacked: int,
+    ) -> None:
+        """
+        Args:
+            pieces: of columns by name.
+            unpacked: bytes of all columns once they are unpacked, where the file states them.
+        """
+        if not len(schema) or not n_rows:
+            raise wrong(path, "holds no rows, expected a log")
+        self.path, self.format, self.size = path, kind, size
+        self._digest, self._schema, self._n_rows = digest, schema, n_rows
+        self._pieces, self._unpacked, self._budget = pieces, unpacked, Budget(path, size)
+        self.names: tuple[str, ...] = tuple(schema.names)
+        stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in schema}
+        self.units: Mapping[str, str] = {
+            name: unit.decode("utf-8", "replace") for name, unit in stated.items()
+        }
+
+    @property
+    def sha256(self) -> str:
+        """Of the file: a log's columns are read in less time."""
+        try:
+            return self._digest.hex()
+        except OSError as e:
+            raise wrong(self.path, f"cannot be read ({e.strerror or type(e).__name__})") from e
+
+    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """The columns as float64 (N,), NaN where a value is null.
+
+        Raises:
+            InputError: a column is missing, there twice, or of a type that is no number; the
+                file is broken.
+        """
+        require_columns(self.path, self.names, names)
+        for name in names:
+            kind = self._schema.field(name).type
+            if not _is_number(kind):
+                raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
+        needed = sorted(set(names))
+        self._budget.require(8 * self._n_rows * len(needed))
+        # Each piece goes to its place as it is decoded: all of them together, and an array made of
+        # them, would be three times the numbers.
+        numbers = {name: np.empty(self._n_rows) for name in needed}
+        first = 0
+        for piece in self._pieces(needed):
+            for name in needed:
+                numbers[name][first : first + piece.num_rows] = _floats(piece.column(name))
+            first += piece.num_rows
+        self._digest.begin()
+        return {name: numbers[name] for name in names}
+
+    def survey(self) -> list[Survey]:
+        """Every column; what is not a number counts as text. Lists and records within cells are
+        not read, so that all of their cells count as filled."""
+        import pyarrow as pa
+
+        flat = [not pa.types.is_nested(f.type) for f in self._schema]
+        named = zip(self.names, flat, strict=True)
+        data = self._read(list(dict.fromkeys(name for name, is_flat in named if is_flat)))
+        # By name: two columns may have the same, and come in an order of their own.
+        columns: dict[str, list[pa.ChunkedArray]] = {}
+        for name, x in zip(data.column_names, data.columns, strict=True):
+            columns.setdefault(name, []).append(x)
+        surveys = []
+        for name, is_flat in zip(self.names, flat, strict=True):
+            if not is_flat:
+                surveys.append(Survey(name, None, self._n_rows))
+                continue
+            x = columns[name].pop(0)
+            values = _floats(x) if _is_number(x.type) else None
+            surveys.append(Survey(name, values, len(x) - x.null_count))
+        return surveys
+
+    def place(self, row: int) -> str:
+        """`row 1` is the first."""
+        return f"row {row + 1}"
+
+    def cell_text(self, name: str, row: int) -> str:
+        """What stands in a cell, in words."""
+        value = self._read([name]).column(name)[row].as_py()
+        return "nothing" if value is None else repr(value)[:40]
+
+    def time_unit(self, name: str) -> str | None:
+        """`s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
+        # By place: of two columns of one name the first, where `field` would refuse the name.
+        kind = self._schema.field(self.names.index(name)).type
+        return str(kind.unit) if _is_clock(kind) else None
+
+    def _read(self, names: Sequence[str]) -> "pa.Table":
+        """The columns, none of them of lists or records."""
+        import pyarrow as pa
+
+        self._budget.require(max(8 * self._n_rows * len(names), self._unpacked))
+        return pa.Table.from_batches(list(self._pieces(names)))
+
+
+def _is_clock(kind: "pa.DataType") -> bool:
+    import pyarrow as pa
+
+    types = pa.types
+    return any(test(kind) for test in (types.is_timestamp, types.is_duration, types.is_time))
+
+
+def _is_number(kind: "pa.DataType") -> bool:
+    import pyarrow as pa
+
+    types = pa.types
+    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
+    tests = (types.is_integer, types.is_floating, types.is_decimal, types.is_boolean, _is_clock)
+    return any(test(kind) for test in tests)
+
+
+def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
+    """Numbers, or ticks of a clock, as float64 (N,), NaN where null."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    # Ticks as whole numbers first: no cast goes from stamps to floating point.
+    if _is_clock(values.type):
+        values = values.cast(pa.int32() if pa.types.is_time32(values.type) else pa.int64())
+    # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
+    # calendar's stamps round to 256 ns.
+    values = pc.cast(values, pa.float64(), safe=False)
+    # A piece of a column has to be asked to copy where it has nulls; a column copies anyway.
+    copied = {"zero_copy_only": False} if isinstance(values, pa.Array) else {}
+    return np.asarray(values.to_numpy(**copied), dtype=np.float64)

@@ -1,0 +1,336 @@
+"""MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5) files, read by SciPy and h5py in a process of
+its own.
+
+The libraries may loop, crash or fill the memory over a damaged file, and hear no Ctrl-C meanwhile.
+So this module starts itself as a program: it reads one file within limits, writes a line of JSON
+and the arrays behind it, as bytes, to standard output, and ends.
+"""
+
+import contextlib
+import importlib.util
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax import import_path
+from heli_jax.errors import InputError
+from heli_jax.finding import LEFT_OUT, note
+from heli_jax.flights.formats.arrays import (
+    LARGEST,
+    MOST_ELEMENTS,
+    PACKING,
+    UNIT_ATTRIBUTES,
+    ArrayTable,
+    DataSets,
+    guarded,
+    holds_numbers,
+    text_of,
+)
+from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.regular_file import read_regular
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+NETCDF_MAGICS = (b"CDF\x01", b"CDF\x02")
+MATLAB_MAGIC = b"MATLAB "
+_SECONDS, _RATE = 20, 10**7
+"""processor time [s] that a file may take, and bytes for which it has a second more"""
+_PATIENCE = 10
+"""times as long by the clock"""
+_BESIDE = 10**9
+"""bytes for Python and its libraries"""
+_COPIES = 4
+"""times that numbers may be in memory while they are unpacked"""
+_MOST_REFERENCES = 1000
+"""of an array of references that are followed"""
+_DEEPEST = 10
+"""groups, structures and references within one another"""
+_LONGEST_TEXT = 1000
+_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+"""the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
+
+
+def open_mat(path: Path) -> ArrayTable:
+    """A MATLAB file, of version 7.3 too where h5py is installed.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a MATLAB file", LARGEST)
+    # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
+    is_hdf5 = data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3")
+    return _read_apart(path, "mat 7.3" if is_hdf5 else "mat", data)
+
+
+def open_netcdf(path: Path) -> ArrayTable:
+    """A NetCDF file, of version 4 where h5py is installed; errors as of `open_mat`."""
+    data = read_regular(path, "a NetCDF file", LARGEST)
+    if data.startswith(HDF5_MAGIC):
+        return _read_apart(path, "netcdf", data)
+    if not data.startswith(NETCDF_MAGICS):
+        raise wrong(str(path), "is no NetCDF file, expected one that begins with its mark")
+    return _read_apart(path, "netcdf 3", data)
+
+
+def open_hdf5(path: Path) -> ArrayTable:
+    """An HDF5 file, where h5py is installed; errors as of `open_mat`."""
+    data = read_regular(path, "an HDF5 file", LARGEST)
+    if not data.startswith(HDF5_MAGIC):
+        raise wrong(str(path), "is no HDF5 file, expected one that begins with its mark")
+    return _read_apart(path, "hdf5", data)
+
+
+def _read_apart(path: Path, kind: str, data: bytes) -> ArrayTable:
+    """The file as `main` reads it in a process of its own.
+
+    Raises:
+        InputError: of that process, or it ended otherwise, or went on for too long.
+    """
+    what = _READERS[kind][0]
+    if what == "HDF5 file" and importlib.util.find_spec("h5py") is None:
+        problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
+        raise wrong(str(path), problem)
+    seconds = _SECONDS + len(data) // _RATE
+    arguments = (str(path), kind, str(len(data)), str(seconds))
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "heli_jax.flights.formats.library_arrays", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=import_path.environment() | {"OPENBLAS_NUM_THREADS": "1"},
+    )
+    # Where the system sets no limit to its processor time.
+    watch = threading.Timer(_PATIENCE * seconds, process.kill)
+    watch.daemon = True
+    watch.start()
+    try:
+        with process:
+            answer: Any = process.stdout
+            head = json.loads(answer.readline() or "{}")
+            arrays = {}
+            for name, dtype, size in head.get("arrays", ()):
+                arrays[name] = np.empty(size, dtype)
+                answer.readinto(arrays[name].view(np.uint8))
+    finally:
+        watch.cancel()
+    if "error" in head:
+        raise InputError(head["error"])
+    if process.returncode:
+        slow = f"took more than {seconds} s to read: it is damaged, or save it without compression"
+        ended = process.returncode in (-signal.SIGKILL, -getattr(signal, "SIGXCPU", 0))
+        raise wrong(str(path), slow if ended else f"is no whole {what} (its reader crashed)")
+    notes = tuple(
+        note(code, words, *names, value=value) for code, words, names, value in head["notes"]
+    )
+    kind = "netcdf" if kind == "netcdf 3" else kind
+    return ArrayTable(str(path), kind, data, arrays, head["units"], notes)
+
+
+def main() -> None:
+    """Read the file that the arguments name: its path, kind, size [bytes] and a limit [s]."""
+    path, kind, size, seconds = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+    sets = DataSets(Budget(str(path), size))
+    # The default ends the process at once, also within a library.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    with contextlib.suppress(ImportError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        most = _BESIDE + _COPIES * sets.budget.most
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    arrays: Mapping[str, np.ndarray] = {}
+    try:
+        what, read = _READERS[kind]
+        guarded(path, what, lambda: read(path, sets))
+        arrays, units, notes = sets.vectors()
+        head = {
+            "arrays": [(name, x.dtype.str, x.size) for name, x in arrays.items()],
+            "units": units,
+            "notes": [(n.code, n.sentence, n.subjects, n.value) for n in notes],
+        }
+    except InputError as e:
+        head = {"error": str(e)}
+    sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")
+    for x in arrays.values():
+        sys.stdout.buffer.write(np.ascontiguousarray(x).data)
+
+
+def _netcdf_3(path: Path, sets: DataSets) -> None:
+    from scipy.io import netcdf_file
+
+    with netcdf_file(path, mmap=False) as file:
+        for name, variable in file.variables.items():
+            values: Any = variable.data
+            values = np.asarray(values)
+            # In the machine's own order of bytes.
+            values = values.astype(values.dtype.newbyteorder("="))
+            sets.add(str(name), values, variable._attributes)
+
+
+def _matlab(path: Path, sets: DataSets) -> None:
+    from scipy.io import loadmat
+
+    objects: dict[str, str] = {}
+
+    def take(name: str, value: Any, depth: int) -> None:
+        if not isinstance(value, np.ndarray) or depth > _DEEPEST:
+            return  # a sparse matrix, or a header
+        kind = value.dtype
+        if kind.names and "_Class" in kind.names:
+            objects[name] = str(value.ravel()[0]["_Class"])  # a table, a timetable, ...
+        elif kind.kind == "U":
+            texts = [text.strip("\0 ") for text in value.ravel()[:MOST_ELEMENTS].tolist()]
+            texts = [text for text in texts if len(text) <= _LONGEST_TEXT]
+            sets.labels |= dict(zip(_indexed(name, len(texts)), texts, strict=True))
+        elif kind.names or kind.kind == "O":
+            # Structures, or cells; in MATLAB's order, the columns first.
+            elements = value.ravel("F")[:MOST_ELEMENTS]
+            for path, element in zip(_indexed(name, value.size), elements, strict=False):
+                for field in kind.names or ():
+                    take(f"{path}.{field}", element[field], depth + 1)
+                if not kind.names:
+                    take(path, element, depth + 1)
+        else:
+            sets.add(name, value, {})
+
+    for name, value in loadmat(path).items():
+        if not name.startswith("__"):
+            take(name, value, 0)
+    if not objects:
+        return
+    if sets.longest < 2:
+        name, kind = next(iter(objects.items()))
+        problem = f"holds {shown(name)}, a {kind} of MATLAB, which is no array; save its numbers"
+        way = f"writetable or writetimetable({name}, 'flight.csv') writes what is read"
+        raise wrong(str(path), f"{problem} as arrays, or of a table {way}")
+    each = listed(f"{shown(n)} ({kind})" for n, kind in objects.items())
+    sets.notes.append(note(LEFT_OUT, f"objects of MATLAB are left out: {each}", *objects))
+
+
+def _indexed(name: str, count: int) -> list[str]:
+    """A path for each element of a list; the name itself of a single one."""
+    return [name] if count == 1 else [f"{name}[{i}]" for i in range(min(count, MOST_ELEMENTS))]
+
+
+class _Hdf5:
+    """The walk through a file. A structure of MATLAB has the path that it has in older versions:
+    the elements of cells and of arrays of structures are kept in a group `#refs#`, by names that
+    mean nothing, and are visited where they are referred to."""
+
+    # Any: h5py's classes have no annotations.
+    def __init__(self, path: Path, sets: DataSets, is_matlab: bool) -> None:
+        import h5py  # pyright: ignore[reportMissingImports]
+
+        self.path, self.sets, self.is_matlab, self.h5py = path, sets, is_matlab, h5py
+        self.seen: set[int] = set()
+        with h5py.File(path, "r") as file:
+            self.visit(file, "", 0)
+            for name in list(file.attrs)[:MOST_ELEMENTS]:
+                value = np.asarray(file.attrs[name])
+                # Single numbers, such as a rate.
+                if value.size == 1 and value.dtype.kind in "iuf" and name not in file:
+                    sets.add(name, np.float64(value).reshape(1), {})
+
+    def visit(self, item: Any, name: str, depth: int) -> None:
+        """A group with all that is in it, or a data set; each object once, whatever leads to it."""
+        address = self.h5py.h5o.get_info(item.id).addr
+        if address in self.seen or depth > _DEEPEST:
+            return
+        self.seen.add(address)
+        if isinstance(item, self.h5py.Dataset):
+            self.data_set(item, name, depth)
+        if not isinstance(item, self.h5py.Group):
+            return
+        for key in item:
+            link = item.get(key, getlink=True)
+            # Of a damaged file a name need be no text.
+            leaf = key if isinstance(key, bytes) else key.encode("utf-8", "surrogateescape")
+            leaf = leaf.decode("utf-8", "replace")
+            if isinstance(link, self.h5py.ExternalLink):
+                problem = f"links to another file, {shown(link.filename)}: expected all data in one"
+                raise wrong(str(self.path), problem, shown(leaf))
+            if isinstance(link, self.h5py.HardLink) and not (self.is_matlab and leaf[:1] == "#"):
+                between = "." if self.is_matlab else "/"
+                self.visit(item[key], f"{name}{between}{leaf}" if name else leaf, depth + 1)
+
+    def data_set(self, item: Any, name: str, depth: int) -> None:
+        """Take in one data set: texts, references or numbers."""
+        sets, size, kind = self.sets, int(item.size or 0), item.dtype
+        matlab_class = text_of(item.attrs.get("MATLAB_class", ""))
+        if matlab_class == "char":
+            if 0 < size <= _LONGEST_TEXT:
+                sets.labels[name] = "".join(map(chr, np.ravel(self.content(item))))
+        elif kind.kind == "O" and self.h5py.check_ref_dtype(kind) is not None:
+            if not self.is_matlab or not 0 < size <= _MOST_REFERENCES:
+                return
+            parent, _, field = name.rpartition(".")
+            # A cell has elements by itself, of structures each field has all elements'.
+            is_cell = bool(matlab_class) or not parent
+            for i, reference in enumerate(np.ravel(self.content(item))):
+                path = f"{name}[{i}]" if is_cell else f"{parent}[{i}].{field}"
+                if reference:
+                    self.visit(item.file[reference], path, depth + 1)
+        elif kind.kind in "SO":
+            if 0 < size <= MOST_ELEMENTS and kind.itemsize <= _LONGEST_TEXT:
+                texts: Sequence[Any] = list(np.ravel(self.content(item)))
+                if all(isinstance(t, bytes | str) and len(t) <= _LONGEST_TEXT for t in texts):
+                    sets.add_texts(name, texts)
+        elif not holds_numbers(kind, item.ndim):
+            sets.leave_out(name, kind, item.shape)
+        elif not text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
+            # Of one in pieces a piece is unpacked as a whole.
+            sets.budget.require(int(np.prod(item.chunks or (0,), dtype=object)) * kind.itemsize)
+            sets.budget.require(size * kind.itemsize)
+            # Of other attributes nothing is read: they may be of types that h5py does not know.
+            counting = (*PACKING, *UNIT_ATTRIBUTES)
+            attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
+            for field, values, own in _fields(name, self.content(item), attributes):
+                sets.add(field, values, own)
+
+    def content(self, item: Any) -> np.ndarray:
+        """All of a data set. Nothing else here reads one.
+
+        Raises:
+            InputError: it is kept in another file, any of which a log could name.
+        """
+        if item.is_virtual or item.external:
+            problem = "is kept in another file, expected its numbers in this one"
+            raise wrong(str(self.path), problem, f"data set {shown(str(item.name))}")
+        return np.asarray(item[()])
+
+
+def _fields(
+    name: str, values: np.ndarray, attributes: Mapping[str, Any]
+) -> Iterator[tuple[str, np.ndarray, Mapping[str, Any]]]:
+    """A data set, or the fields of its table as data sets in a group of its name, each with the
+    attributes that are its own."""
+    names = values.dtype.names
+    if names is None:
+        yield name, values, attributes
+        return
+    # What stands beside a table is of none of its fields, unless it is as many texts.
+    stated = next((attributes[n] for n in UNIT_ATTRIBUTES if n in attributes), ())
+    units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
+    for field, unit in zip(names, units, strict=True):
+        yield from _fields(f"{name}/{field}", values[field], {"units": unit})
+
+
+_READERS: dict[str, tuple[str, Any]] = {
+    "mat": ("MATLAB file", _matlab),
+    "netcdf 3": ("NetCDF file", _netcdf_3),
+    "mat 7.3": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=True)),
+    "netcdf": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=False)),
+    "hdf5": ("HDF5 file", lambda path, sets: _Hdf5(path, sets, is_matlab=False)),
+}
+"""what a file is called, and what reads it, by kind"""
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""Files of NumPy (.npy, .npz), without objects of Python."""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax.finding import LEFT_OUT, note
+from heli_jax.flights.formats.arrays import (
+    LARGEST,
+    MOST_ELEMENTS,
+    ArrayTable,
+    DataSets,
+    guarded,
+    holds_numbers,
+)
+from heli_jax.flights.table import Budget, listed, shown, wrong
+from heli_jax.regular_file import read_regular
+
+MAGIC = b"\x93NUMPY"
+_MOST_ARRAYS = 1000
+
+
+def open_numpy(path: Path) -> ArrayTable:
+    """A file of NumPy: one array (.npy), or several by name (.npz).
+
+    Without pickle, which would run what a file says: arrays of Python's objects are passed over.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    where = str(path)
+    data = read_regular(path, "a file of NumPy", LARGEST)
+    sets, objects = DataSets(Budget(where, len(data))), []
+
+    def read() -> None:
+        for name, content in _arrays(data, sets.budget):
+            file = io.BytesIO(content)
+            version = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+            shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
+            if dtype.hasobject:
+                objects.append(name)
+            # What is claimed beyond the bytes that there are would be allocated.
+            elif np.prod(shape, dtype=object) * dtype.itemsize > len(content) or not dtype.itemsize:
+                raise ValueError("cut off")
+            else:
+                _add(sets, name, np.load(io.BytesIO(content), allow_pickle=False))
+
+    guarded(path, "file of NumPy", read)
+    if objects:
+        words = f"objects of Python, which are not read: {listed(map(shown, objects))}"
+        if not sets.names:
+            problem = f"holds {words}; expected arrays of numbers, numpy.savez(FILE, t=t, p=p)"
+            raise wrong(where, problem)
+        sets.notes.append(note(LEFT_OUT, words, *objects))
+    return sets.table(where, "numpy", data)
+
+
+def _arrays(data: bytes, budget: Budget) -> Iterator[tuple[str, bytes]]:
+    """The arrays of a file by name, each as a .npy file has it."""
+    if data.startswith(MAGIC):
+        yield "data", data
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()[:_MOST_ARRAYS]
+        budget.take(sum(m.file_size for m in members))
+        for member in members:
+            if member.filename.endswith(".npy"):
+                yield member.filename.removesuffix(".npy"), archive.read(member)
+
+
+def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
+    kind = array.dtype.kind
+    if array.dtype.names is not None:
+        for field in array.dtype.names:
+            _add(sets, f"{name}.{field}" if name != "data" else field, array[field])
+    elif kind in "US" and 0 < array.size <= MOST_ELEMENTS:
+        sets.add_texts(name, [str(x)[:1000] for x in array.astype(str).ravel()])
+    elif kind in "mM":
+        unit, count = np.datetime_data(array.dtype)
+        if unit in ("s", "ms", "us", "ns") and count == 1:
+            ticks = array.astype(np.int64).astype(np.float64)
+            sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
+    elif holds_numbers(array.dtype, array.ndim):
+        # In the machine's own order of bytes.
+        sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
+    else:
+        sets.leave_out(name, array.dtype, array.shape)
