@@ -20,6 +20,7 @@ from heli_jax.analysis.operating_point import (
     operating_point,
 )
 from heli_jax.analysis.spectra import (
+    Spectra,
     partial_coherence,
     segment_transforms,
     size_of,

@@ -88,7 +88,7 @@ def expected_sd(
 
 
 def not_determined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str, ...]:
-    """Return the parameters that the whole record does not determine: then none of its parts does."""
+    """Return the parameters that the whole record does not determine, and so none of its parts."""
     verdict = verdict_of(problem, layout, e)
     return (*verdict.undetermined, *verdict.without_effect)
 
@@ -127,7 +127,7 @@ def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
 
 
 def unstated_gusts(problem: Problem) -> list[str]:
-    """Return the names of the sizes of disturbances that nobody stated; none without process noise."""
+    """Return the sizes of disturbances that nobody stated; none without process noise."""
     if problem.noise_model != "disturbance":
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]
