@@ -23,7 +23,7 @@ from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
 
 class Prior(NamedTuple):
-    """What is known of a parameter beforehand: a normal distribution, in the parameter's unit."""
+    """Prior knowledge of a parameter: a normal distribution, in the parameter's unit."""
 
     mean: float
     sd: float
@@ -169,7 +169,7 @@ class Problem:
 
     @property
     def noise_model(self) -> str:
-        """What the method takes the noise for (`Objective.noise_model`)."""
+        """The noise model of the method (`Objective.noise_model`)."""
         return objective_of(self.method).noise_model
 
     @property
@@ -214,7 +214,7 @@ class Problem:
 
     @property
     def noise_is_fixed(self) -> bool:
-        """Whether the measurement noise is taken as stated."""
+        """True if the measurement noise is taken as stated."""
         return self.noise_model == "disturbance" and "sigma_y" in self.fixed_noise
 
     @functools.cached_property

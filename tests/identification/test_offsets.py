@@ -87,6 +87,12 @@ def test_where_the_offset_is_estimated_unless_told(free, outputs, expected):
     assert problem_of(starts, outputs, Nuisance(input_offset=("d",))).offset_inputs == ("d",)
 
 
+def test_an_offset_that_drives_an_unstable_mode_is_no_bias():
+    for damping, expected in ((-2.0, ()), (2.0, ("d",))):
+        free = {"Lp": Free(damping), "Ld": Free(5.0)}
+        assert problem_of(free, ("p",), Nuisance()).offset_inputs == expected
+
+
 def test_a_stand_takes_the_offset_up_in_the_bias():
     rng = np.random.default_rng(0)
     flight = Flight(dt=DT, inputs={"x_roll": steps(rng, N, DT, 1e-6)}, outputs={"roll": np.ones(N)})

@@ -48,11 +48,7 @@ class Sensitivity(NamedTuple):
 
 
 def sensitivity_at(problem: Problem, layout: Layout, e: Evaluation) -> Sensitivity:
-    """Return the rows of the data of an evaluation.
-
-    Args:
-        layout: what stands where in the Jacobian's columns.
-    """
+    """Return the rows of the data of an evaluation."""
     unknowns, rows = relative_rows(problem, layout, e)
     # Of the unknowns that are no parameter of interest the first are shared by all flights.
     count = layout.first_nuisance - len(unknowns)
@@ -92,11 +88,7 @@ def expected_sd(
 
 
 def not_determined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str, ...]:
-    """Return the parameters that the whole record does not determine: then none of its parts does.
-
-    Args:
-        layout: what stands where.
-    """
+    """Return the parameters that the whole record does not determine, and so none of its parts."""
     verdict = verdict_of(problem, layout, e)
     return (*verdict.undetermined, *verdict.without_effect)
 
@@ -135,11 +127,7 @@ def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:
 
 
 def unstated_gusts(problem: Problem) -> list[str]:
-    """Return the names of the sizes of disturbances that nobody stated; none without process noise.
-
-    Args:
-        problem: with its vehicle, where a size may be stated.
-    """
+    """Return the sizes of disturbances that nobody stated; none without process noise."""
     if problem.noise_model != "disturbance":
         return []
     sizes = [d.sigma for d in disturbances_of(problem.model)]

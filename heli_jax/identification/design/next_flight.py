@@ -1,4 +1,4 @@
-"""What to fly next, by Fisher's information at the start values: further outputs and manoeuvres.
+"""Outputs and manoeuvres to add to a record, by Fisher's information at the start values.
 
 The Jacobian gets the rows of outputs that the log lacks, as the model shows them; and candidates of
 the same duration and amplitude as the record are flown, one input at a time: doublets, 3-2-1-1
@@ -167,7 +167,7 @@ class Candidate(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What the candidates would do to the parameter with the widest interval."""
+    """The effect of the candidates on the parameter with the widest interval."""
 
     parameter: str
     before: float

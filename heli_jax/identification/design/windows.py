@@ -221,11 +221,7 @@ def rank_windows(
 
 
 def why_excluded(flight: Flight, first: int, last: int) -> str:
-    """Return in words why a window of a flight is not to be used; empty where it may be.
-
-    Args:
-        flight: the whole of it.
-    """
+    """Return in words why a window of a flight is not to be used; empty where it may be."""
     for name, y in flight.outputs.items():
         seen = np.flatnonzero(np.isfinite(y))
         here = seen[(seen >= first) & (seen < last)]

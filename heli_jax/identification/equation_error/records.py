@@ -200,7 +200,7 @@ def generic(count: int) -> Float[np.ndarray, " q"]:
 
 
 class Structure(NamedTuple):
-    """What a flight's measured outputs show of a model's states."""
+    """The states of a model that a flight's measured outputs show."""
 
     states: tuple[str, ...]
     signals: tuple[str, ...]

@@ -39,7 +39,7 @@ _WORSE = 1.5
 
 
 class RLSState(NamedTuple):
-    """What the next step needs."""
+    """State between samples."""
 
     theta: Float[Array, " q"]
     S: Float[Array, "q q"]
@@ -47,7 +47,7 @@ class RLSState(NamedTuple):
 
 
 class RLSInfo(NamedTuple):
-    """What a step tells."""
+    """Results of a step."""
 
     theta: Float[Array, " q"]
     error: Float[Array, ""]
@@ -270,7 +270,7 @@ class Baseline:
 
     @property
     def sentences(self) -> list[str]:
-        """What speaks against it, in words."""
+        """The sentences of the findings."""
         return [f.sentence for f in self.findings]
 
 
@@ -424,7 +424,7 @@ def _combinations(
 def _bias(
     errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
 ) -> Iterator[Finding]:
-    """What shows that noise biases least squares on past measured outputs."""
+    """Yield findings on a bias of least squares by noise on past measured outputs."""
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))

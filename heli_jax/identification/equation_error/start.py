@@ -367,7 +367,7 @@ Origin = Literal["equation error", "frequency error", "as stated", "vehicle", "n
 
 
 class StartValue(NamedTuple):
-    """Where a fit begins with one parameter. The names of the fields are keys of fit.json."""
+    """The start of one parameter. The names of the fields are keys of fit.json."""
 
     value: float
     sd: float | None
@@ -400,7 +400,7 @@ class EquationErrorStart(NamedTuple):
 
     @property
     def findings(self) -> list[Finding]:
-        """What was taken from where."""
+        """The origin of each value."""
         out = [
             found(
                 "start.equation-error",

@@ -138,7 +138,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
 
 
 def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
-    """What is simulated at z."""
+    """Simulate at z."""
     # By the program that is to be compiled anyway, where that simulates on its way: one more for
     # the simulation alone would take longer than the derivatives that nobody asks for here.
     if layout.noise_model == "white":
@@ -158,7 +158,7 @@ _HALVINGS = 8
 def _before_it_grows(
     layout: Layout, data: Data, z: Array
 ) -> tuple[SimulatedOutputs, tuple[dict[str, np.ndarray], ...]]:
-    """What is simulated at z, of an unstable machine over as much of the records as it stays near
+    """Simulate at z, an unstable model over as much of the records as it stays near
     them; as NumPy arrays, and by flight and output."""
     simulate = _simulated
     for _ in range(_HALVINGS):

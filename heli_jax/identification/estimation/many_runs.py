@@ -55,7 +55,7 @@ _MOST = 6000
 
 
 class Own(NamedTuple):
-    """What each run has of its own, beside its unknowns."""
+    """The parts of the record that each run has of its own."""
 
     inputs: bool
     outputs: bool
@@ -319,6 +319,8 @@ def _priors(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
 
 _MANY = 24
 """runs from which on a program of machine code is worth its compilation"""
+_BATCH = 8
+"""records side by side by XLA"""
 _SIDE_BY_SIDE = 256
 """runs that such a program computes together: between them somebody may interrupt"""
 _MANY_STEPS = 60
@@ -341,36 +343,30 @@ def _batch(
 def optimise_many(
     reached: Solution,
     data: Callable[[Any], Data],
-    starts: Float[Array, "k q"],
+    k: int,
     each: Any,
-    *,
-    batch: int = 8,
-    say: Callable[[str], None] = lambda _: None,
+    say: Callable[[str], None],
 ) -> Optimum:
-    """Optima (k, ...) for many starts or records near an optimum.
+    """Return the optima (k, ...) of many records, each searched from one optimum.
 
     Args:
         reached: that optimum; its Jacobian gives the units of all runs.
         data: makes the numbers of one run out of its slice of `each`.
-        starts: where each run begins.
+        k: how many.
         each: what differs between the runs, a pytree of arrays (k, ...).
         say: called with a sentence where many runs are no programs of machine code.
     """
     layout, noise = reached.layout, reached.noise
     units = _units_at(reached)
-    fused = _fused(reached, data, each, say) if starts.shape[0] >= _MANY else None
-    if fused is not None:
-        batch = _SIDE_BY_SIDE
-    k, batch = starts.shape[0], min(batch, starts.shape[0])
-    optima = []
+    fused = _fused(reached, data, each, say) if k >= _MANY else None
+    batch, optima = min(_BATCH if fused is None else _SIDE_BY_SIDE, k), []
+    z0 = jnp.tile(reached.z[None, :], (batch, 1))
+    one = Constants(reached.z, units, jnp.asarray(ties_of(layout)), jnp.asarray(True))
+    constants = jax.tree.map(lambda v: jnp.broadcast_to(v, (batch, *jnp.shape(v))), one)
     for i in range(0, k, batch):
         # The last ones again where the batch is not full: another shape would compile anew.
         chosen = np.minimum(np.arange(i, i + batch), k - 1)
-        z0 = starts[chosen]
         numbers = jax.vmap(data)(jax.tree.map(lambda v, chosen=chosen: v[chosen], each))
-        constants = jax.vmap(
-            lambda z: Constants(z, units, jnp.asarray(ties_of(layout)), jnp.asarray(True))
-        )(z0)
 
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)

@@ -30,8 +30,6 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, unpack, value_of
 
-_BATCH = 8
-"""records side by side"""
 _ROUNDS = 3
 """of residual and spectrum in turn, for an estimate by responses, which has no spectrum of lines"""
 _STEPS = 200
@@ -122,9 +120,8 @@ def _optima(
         changed = at.data._replace(flights=tuple(flights))
         return changed if means is None else changed._replace(prior_mean=means)
 
-    starts = jnp.tile(at.z[None, :], (count, 1))
     each = (outputs, inputs, prior_means)
-    return optimise_many(at, data, starts, each, batch=_BATCH, say=say)
+    return optimise_many(at, data, count, each, say)
 
 
 def _values(at: Solution, z: Any) -> dict[str, np.ndarray]:

@@ -114,7 +114,7 @@ class Layout(eqx.Module):
 
     @property
     def noise_model(self) -> str:
-        """What the method takes the noise for (`Objective.noise_model`)."""
+        """The noise model of the method (`Objective.noise_model`)."""
         return self.objective.noise_model
 
     @property
@@ -136,7 +136,7 @@ class Layout(eqx.Module):
 
     @property
     def first_nuisance(self) -> int:
-        """Where in z the nuisance parameters of the flights begin: initial states, biases and
+        """The place in z of the first nuisance parameter of a flight: initial states, biases and
         input offsets, which have weak priors and are projected out of the verdict."""
         return len(self.of_interest) + len(self.noises) + len(self.scaled)
 
@@ -157,7 +157,7 @@ class Layout(eqx.Module):
         return tuple(d.sigma for d in disturbances_of(self.model) if d.sigma in self.disturbance)
 
     def disturbance_at(self, name: str) -> int:
-        """Where in z a parameter of process noise stands."""
+        """Return the place in z of a parameter of process noise."""
         return len(self.of_interest) + self.noises.index(name)
 
     @property
@@ -166,7 +166,7 @@ class Layout(eqx.Module):
         return self.first_nuisance + sum(places.every.size for places in flight_places(self))
 
     def hold(self, i: int) -> dict[str, str]:
-        """What the inputs of the i-th flight do between samples, by name."""
+        """Return the hold of each input of the i-th flight, by name."""
         return dict(zip(naming.names(self.model.Inputs), self.holds[i], strict=True))
 
     @property
@@ -208,7 +208,7 @@ class FlightUnknown(NamedTuple):
 
 
 class FlightPlaces(NamedTuple):
-    """Where in z the unknowns of one flight stand."""
+    """The places of one flight's unknowns in z."""
 
     states: Int[np.ndarray, "windows k"]
     biases: Int[np.ndarray, " p"]
@@ -253,7 +253,7 @@ def flight_unknowns(layout: Layout, called: Sequence[str]) -> tuple[FlightUnknow
 
 
 class Noise(NamedTuple):
-    """What the residuals are measured by."""
+    """The noise that residuals are divided by."""
 
     sd: tuple[dict[str, Any], ...]
     """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
@@ -276,7 +276,7 @@ class Noise(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Where a fit ended, for what goes on from there."""
+    """The end of a fit, for what goes on from there."""
 
     layout: Layout
     data: Data
@@ -369,7 +369,7 @@ def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tupl
 
 
 def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
-    """How many windows, and the samples of each; a short rest belongs to the last window."""
+    """Return the number of windows, and the samples of each; a short rest belongs to the last."""
     n = flight.n_samples
     if problem.window is None:
         return 1, n
@@ -424,11 +424,7 @@ def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]
 
 
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
-    """Names for the entries of z.
-
-    Args:
-        z: all unknowns (q,), without units.
-    """
+    """Names for the entries of z."""
     q = len(layout.free)
     params = {name: value_of(layout, data, i, z[i]) for i, name in enumerate(layout.free)}
     gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
@@ -451,11 +447,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
 
 
 def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
-    """Factors on the guess of the measurement noise, by output that has one of its own.
-
-    Args:
-        z: all unknowns (q,), without units.
-    """
+    """Factors on the guess of the measurement noise, by output that has one of its own."""
     first = layout.first_nuisance - len(layout.scaled)
     return {
         name: jnp.exp(jnp.clip(z[first + i], -_SCALES, _SCALES))

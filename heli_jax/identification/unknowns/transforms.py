@@ -63,7 +63,7 @@ def plain_kind(free: Free) -> str:
 
 
 def changes_sign(free: Free) -> bool:
-    """Whether a parameter is free to change its sign, rather than asked to stay between bounds."""
+    """True if a parameter may change its sign, and need not stay between bounds."""
     low, high = limits(free)
     bounded = math.isfinite(low) and math.isfinite(high)
     return bool(free.sign == "any" and low < 0 < high and not bounded)
@@ -81,7 +81,7 @@ def scale(free: Free) -> float:
 
 
 def sign_or_scale(free: Free) -> float:
-    """What `to_value` and `to_coordinate` take as `sign`."""
+    """Return the `sign` that `to_value` and `to_coordinate` take."""
     # Whichever of the two it is, to_value multiplies by it: one array of numbers serves both.
     if changes_sign(free):
         return scale(free)
@@ -89,7 +89,7 @@ def sign_or_scale(free: Free) -> float:
 
 
 def inside(free: Free, value: float) -> bool:
-    """Whether a value lies within the bounds."""
+    """True if a value lies within the bounds."""
     low, high = limits(free)
     return bool(low <= value <= high)
 
@@ -110,7 +110,7 @@ def coordinate(free: Free, kind: str, value: float) -> float | None:
 
 
 def at_bound(free: Free, value: float) -> bool:
-    """Whether an estimate ended at a bound that was stated."""
+    """True if an estimate ended at a bound that was stated."""
     low, high = free.lower, free.upper
     width = high - low if low is not None and high is not None else abs(value)
     near = 1e-3 * width
