@@ -575,7 +575,8 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _selection(options: argparse.Namespace) -> "Selection":
     """What `convert` takes of a log."""
-    from heli_jax.flights import convert, named
+    from heli_jax.flights import convert
+    from heli_jax.flights.preset import by_preset as named_by
 
     if options.preset is not None and (options.signals or options.config is not None):
         other = "--signals" if options.signals else "--config"
@@ -583,7 +584,7 @@ def _selection(options: argparse.Namespace) -> "Selection":
     by_preset = None
     if options.preset is not None:
         with located("--preset"):
-            by_preset = named.by_preset(options.preset)
+            by_preset = named_by(options.preset)
     return convert.Selection(
         options.signals,
         options.rate,

@@ -3,7 +3,7 @@
 The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`; an array's name is its
 path, `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 
-Sources of the packing: the CF conventions 1.11, section 8.1, and the attribute conventions of the
+Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute conventions of the
 NetCDF User's Guide.
 """
 
@@ -41,7 +41,10 @@ LARGEST = 10**9
 """bytes of a file"""
 MOST_ELEMENTS = 100
 """columns of a matrix, or elements of a list: more are data of another shape than a log's"""
-PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
+PACKING = (
+    *("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned"),
+    *("valid_range", "valid_min", "valid_max"),
+)
 """attributes that say how numbers are packed"""
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
 SEGMENT = "segment"
@@ -323,7 +326,8 @@ class Packing(ValueError):
 
 
 def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.ndarray, int]:
-    """What stored numbers stand for, NaN for fills, and how many are missing.
+    """What stored numbers stand for, NaN for fills and what is no valid value, and how many are
+    missing.
 
     Raises:
         Packing: a scale or an offset is no number.
@@ -348,6 +352,17 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
     values = stored
     if (scale, offset) != (1.0, 0.0):
         values = stored.astype(np.float64) * scale + offset
+    both = _numbers(attributes.get("valid_range", ()))
+    for i, (name, beyond) in enumerate((("valid_min", np.less), ("valid_max", np.greater))):
+        limits = _numbers(attributes.get(name, both[[i]] if both.size == 2 else ()))
+        if limits.size == 1:
+            # The range has the type of the packed numbers, or of the unpacked ones.
+            of = stored if limits.dtype.kind in "iu" or values is stored else values
+            limit = limits[0]
+            if of.dtype.kind == "u" and limit < 0:
+                limit = int(limit) + 2 ** (8 * of.dtype.itemsize)
+            with np.errstate(invalid="ignore"):
+                missing |= beyond(of, limit)
     count = int(np.count_nonzero(missing))
     return (np.where(missing, np.nan, values.astype(np.float64)) if count else values), count
 
