@@ -19,7 +19,7 @@ from heli_jax.flights.clock import (
     unit_notes,
     with_runs,
 )
-from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
+from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, rounding_of, without_overflow
@@ -133,16 +133,10 @@ def clocked_table(
         def refuse(i: int, more: str) -> InputError:
             row, name = rows.start + i, signal.name  # noqa: B023
             problem = f"got {table.cell_text(name, row)}, expected a finite number"
-            more = why_missing(table, name) or more
             return wrong(table.path, problem + more, table.place(row), column(name))
 
         values = in_si(signal, kind, loaded.numbers[signal.name][rows], refuse)
-        by_source = marks_of_sources(table, signal.name, (rows.start, rows.stop - 1))
-        marks = {
-            n: marked._replace(places=seconds[marked.places - rows.start])
-            for n, marked in by_source.items()
-        }
-        signals[key, kind] = ClockedSignal(topic, values, marks)
+        signals[key, kind] = ClockedSignal(topic, values)
     return signals, notes
 
 

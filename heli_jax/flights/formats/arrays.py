@@ -3,8 +3,8 @@
 The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`; an array's name is its
 path, `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 
-Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute conventions of the
-NetCDF User's Guide.
+Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute
+conventions of the NetCDF User's Guide.
 """
 
 import hashlib
