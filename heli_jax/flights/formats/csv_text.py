@@ -20,6 +20,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
+from heli_jax.flights.formats.arrow import floats
 from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import (
     Budget,
@@ -47,8 +48,6 @@ _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
 """bytes and lines in which a table is sought"""
 _FEWEST = 3
 """rows that make a table"""
-_LONGEST_LINE = 10_000_000
-"""bytes of a row, in which a cell may hold a text"""
 _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
 _FIRST = 100
@@ -125,7 +124,6 @@ def open_csv(path: Path) -> "CsvTable":
     rows = memoryview(data)[head.begin :]
     if not data[head.begin : head.begin + _LOOKED_AT].strip() and not bytes(rows).strip():
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
-    _require_short_lines(where, data, head)
     if head.delimiter == " ":
         lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         head, rows = head._replace(delimiter="\t"), memoryview(b"\n".join(lines))
@@ -369,17 +367,6 @@ def _require_names(path: str, head: _Head) -> None:
         raise wrong(path, f"{problem}; {remedy}", f"line {head.number}")
 
 
-def _require_short_lines(path: str, data: bytes, head: _Head) -> None:
-    """Refuse a line longer than any of a log: its cells alone would fill the memory."""
-    start = head.begin
-    while len(data) - start > _LONGEST_LINE:
-        end = data.rfind(b"\n", start, start + _LONGEST_LINE + 1)
-        if end < 0:
-            line = head.first_line + data.count(b"\n", head.begin, start)
-            raise wrong(path, "is longer than a line of a log can be", f"line {line}")
-        start = end + 1
-
-
 def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ...]]:
     """The rows without those of empty cells at the end, as spreadsheets write them, and without a
     last line that ends before its last cells, as where a logger lost its power; and a note."""
@@ -518,7 +505,7 @@ class CsvTable:
                 return row
             cells = _compute().replace_substring(cells, ",", ".")
         try:
-            return _floats(cells.cast(pa.float64()))
+            return floats(cells.cast(pa.float64()))
         except pa.ArrowInvalid:  # it does not say which row
             return _floats_one_by_one(cells)
 
@@ -546,7 +533,7 @@ class CsvTable:
             table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), sign)
             if table is not None:
                 columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
-                return {i: (_floats(c), len(c) - c.null_count) for i, c in columns.items()}
+                return {i: (floats(c), len(c) - c.null_count) for i, c in columns.items()}
         return None
 
     def _likely_numbers(self) -> list[int]:
@@ -732,21 +719,4 @@ def _floats_one_by_one(cells: "pa.ChunkedArray") -> np.ndarray | int:
         if not _NUMBER.fullmatch(cell):
             return row
         values[row] = float(cell.replace("\u2212", "-").replace("D", "e").replace("d", "e"))
-    return values
-
-
-def _floats(numbers: "pa.ChunkedArray") -> np.ndarray:
-    """Numbers of pyarrow as float64 (N,), NaN where null."""
-    import pyarrow as pa
-
-    values, at = np.empty(len(numbers), np.float64), 0
-    # As buffers, since to_numpy imports pandas, which takes a second.
-    for chunk in (c for c in numbers.chunks if len(c)):
-        piece = values[at : at + len(chunk)]
-        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
-        if chunk.null_count:
-            known = chunk.is_valid().cast(pa.uint8())
-            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
-            piece[at_known == 0] = np.nan
-        at += len(chunk)
     return values
