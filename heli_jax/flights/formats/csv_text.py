@@ -406,7 +406,7 @@ class CsvTable:
         self._digest, self._rows, self._head = digest, rows, head
         self._dates: set[str] = set()
         self._has_quotes = has_quotes
-        self._signs = self._decimal_signs()
+        self._sign = self._decimal_sign()
 
     @property
     def sha256(self) -> str:
@@ -436,7 +436,7 @@ class CsvTable:
             values = self._values(name, text)
             if isinstance(values, int):
                 cell = self.cell_text(name, values)
-                sign = " with a decimal comma" if self._signs == (",",) else ""
+                sign = " with a decimal comma" if self._sign == "," else ""
                 problem = f"got {cell}, expected a number{sign}"
                 if ":" in cell:
                     problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
@@ -495,13 +495,10 @@ class CsvTable:
         if is_date(first):
             self._dates.add(name)
             return seconds_of_dates(cells.to_pylist())
-        if "," not in self._signs:
-            sign = "."
-        else:
-            sign = "," if len(self._signs) == 1 or _first_with(cells, ",") is not None else "."
-        if sign == ",":
+        if self._sign == ",":
             # A point would be one between thousands, or a slip.
-            if (row := _first_with(cells, ".")) is not None:
+            row = _compute().index(_compute().match_substring(cells, "."), True).as_py()
+            if row >= 0:
                 return row
             cells = _compute().replace_substring(cells, ",", ".")
         try:
@@ -509,32 +506,29 @@ class CsvTable:
         except pa.ArrowInvalid:  # it does not say which row
             return _floats_one_by_one(cells)
 
-    def _decimal_signs(self) -> tuple[str, ...]:
-        """The decimal sign of the file; both, in the order to try, where its first rows tell none.
+    def _decimal_sign(self) -> str:
+        """The decimal sign of the file, by its first rows.
 
         A file has one: `1.577` beside `0,25` would else be one and a half.
         """
         delimiter, first = self._head.delimiter, bytes(self._rows[:_SAMPLE])
         # A comma between cells is decimal only within quotes.
         if b'"' not in first if delimiter == "," else b"," not in first:
-            return (".",)
+            return "."
         lines = first.decode("utf-8", "ignore").split("\n")[:2000]
         cells = (cell.strip() for line in lines for cell in _cells_of(line, delimiter))
-        if any(map(_WITH_COMMA.fullmatch, cells)):
-            return (",",)
-        return (".",) if delimiter == "," else (".", ",")
+        return "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
 
     def _plain(self, indices: Sequence[int]) -> dict[int, tuple[np.ndarray, int]] | None:
         """Columns of numbers by index, and how many of their cells are filled; None where anything
         is not plain."""
         import pyarrow as pa
 
-        for sign in self._signs:
-            table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), sign)
-            if table is not None:
-                columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
-                return {i: (floats(c), len(c) - c.null_count) for i, c in columns.items()}
-        return None
+        table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), self._sign)
+        if table is None:
+            return None
+        columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
+        return {i: (floats(c), len(c) - c.null_count) for i, c in columns.items()}
 
     def _likely_numbers(self) -> list[int]:
         """The columns that hold numbers as far as the first rows tell."""
@@ -543,16 +537,10 @@ class CsvTable:
         first = self._rows[:_SAMPLE]
         if len(self._rows) > len(first):
             first = first[: bytes(first).rfind(b"\n") + 1]
-        likely = set()
-        for sign in self._signs:
-            table = self._arrow(first, dict.fromkeys(range(len(self.names))), sign)
-            kinds = [] if table is None else table.schema.types
-            likely |= {
-                i
-                for i, kind in enumerate(kinds)
-                if pa.types.is_integer(kind) or pa.types.is_floating(kind)
-            }
-        return sorted(likely)
+        table = self._arrow(first, dict.fromkeys(range(len(self.names))), self._sign)
+        kinds = [] if table is None else table.schema.types
+        is_number = (pa.types.is_integer, pa.types.is_floating)
+        return [i for i, kind in enumerate(kinds) if any(test(kind) for test in is_number)]
 
     def _arrow(self, rows: memoryview, kinds: Mapping[int, Any], sign: str) -> "pa.Table | None":
         """Columns by index, in their types (None lets pyarrow guess); None where it cannot read
@@ -697,12 +685,6 @@ def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     trimmed = pc.utf8_trim_whitespace(text)
     is_empty = pc.is_in(trimmed, value_set=pa.array(["", *MISSING], trimmed.type))
     return pc.if_else(is_empty, pa.nulls(1, trimmed.type)[0], trimmed)
-
-
-def _first_with(cells: "pa.ChunkedArray", sign: str) -> int | None:
-    """The first row whose cell holds a sign."""
-    row = _compute().index(_compute().match_substring(cells, sign), True).as_py()
-    return row if row >= 0 else None
 
 
 def _pieces(cells: "pa.ChunkedArray") -> Iterator["pa.ChunkedArray"]:
