@@ -300,7 +300,8 @@ def _named_columns(
                 units_of[leaf.casefold()] = each
         elif words & _NAMES and all(each) and len(set(each)) == count:
             names[leaf.casefold()] = each
-    return tuple(_belonging(own[-1].casefold(), count, lists) for lists in (names, units_of))
+    leaf = own[-1].casefold()
+    return _belonging(leaf, count, names), _belonging(leaf, count, units_of)
 
 
 def _belonging(own: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequence[str]:
@@ -439,7 +440,8 @@ def _unstacked(
     if left:
         why = "runs are read of arrays (run, sample, channel), with a time for each sample"
         notes.append(note(LEFT_OUT, f"left out, since {why}: {_shapes(left, arrays)}", *left))
-    return {n: made.get(n, x) for n, x in (arrays | made).items() if n not in left}, tuple(notes)
+    kept = {n: x for n, x in {**arrays, **made}.items() if n not in left}
+    return kept, tuple(notes)
 
 
 def _is_time(name: str, values: np.ndarray) -> bool:
