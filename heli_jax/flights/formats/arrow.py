@@ -278,7 +278,11 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
     # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
     # calendar's stamps round to 256 ns.
     values = pc.cast(values, pa.float64(), safe=False)
-    return floats(values if isinstance(values, pa.ChunkedArray) else pa.chunked_array([values]))
+    if isinstance(values, pa.ChunkedArray):
+        return floats(values)
+    if len(values) and not values.null_count:  # without a copy
+        return np.frombuffer(values.buffers()[1], np.float64, len(values), 8 * values.offset)
+    return floats(pa.chunked_array([values]))
 
 
 def floats(numbers: "pa.ChunkedArray") -> np.ndarray:
