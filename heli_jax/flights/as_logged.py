@@ -6,7 +6,6 @@ no value, and the jump of an angle from 180 deg to -180 deg.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -14,8 +13,6 @@ from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.flights.marks import (
-    Counts,
-    Marked,
     at_marks,
     counted,
     mark_words,
@@ -41,7 +38,6 @@ _TURN = 1.001
 """turns that a wrapped angle goes over, at most; its ends may be rounded"""
 _DIGITS, _TINY = 1e-9, 1e-6
 """of a number that is compared with one that was stated, and the smallest that counts"""
-_NONE: Mapping[Key, Mapping[str, Marked]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +58,11 @@ class AsLogged:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # differences of huge values
-def as_logged(
-    request: Request,
-    signals: Mapping[Key, Timed],
-    of_sources: Mapping[Key, Mapping[str, Marked]] = _NONE,
-) -> AsLogged:
+def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     """The signals without marks and turns, and what they were.
 
     Args:
         signals: by key, in SI, each on its own clock.
-        of_sources: of derived ones by key, the marks that their sources had, by channel.
 
     Raises:
         InputError: an input has marks; it acts all the time, so that none of it may be missing.
@@ -88,7 +79,6 @@ def as_logged(
             timed = timed._replace(values=values)
             numbers = signal.from_si(values)
         at = at_marks(numbers)
-        sources = of_sources.get(key, {})
         if at.any():
             words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
@@ -98,7 +88,6 @@ def as_logged(
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
             words = f"{name} has {words}: taken as missing"
             notes.append(note("samples.marks", words, key[0], value=int(np.count_nonzero(at))))
-        notes += source_notes(name, {n: marked.counts for n, marked in sources.items()})
         values = np.where(at, np.nan, timed.values)
         turn = units.turn(signal.si)
         if turn is not None and is_wrapped(values, turn):
@@ -137,23 +126,6 @@ def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray,
     # An input acts all the time: a stick stays where it was.
     last = known[np.maximum(np.searchsorted(known, np.arange(at.size), side="right") - 1, 0)]
     return values[last], f"{words}: taken as it was before"
-
-
-def source_notes(name: str, marks: Mapping[str, Counts]) -> list[Finding]:
-    """Notes on the marks in the channels that a derived one is computed from."""
-    # The four parts of a quaternion are lost together: one note says it of all.
-    alike: dict[Counts, list[str]] = {}
-    for source, counts in marks.items():
-        alike.setdefault(counts, []).append(shown(source))
-    return [
-        note(
-            "samples.marks",
-            f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
-            f"{mark_words(counts)}: taken as missing",
-            value=sum(n for _, n in counts),
-        )
-        for counts, sources in alike.items()
-    ]
 
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:

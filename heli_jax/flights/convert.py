@@ -9,12 +9,11 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.finding import LEFT_OUT, Finding, note
-from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
+from heli_jax.flights.as_logged import without_marks_and_turns
 from heli_jax.flights.derived import (
     DerivedLog,
     DerivedTable,
     Swashplate,
-    marks_of_sources,
     with_derived,
 )
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
@@ -134,10 +133,6 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
             if selection.rate * clock.usual > _INTERPOLATED:
                 words = f"{clock.words}: interpolated, so its noise is no longer white"
                 notes.append(note("resampling.interpolated", words))
-    for name in names:
-        times = log.channel(name).times[clocks[log.topic_of(name).name].rows]
-        marks = marks_of_sources(log, name, (times[0], times[-1]))
-        notes += source_notes(shown(name), {n: m.counts for n, m in marks.items()})
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
     if named is not None:
         taken = {n: s for n, s in named.signals.items() if s.name in columns}

@@ -7,14 +7,14 @@ written here.
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from heli_jax.errors import nearest
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.marks import Marked, at_marks, mark_words, without_marks
+from heli_jax.flights.marks import without_marks
 from heli_jax.flights.resample import longest_gap
 from heli_jax.flights.table import Table, TableView, shown, wrong
 
@@ -293,12 +293,6 @@ class DerivedLog(ChannelLog):
         # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
         return topics[0], np.stack([without_marks(x) for x in values])
 
-    def source_marks(self, name: str) -> dict[str, Marked]:
-        """The marks in the channels that a derived one is computed from, by channel."""
-        known = frozenset(self.names)
-        needed = [] if name in known else sources(name, known, self.swashplate)
-        return _marked({n: self.channel(n) for n in needed})
-
 
 def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Quaternions (4, M) of a clock (M,) at other times (N,): between two on a straight line."""
@@ -321,7 +315,6 @@ class DerivedTable(TableView):
     def __init__(self, table: Table, swashplate: Swashplate | None = None) -> None:
         super().__init__(table)
         self.swashplate = swashplate
-        self._marks: dict[str, dict[str, Marked]] = {}
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -334,17 +327,9 @@ class DerivedTable(TableView):
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
         for name, d in derived.items():
-            needed = {n: columns[n] for group in d.groups for n in group}
-            rows = {n: (np.arange(x.size), x) for n, x in needed.items()}
-            self._marks[name] = _marked(rows)
-            clean = {n: without_marks(x) for n, x in needed.items()}
+            clean = {n: without_marks(columns[n]) for group in d.groups for n in group}
             columns[name] = d.compute(*(np.stack([clean[n] for n in g]) for g in d.groups))
         return {name: columns[name] for name in names}
-
-    def source_marks(self, name: str) -> dict[str, Marked]:
-        """The marks in the columns that a derived one was computed from, by column; none of one
-        that was not asked for yet."""
-        return self._marks.get(name, {})
 
     def _derivation(self, name: str) -> Derivation | None:
         try:
@@ -357,37 +342,6 @@ class DerivedTable(TableView):
         if self._derivation(name) is None:
             return super().cell_text(name, row)
         return f"{self.numbers([name])[name][row]:g}"
-
-
-def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Marked]:
-    """By channel the marks in places and samples (N,), of those that have some."""
-    kept = {n: at_marks(x) for n, (_, x) in channels.items()}
-    return {n: Marked(*(x[kept[n]] for x in pair)) for n, pair in channels.items()}
-
-
-def marks_of_sources(
-    log: Table | ChannelLog, name: str, span: tuple[float, float] | None = None
-) -> dict[str, Marked]:
-    """The marks in the channels that a derived one is computed from, by channel.
-
-    Args:
-        log: where it is none of `with_derived`, nothing is derived.
-        name: of any channel; of a table's derived one after it was read.
-        span: first and last row of a table, first and last time of an autopilot's log [s], between
-            which they are taken; all of it by default.
-    """
-    if not isinstance(log, DerivedTable | DerivedLog):
-        return {}
-    first, last = span or (-np.inf, np.inf)
-    inside = {n: marked.within(first, last) for n, marked in log.source_marks(name).items()}
-    return {n: marked for n, marked in inside.items() if marked.places.size}
-
-
-def why_missing(log: Table | ChannelLog, name: str) -> str:
-    """Why a derived input has missing samples, where its sources have marks: for a message."""
-    for source, marked in marks_of_sources(log, name).items():
-        return f"; {shown(source)} has {mark_words(marked.counts)}; give a window without them"
-    return ""
 
 
 def with_derived(

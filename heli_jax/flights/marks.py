@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -94,24 +93,6 @@ def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     )
     at[rows[nearest <= _SINGLE]] = True
     return at
-
-
-class Marked(NamedTuple):
-    """Samples (K,) of a channel that stand for no value, as the log has them, and their places:
-    times [s], or rows of a table."""
-
-    places: np.ndarray
-    values: np.ndarray
-
-    @property
-    def counts(self) -> "Counts":
-        """Each value once, and how often it is there."""
-        return counted(self.values)
-
-    def within(self, first: float, last: float) -> "Marked":
-        """Those from one place to another, both included."""
-        at = (self.places >= first) & (self.places <= last)
-        return Marked(self.places[at], self.values[at])
 
 
 def without_marks(numbers: np.ndarray) -> np.ndarray:

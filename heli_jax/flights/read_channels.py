@@ -6,19 +6,18 @@ are times.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from heli_jax.errors import InputError
 from heli_jax.finding import Finding
 from heli_jax.flights.as_logged import as_logged
-from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import Marked, infinite
+from heli_jax.flights.marks import infinite
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -85,12 +84,10 @@ class TopicClock:
 
 @dataclass(frozen=True, eq=False)
 class ClockedSignal:
-    """Samples (N,) in SI on the clock of a topic, and of a derived signal the marks that the
-    channels had from which it is computed."""
+    """Samples (N,) in SI on the clock of a topic."""
 
     clock: TopicClock
     values: np.ndarray
-    of_sources: Mapping[str, Marked] = field(default_factory=dict)
 
     @property
     def timed(self) -> Timed:
@@ -202,18 +199,12 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
         numbers = values[clock.rows]
 
         def refuse(row: int, more: str) -> InputError:
-            why = why_missing(log, signal.name) or more  # noqa: B023
             problem = f"got {numbers[row]} at {clock.seconds[row]:.6g} s"  # noqa: B023
             at = f"channel {shown(signal.name)}"  # noqa: B023
-            return wrong(log.path, f"{problem}, expected a finite number{why}", at)
+            return wrong(log.path, f"{problem}, expected a finite number{more}", at)
 
         values = in_si(signal, kind, numbers, refuse)
-        span = tuple(times[clock.rows][[0, -1]])
-        marks = {
-            n: marked._replace(places=marked.places - log.first_time)
-            for n, marked in marks_of_sources(log, signal.name, span).items()
-        }
-        signals[key, kind] = ClockedSignal(clock, values, marks)
+        signals[key, kind] = ClockedSignal(clock, values)
     return signals
 
 
@@ -251,8 +242,7 @@ def flight_of_signals(
         grid = uniform_grid(clocks[0].seconds, clocks[0].rounding)
         if isinstance(grid, Uneven) and rate is None:
             raise _uneven(source.path, clocks[0], grid)
-    marks = {key: signal.of_sources for key, signal in signals.items()}
-    logged = as_logged(request, {key: s.timed for key, s in signals.items()}, marks)
+    logged = as_logged(request, {key: s.timed for key, s in signals.items()})
     values = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, values)

@@ -19,7 +19,7 @@ from heli_jax.flights.clock import (
     unit_notes,
     with_runs,
 )
-from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
+from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
 from heli_jax.flights.grid import LATEST, rounding_of, without_overflow
@@ -40,16 +40,37 @@ from heli_jax.flights.time_units import require_likely
 
 @dataclass(frozen=True, eq=False)
 class LoadedTable:
-    """A table with the columns (N,) that are asked for, and its clock."""
+    """A table with the columns (N,) that are asked for, and its clock: `stamps` (N,) in the log's
+    unit, which is `scale` seconds."""
 
     table: Table
     numbers: Mapping[str, np.ndarray]
-    clock: "TableClock"
+    stamps: np.ndarray
+    scale: float
+    said: tuple[Finding, ...] = ()
+    """where the file or a name says another unit of the clock"""
+    cautions: tuple[Finding, ...] = ()
+    """what speaks against the times"""
 
     @property
     def first_time(self) -> float:
         """Of the first stamp [s], from which windows count."""
-        return float(self.clock.stamps[0] * self.clock.scale)
+        return float(self.stamps[0] * self.scale)
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """(N,) [s], from 0; subtracted first, so that a calendar's digits do not cost any."""
+        return (self.stamps - self.stamps[0]) * self.scale
+
+    @contextlib.contextmanager
+    def hinting(self) -> Iterator[None]:
+        """What is said of the unit behind errors that a wrong one makes."""
+        try:
+            yield
+        except InputError as e:
+            if not self.said:
+                raise
+            raise InputError("; ".join([str(e), *sentences(self.said)])) from e
 
 
 def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
@@ -75,7 +96,7 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     joined = joined_log(table, request, numbers)
     if joined is not None:
         return joined
-    return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
+    return _with_clock(table, numbers, request.time)
 
 
 def _with_runs(
@@ -110,9 +131,8 @@ def clocked_table(
     Raises:
         InputError: the window lies outside the table, or a cell is no finite number.
     """
-    table, clock = loaded.table, loaded.clock
+    table, elapsed = loaded.table, loaded.elapsed
     assert request.time is not None  # or `load_table` would have refused it
-    elapsed = clock.elapsed
     # The window before anything else is asked of the samples: what lies outside of it may be as
     # wrong as it likes.
     rows = rows_in_window(table.path, elapsed, request.options.window)
@@ -122,10 +142,10 @@ def clocked_table(
         assert request.time is not None
         return table.place(rows.start + i), column(request.time.name)
 
-    seconds, stamps = elapsed[rows], clock.stamps[rows]
+    seconds, stamps = elapsed[rows], loaded.stamps[rows]
     # Before the rounding is looked for, which steps of a wrong unit would make meaningless.
     require_steps(table.path, seconds, *places(0))
-    begin, rounding = float(stamps[0] * clock.scale), rounding_of(stamps) * clock.scale
+    begin, rounding = float(stamps[0] * loaded.scale), rounding_of(stamps) * loaded.scale
     topic = TopicClock(Path(table.path).name, seconds, rows, begin, rounding, places, of_table=True)
     signals = {}
     for (key, kind), signal in request.signals.items():
@@ -133,22 +153,16 @@ def clocked_table(
         def refuse(i: int, more: str) -> InputError:
             row, name = rows.start + i, signal.name  # noqa: B023
             problem = f"got {table.cell_text(name, row)}, expected a finite number"
-            more = why_missing(table, name) or more
             return wrong(table.path, problem + more, table.place(row), column(name))
 
         values = in_si(signal, kind, loaded.numbers[signal.name][rows], refuse)
-        by_source = marks_of_sources(table, signal.name, (rows.start, rows.stop - 1))
-        marks = {
-            n: marked._replace(places=seconds[marked.places - rows.start])
-            for n, marked in by_source.items()
-        }
-        signals[key, kind] = ClockedSignal(topic, values, marks)
+        signals[key, kind] = ClockedSignal(topic, values)
     return signals, notes
 
 
 def table_window_note(loaded: LoadedTable, request: Request) -> tuple[Finding, ...]:
     """A note where the window reaches beyond the table."""
-    elapsed = loaded.clock.elapsed
+    elapsed = loaded.elapsed
     step = float(np.median(np.diff(elapsed))) if elapsed.size > 1 else 0.0
     return window_note(request.options.window, float(elapsed[-1]), step)
 
@@ -180,36 +194,9 @@ def _of_known_inputs(
     return slice(first, stop), (left_out,)
 
 
-@dataclass(frozen=True, eq=False)
-class TableClock:
-    """Stamps (N,) in the log's unit, which is `scale` seconds, and the time since the first."""
-
-    stamps: np.ndarray
-    scale: float
-    notes: tuple[Finding, ...] = ()
-    """where the file or a name says another unit"""
-    cautions: tuple[Finding, ...] = ()
-    """what speaks against the times"""
-
-    @contextlib.contextmanager
-    def hinting(self) -> Iterator[None]:
-        """What is said of the unit behind errors that a wrong one makes."""
-        try:
-            yield
-        except InputError as e:
-            if not self.notes:
-                raise
-            raise InputError("; ".join([str(e), *sentences(self.notes)])) from e
-
-    @property
-    def elapsed(self) -> np.ndarray:
-        """(N,) [s], from 0; subtracted first, so that a calendar's digits do not cost any."""
-        return (self.stamps - self.stamps[0]) * self.scale
-
-
-def _clock(table: Table, time: Signal, stamps: np.ndarray) -> TableClock:
-    """The stamps, finite and increasing."""
-    place = column(time.name)
+def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -> LoadedTable:
+    """The columns with their clock, whose stamps are finite and increase."""
+    place, stamps = column(time.name), numbers[time.name]
     stated, scale = table.time_unit(time.name), clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
@@ -226,4 +213,4 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> TableClock:
     cautions = contradicted_rate(table, time.name, 1.0 / step)
     if not stated and time.scale == 1.0:
         cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return TableClock(stamps, scale, said, cautions)
+    return LoadedTable(table, numbers, stamps, scale, said, cautions)

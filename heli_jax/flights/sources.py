@@ -104,13 +104,13 @@ def flight_from(logs: Opened, request: Request) -> Flight:
             first_time=log.first_time,
         )
         return flight_of_signals(clocked(logs, request)[0], request, source)
-    with log.clock.hinting():
+    with log.hinting():
         signals, more = clocked(logs, request)
         source = Source(
             log.table.path,
             log.table.sha256,
-            (*log.table.notes, *log.clock.notes, *notes, *more),
-            cautions=log.clock.cautions,
+            (*log.table.notes, *log.said, *notes, *more),
+            cautions=log.cautions,
             first_time=log.first_time,
         )
         return flight_of_signals(signals, request, source)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heli_jax.flights.band_limited import decimate
+from heli_jax.flights.resample import decimate
 
 FS, NEW = 200, 50
 

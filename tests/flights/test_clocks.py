@@ -6,7 +6,6 @@ import pytest
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
 from heli_jax.flights.convert import Selection, convert_log
-from heli_jax.flights.resample import new_clock, step_notes
 from heli_jax.flights.time_units import likely_unit, split_unit, time_unit
 
 N, DT = 300, 0.01
@@ -217,29 +216,3 @@ def test_a_counter_of_32_bits_goes_on_and_other_faults_are_refused_with_their_li
     ):
         with pytest.raises(InputError, match=f"line {line}, column 't'"):
             read(stamped(tmp_path, [f"{s:.3f}" for s in stamps]))
-
-
-def test_a_step_of_the_clock_is_told_with_its_time():
-    t = 0.01 * np.arange(6000)
-    t[3000:] += 0.1
-    (note,) = step_notes(t, 100.0, 0.25)
-    assert (note.code, note.value) == ("clock.long-steps", pytest.approx(0.11))
-    assert note in new_clock(t, 100.0).notes
-
-
-@pytest.mark.parametrize(("first", "second"), [(0.01, 0.02), (0.02, 0.01)])
-def test_a_second_rate(first, second):
-    rng = np.random.default_rng(0)
-    steps = np.r_[np.full(3000, first), np.full(2000, second)]
-    t = np.cumsum(steps * (1 + 0.1 * rng.uniform(-1, 1, steps.size)))
-    (note,) = step_notes(t, 100.0, 0.25)
-    assert (note.code, note.value) == ("clock.other-rate", pytest.approx(t[2999], abs=0.03))
-
-
-def test_nothing_is_said_of_an_ordinary_clock():
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        t = 0.01 * np.arange(4000) + 0.002 * rng.uniform(-1, 1, 4000)
-        assert step_notes(t, 50.0, 0.25) == ()
-        # Many samples lost here and there: the shares of missing samples say so.
-        assert step_notes(t[rng.uniform(size=t.size) > 0.4], 50.0, 0.25) == ()

@@ -3,8 +3,8 @@
 The readers of MATLAB, NetCDF, HDF5, NumPy and JSON files collect `DataSets`; an array's name is its
 path, `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
 
-Sources of the packing: the CF conventions 1.11, section 8.1, and the attribute conventions of the
-NetCDF User's Guide.
+Sources of the packing: the CF conventions 1.11, sections 2.5.1 and 8.1, and the attribute
+conventions of the NetCDF User's Guide.
 """
 
 import hashlib
@@ -41,7 +41,10 @@ LARGEST = 10**9
 """bytes of a file"""
 MOST_ELEMENTS = 100
 """columns of a matrix, or elements of a list: more are data of another shape than a log's"""
-PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
+PACKING = (
+    *("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned"),
+    *("valid_range", "valid_min", "valid_max"),
+)
 """attributes that say how numbers are packed"""
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
 SEGMENT = "segment"
@@ -297,7 +300,8 @@ def _named_columns(
                 units_of[leaf.casefold()] = each
         elif words & _NAMES and all(each) and len(set(each)) == count:
             names[leaf.casefold()] = each
-    return tuple(_belonging(own[-1].casefold(), count, lists) for lists in (names, units_of))
+    leaf = own[-1].casefold()
+    return _belonging(leaf, count, names), _belonging(leaf, count, units_of)
 
 
 def _belonging(own: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequence[str]:
@@ -323,7 +327,8 @@ class Packing(ValueError):
 
 
 def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.ndarray, int]:
-    """What stored numbers stand for, NaN for fills, and how many are missing.
+    """What stored numbers stand for, NaN for fills and what is no valid value, and how many are
+    missing.
 
     Raises:
         Packing: a scale or an offset is no number.
@@ -348,6 +353,17 @@ def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.nda
     values = stored
     if (scale, offset) != (1.0, 0.0):
         values = stored.astype(np.float64) * scale + offset
+    both = _numbers(attributes.get("valid_range", ()))
+    for i, (name, beyond) in enumerate((("valid_min", np.less), ("valid_max", np.greater))):
+        limits = _numbers(attributes.get(name, both[[i]] if both.size == 2 else ()))
+        if limits.size == 1:
+            # The range has the type of the packed numbers, or of the unpacked ones.
+            of = stored if limits.dtype.kind in "iu" or values is stored else values
+            limit = limits[0]
+            if of.dtype.kind == "u" and limit < 0:
+                limit = int(limit) + 2 ** (8 * of.dtype.itemsize)
+            with np.errstate(invalid="ignore"):
+                missing |= beyond(of, limit)
     count = int(np.count_nonzero(missing))
     return (np.where(missing, np.nan, values.astype(np.float64)) if count else values), count
 
@@ -424,7 +440,8 @@ def _unstacked(
     if left:
         why = "runs are read of arrays (run, sample, channel), with a time for each sample"
         notes.append(note(LEFT_OUT, f"left out, since {why}: {_shapes(left, arrays)}", *left))
-    return {n: made.get(n, x) for n, x in (arrays | made).items() if n not in left}, tuple(notes)
+    kept = {n: x for n, x in {**arrays, **made}.items() if n not in left}
+    return kept, tuple(notes)
 
 
 def _is_time(name: str, values: np.ndarray) -> bool:

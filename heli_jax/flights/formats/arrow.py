@@ -278,6 +278,25 @@ def _floats(values: "pa.Array | pa.ChunkedArray") -> np.ndarray:
     # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
     # calendar's stamps round to 256 ns.
     values = pc.cast(values, pa.float64(), safe=False)
-    # A piece of a column has to be asked to copy where it has nulls; a column copies anyway.
-    copied = {"zero_copy_only": False} if isinstance(values, pa.Array) else {}
-    return np.asarray(values.to_numpy(**copied), dtype=np.float64)
+    if isinstance(values, pa.ChunkedArray):
+        return floats(values)
+    if len(values) and not values.null_count:  # without a copy
+        return np.frombuffer(values.buffers()[1], np.float64, len(values), 8 * values.offset)
+    return floats(pa.chunked_array([values]))
+
+
+def floats(numbers: "pa.ChunkedArray") -> np.ndarray:
+    """Numbers of type float64 (N,), NaN where null."""
+    import pyarrow as pa
+
+    values, at = np.empty(len(numbers), np.float64), 0
+    # As buffers, since to_numpy imports pandas, which takes a second.
+    for chunk in (c for c in numbers.chunks if len(c)):
+        piece = values[at : at + len(chunk)]
+        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
+        if chunk.null_count:
+            known = chunk.is_valid().cast(pa.uint8())
+            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
+            piece[at_known == 0] = np.nan
+        at += len(chunk)
+    return values

@@ -20,6 +20,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.finding import Finding, note
 from heli_jax.flights import progress
+from heli_jax.flights.formats.arrow import floats
 from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import (
     Budget,
@@ -47,8 +48,6 @@ _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
 """bytes and lines in which a table is sought"""
 _FEWEST = 3
 """rows that make a table"""
-_LONGEST_LINE = 10_000_000
-"""bytes of a row, in which a cell may hold a text"""
 _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
 _FIRST = 100
@@ -125,7 +124,6 @@ def open_csv(path: Path) -> "CsvTable":
     rows = memoryview(data)[head.begin :]
     if not data[head.begin : head.begin + _LOOKED_AT].strip() and not bytes(rows).strip():
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
-    _require_short_lines(where, data, head)
     if head.delimiter == " ":
         lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         head, rows = head._replace(delimiter="\t"), memoryview(b"\n".join(lines))
@@ -369,17 +367,6 @@ def _require_names(path: str, head: _Head) -> None:
         raise wrong(path, f"{problem}; {remedy}", f"line {head.number}")
 
 
-def _require_short_lines(path: str, data: bytes, head: _Head) -> None:
-    """Refuse a line longer than any of a log: its cells alone would fill the memory."""
-    start = head.begin
-    while len(data) - start > _LONGEST_LINE:
-        end = data.rfind(b"\n", start, start + _LONGEST_LINE + 1)
-        if end < 0:
-            line = head.first_line + data.count(b"\n", head.begin, start)
-            raise wrong(path, "is longer than a line of a log can be", f"line {line}")
-        start = end + 1
-
-
 def _whole(rows: memoryview, head: _Head) -> tuple[memoryview, tuple[Finding, ...]]:
     """The rows without those of empty cells at the end, as spreadsheets write them, and without a
     last line that ends before its last cells, as where a logger lost its power; and a note."""
@@ -419,7 +406,7 @@ class CsvTable:
         self._digest, self._rows, self._head = digest, rows, head
         self._dates: set[str] = set()
         self._has_quotes = has_quotes
-        self._signs = self._decimal_signs()
+        self._sign = self._decimal_sign()
 
     @property
     def sha256(self) -> str:
@@ -449,7 +436,7 @@ class CsvTable:
             values = self._values(name, text)
             if isinstance(values, int):
                 cell = self.cell_text(name, values)
-                sign = " with a decimal comma" if self._signs == (",",) else ""
+                sign = " with a decimal comma" if self._sign == "," else ""
                 problem = f"got {cell}, expected a number{sign}"
                 if ":" in cell:
                     problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
@@ -508,46 +495,40 @@ class CsvTable:
         if is_date(first):
             self._dates.add(name)
             return seconds_of_dates(cells.to_pylist())
-        if "," not in self._signs:
-            sign = "."
-        else:
-            sign = "," if len(self._signs) == 1 or _first_with(cells, ",") is not None else "."
-        if sign == ",":
+        if self._sign == ",":
             # A point would be one between thousands, or a slip.
-            if (row := _first_with(cells, ".")) is not None:
+            row = _compute().index(_compute().match_substring(cells, "."), True).as_py()
+            if row >= 0:
                 return row
             cells = _compute().replace_substring(cells, ",", ".")
         try:
-            return _floats(cells.cast(pa.float64()))
+            return floats(cells.cast(pa.float64()))
         except pa.ArrowInvalid:  # it does not say which row
             return _floats_one_by_one(cells)
 
-    def _decimal_signs(self) -> tuple[str, ...]:
-        """The decimal sign of the file; both, in the order to try, where its first rows tell none.
+    def _decimal_sign(self) -> str:
+        """The decimal sign of the file, by its first rows.
 
         A file has one: `1.577` beside `0,25` would else be one and a half.
         """
         delimiter, first = self._head.delimiter, bytes(self._rows[:_SAMPLE])
         # A comma between cells is decimal only within quotes.
         if b'"' not in first if delimiter == "," else b"," not in first:
-            return (".",)
+            return "."
         lines = first.decode("utf-8", "ignore").split("\n")[:2000]
         cells = (cell.strip() for line in lines for cell in _cells_of(line, delimiter))
-        if any(map(_WITH_COMMA.fullmatch, cells)):
-            return (",",)
-        return (".",) if delimiter == "," else (".", ",")
+        return "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
 
     def _plain(self, indices: Sequence[int]) -> dict[int, tuple[np.ndarray, int]] | None:
         """Columns of numbers by index, and how many of their cells are filled; None where anything
         is not plain."""
         import pyarrow as pa
 
-        for sign in self._signs:
-            table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), sign)
-            if table is not None:
-                columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
-                return {i: (_floats(c), len(c) - c.null_count) for i, c in columns.items()}
-        return None
+        table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), self._sign)
+        if table is None:
+            return None
+        columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
+        return {i: (floats(c), len(c) - c.null_count) for i, c in columns.items()}
 
     def _likely_numbers(self) -> list[int]:
         """The columns that hold numbers as far as the first rows tell."""
@@ -556,16 +537,10 @@ class CsvTable:
         first = self._rows[:_SAMPLE]
         if len(self._rows) > len(first):
             first = first[: bytes(first).rfind(b"\n") + 1]
-        likely = set()
-        for sign in self._signs:
-            table = self._arrow(first, dict.fromkeys(range(len(self.names))), sign)
-            kinds = [] if table is None else table.schema.types
-            likely |= {
-                i
-                for i, kind in enumerate(kinds)
-                if pa.types.is_integer(kind) or pa.types.is_floating(kind)
-            }
-        return sorted(likely)
+        table = self._arrow(first, dict.fromkeys(range(len(self.names))), self._sign)
+        kinds = [] if table is None else table.schema.types
+        is_number = (pa.types.is_integer, pa.types.is_floating)
+        return [i for i, kind in enumerate(kinds) if any(test(kind) for test in is_number)]
 
     def _arrow(self, rows: memoryview, kinds: Mapping[int, Any], sign: str) -> "pa.Table | None":
         """Columns by index, in their types (None lets pyarrow guess); None where it cannot read
@@ -712,12 +687,6 @@ def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     return pc.if_else(is_empty, pa.nulls(1, trimmed.type)[0], trimmed)
 
 
-def _first_with(cells: "pa.ChunkedArray", sign: str) -> int | None:
-    """The first row whose cell holds a sign."""
-    row = _compute().index(_compute().match_substring(cells, sign), True).as_py()
-    return row if row >= 0 else None
-
-
 def _pieces(cells: "pa.ChunkedArray") -> Iterator["pa.ChunkedArray"]:
     """As objects of Python all cells at once take many times the file's size."""
     return (cells.slice(at, _CELLS_AT_ONCE) for at in range(0, len(cells), _CELLS_AT_ONCE))
@@ -732,21 +701,4 @@ def _floats_one_by_one(cells: "pa.ChunkedArray") -> np.ndarray | int:
         if not _NUMBER.fullmatch(cell):
             return row
         values[row] = float(cell.replace("\u2212", "-").replace("D", "e").replace("d", "e"))
-    return values
-
-
-def _floats(numbers: "pa.ChunkedArray") -> np.ndarray:
-    """Numbers of pyarrow as float64 (N,), NaN where null."""
-    import pyarrow as pa
-
-    values, at = np.empty(len(numbers), np.float64), 0
-    # As buffers, since to_numpy imports pandas, which takes a second.
-    for chunk in (c for c in numbers.chunks if len(c)):
-        piece = values[at : at + len(chunk)]
-        piece[:] = np.frombuffer(chunk.buffers()[1], np.float64, len(chunk), 8 * chunk.offset)
-        if chunk.null_count:
-            known = chunk.is_valid().cast(pa.uint8())
-            at_known = np.frombuffer(known.buffers()[1], np.uint8, len(known), known.offset)
-            piece[at_known == 0] = np.nan
-        at += len(chunk)
     return values

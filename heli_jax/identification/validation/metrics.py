@@ -6,8 +6,8 @@ import numpy as np
 import scipy.fft
 import scipy.special
 
-from heli_jax.flights.band_limited import PASSED
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.resample import PASSED
 
 
 class Metrics(NamedTuple):
