@@ -217,11 +217,11 @@ def cross_spectra(
     # The bulk of the mean here: rounding would leave some of it in each segment.
     long = [r - r.mean(axis=1, keepdims=True) for r in long]
     X = np.concatenate([transforms(r, window) for r in long], axis=1)
-    steep = [transforms(r[:sloped], slope) for r in long] if sloped else None
+    steep = None
+    if sloped:
+        steep = np.concatenate([transforms(r[:sloped], slope) for r in long], axis=1)
     averages = sum(_independent(window, step, 1 + (r.shape[1] - length) // step) for r in long)
-    return Spectra(
-        np.asarray(omega), X, averages, length * dt, steep and np.concatenate(steep, axis=1)
-    )
+    return Spectra(np.asarray(omega), X, averages, length * dt, steep)
 
 
 def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
