@@ -81,7 +81,7 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
     def weighed(Z):
         # Parts of complex errors, of half their variance; derivatives of what is taken off.
         r, z, j = (v / 2**0.5 for v in (e[:, None], -Z.T, -J.T))
-        left, right = np.concatenate([z, r, Q], axis=1), np.concatenate([z, r, j], axis=1)
+        left, right = np.concatenate([z, r, Q], axis=1), np.concatenate([j, z, r], axis=1)
         G = jnp.asarray(left.T @ right)
         return [np.asarray(v) for v in _weighed(projected(G, jnp.eye(4)))]
 

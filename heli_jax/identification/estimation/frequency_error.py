@@ -43,6 +43,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     alike,
     at_lines,
     by_flight,
+    by_real,
     cut_notes,
     errors_of_lines,
     errors_of_some,
@@ -57,6 +58,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     resolved,
     shared_of,
     stacked,
+    states,
     with_shared,
     without_parts,
 )
@@ -346,15 +348,6 @@ def products_of_lines(
     return jax.tree.map(lambda *v: sum(v), *total)
 
 
-class _Driven(NamedTuple):
-    """The states at some lines, what drives them, and the derivatives of that."""
-
-    X: Complex[Array, "... k n"]
-    lines: Signals
-    slopes: Signals
-    """(..., k, c, q); None for those that do not move"""
-
-
 def _of_record(
     at: Resolved,
     matrices: tuple[Matrices, Matrices],
@@ -371,16 +364,13 @@ def _of_record(
         by: the same by instrument.
     """
     (m, dm), blocks = matrices, at.blocks
-    e = errors_of_some(at, m, record, direct[0], y, None if by is None else by[0])
+    e = errors_of_some(at, m, record, direct[0], y)
 
-    def driven(X: Array, signals: Signals, slopes: Signals) -> _Driven:
-        def lines(v: Array) -> Array:
-            flat = at_lines(record, v.reshape(*v.shape[:2], -1))
-            return blocks.cut(flat.reshape(*flat.shape[:2], *v.shape[2:]), axis=1)
+    def by_block(v: Array) -> Array:
+        lines = at_lines(record, v.reshape(*v.shape[:2], -1))
+        return blocks.cut(lines.reshape(*lines.shape[:2], *v.shape[2:]), axis=1)
 
-        return _Driven(X, *jax.tree.map(lines, (signals, slopes)))
-
-    own = (e.rows, driven(e.X, *direct), None if by is None else driven(e.X_by, *by))
+    own = (e.rows, e.X, *jax.tree.map(by_block, (direct, by)))
     # What passes a machine by, without its states, hangs on no unknown of most.
     passes = any(v is not None for v in (dm.C, dm.D, direct[1].acting))
 
@@ -389,20 +379,29 @@ def _of_record(
         H, W = real(at.H[b]), real(at.W[b]) if passes else None
         Q = at.basis(b)
 
-        def of_one(one: tuple[Array, _Driven, _Driven | None]) -> Array:
-            e, direct, by = one
-            J = _slopes(H, W, matrices, direct)
-            if by is None:
-                Z, right = J, [J, e[:, None]]
-            else:
-                # One program for both: the direct estimate is where the search begins.
-                Z = jax.lax.cond(
-                    by_instrument > 0.5, lambda: _slopes(H, W, matrices, by), lambda: J
-                )
-                right = [Z, e[:, None], J]
+        def of_one(one: tuple[Array, Array, Any, Any]) -> Array:
+            e, X, direct, by = one
+            J = _slopes(H, W, matrices, X, direct)
+
             # One product of tall matrices in place of several: each is read once.
-            left = jnp.concatenate([Z, e[:, None], Q], axis=1)
-            return left.T @ jnp.concatenate(right, axis=1)
+            def products(Z: Array, *right: Array) -> Array:
+                left = jnp.concatenate([Z, e[:, None], Q], axis=1)
+                return left.T @ jnp.concatenate([*right, e[:, None]], axis=1)
+
+            def directly() -> Array:
+                G = products(J, J)
+                return jnp.concatenate([G[:, :-1], G], axis=1)
+
+            def with_instruments() -> Array:
+                # The states are those of the inputs alone: such a record has no ends.
+                X = states(at, b, by_real(by[0].U, m.B.T)[None])[0]
+                Z = _slopes(H, W, matrices, X, by)
+                return products(Z, J, Z)
+
+            if by is None:
+                return directly()
+            # One program for both: the direct estimate is where the search begins.
+            return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
 
         return jax.lax.map(of_one, jax.tree.map(lambda v: v[b], own))
 
@@ -415,29 +414,33 @@ def projected(G: Float[Array, "r c"], S: Float[Array, "m m"]) -> Products:
     """Products with what the ends may add projected out of them: only they change (Kaufman).
 
     Args:
-        G: of the columns [Z, e, Q], with Q what the ends may add, and [Z, e, J], all minus the
-            derivatives; or [J, e, Q] and [J, e] where Z = J.
+        G: of the columns [Z, e, Q], with Q what the ends may add, and [J, Z, e]; Z and J are minus
+            the derivatives.
         S: makes an orthonormal basis of Q.
     """
-    m = len(S)
-    q = len(G) - m - 1
-    along = S.T @ G[-m:]
+    q = G.shape[1] // 2
+    along = S.T @ G[q + 1 :]
     # Of a complex normal error each part has half of the variance.
-    P = 2.0 * (G[:-m] - along[:, : q + 1].T @ along)
-    ZZ = P[:q, :q]
-    return Products(P[q, q], -P[:q, q], ZZ, P[:q, q + 1 :] if P.shape[1] > q + 1 else ZZ)
+    P = 2.0 * (G[: q + 1] - along[:, q:].T @ along)
+    return Products(P[q, -1], -P[:q, -1], P[:q, q:-1], P[:q, :q])
 
 
 def _slopes(
     H: Float[Array, "k p2 n2"],
     W: Float[Array, "k p2 p2"] | None,
     matrices: tuple[Matrices, Matrices],
-    of: _Driven,
+    X: Complex[Array, "k n"],
+    driven: tuple[Signals, Signals],
 ) -> Float[Array, "s q"]:
-    """The derivatives of the whitened response, real parts and imaginary ones."""
-    m, dm = matrices
-    driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
-    passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
+    """The derivatives of the whitened response, real parts and imaginary ones.
+
+    Args:
+        X: the states.
+        driven: what drives them, and its derivatives (k, c, q), None for those that do not move.
+    """
+    (m, dm), (lines, slopes) = matrices, driven
+    driving = _moved(X, lines.U, (dm.Ad, dm.B), (m.B, slopes.U))
+    passing = _moved(X, lines.acting, (dm.C, dm.D), (m.D, slopes.acting))
     pairs = ((H, driving), (W, passing))
     made = sum(M @ v for M, v in pairs if M is not None and v is not None)
     return made.reshape(-1, made.shape[-1])  # pyright: ignore

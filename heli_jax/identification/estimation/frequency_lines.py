@@ -423,17 +423,13 @@ class Resolved(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of one record of each of a few flights, with what they came of; the first three by block."""
+    """Of one record of each of a few flights, with what they came of; the first two by block."""
 
     rows: Float[Array, "b f s"]
     """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines
     that are used"""
     X: Complex[Array, "b f k n"]
     """the states; zero beyond the blocks that are used"""
-    X_by: Complex[Array, "b f k n"] | None
-    """those that inputs by instrument make; None without any"""
-    signals: Signals
-    """at all lines (f, K, ...)"""
     beyond: Complex[Array, "f K p"]
     """measured less what the inputs add to the outputs past the states"""
 
@@ -545,27 +541,20 @@ def errors_of_some(
     record: Record,
     signals: Signals,
     y: Float[Array, "f N p"],
-    by: Signals | None = None,
 ) -> Errors:
     """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
         signals: over the whole flights.
-        by: the inputs by instrument.
     """
     blocks, f = at.blocks, y.shape[0]
-    lines = Signals(*(at_lines(record, v) for v in signals))
     # In time, where these numbers are real ones and half as many.
     beyond = at_lines(record, y - signals.acting @ m.D.T)
-    # By instrument the states are those of the inputs alone: such a record has no ends.
-    inputs = blocks.cut(
-        lines.U if by is None else jnp.concatenate([lines.U, at_lines(record, by.U)]), axis=1
-    )
-    left = blocks.cut(beyond, axis=1)
+    inputs, left = (blocks.cut(v, axis=1) for v in (at_lines(record, signals.U), beyond))
 
     def unprojected(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         white, along = made
-        e = _times(at.W[b], left[b]) - _times(at.H[b], by_real(inputs[b, :f], m.B.T))
+        e = _times(at.W[b], left[b]) - _times(at.H[b], by_real(inputs[b], m.B.T))
         e = jnp.stack([jnp.real(e), jnp.imag(e)], axis=2).reshape(f, -1)
         return white.at[b].set(e), along + e @ at.basis(b)
 
@@ -581,12 +570,12 @@ def errors_of_some(
 
     def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
         rows, X = made
-        driven = by_real(inputs[b], m.B.T).at[:f].add(at.ends[b][None] @ of_ends)
+        driven = by_real(inputs[b], m.B.T) + at.ends[b][None] @ of_ends
         return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
 
     X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
     rows, X = blocks.over(without_ends, (white, X))
-    return Errors(rows, X[:, :f], None if by is None else X[:, f:], lines, beyond)
+    return Errors(rows, X, beyond)
 
 
 def states(
