@@ -40,9 +40,6 @@ class PairAgreement(NamedTuple):
     """squared errors over their variance, in the mean; 1 is expected"""
     of_none: float
     """the same of a model without any response: how far the measured one stands above its errors"""
-    simulated: bool
-    """whether the model was simulated from its initial state and sent through the windows of the
-    measurement; else its bounded solution was, and what the ends of the record add taken off"""
 
 
 APART = (
@@ -91,8 +88,8 @@ class ResponseAgreement(NamedTuple):
         if some:
             total = sum(p.of for p in self.pairs if p.lines)
             words.append(
-                f"{some} of {total} lines of the responses take no part: outside of a band, below "
-                "a coherence, or of no more power than the window's sidelobes."
+                f"{some} of {total} lines of the responses take no part: outside of a band or "
+                "below a coherence."
             )
         return tuple(words)
 
@@ -129,7 +126,6 @@ def pair_agreements(
     E: Complex[np.ndarray, "k p m"],
     variance: Float[np.ndarray, "k p m"],
     coherence: Float[np.ndarray, "k p m"],
-    simulated: tuple[bool, ...],
 ) -> tuple[PairAgreement, ...]:
     """Response by response."""
     out = []
@@ -151,7 +147,6 @@ def pair_agreements(
                     _J(w, at, (H[:, j, i], E[:, j, i], coherence[:, j, i])),
                     float(np.mean(errors)) if some else np.nan,
                     float(np.mean(sizes)) if some else np.nan,
-                    simulated[j],
                 )
             )
     return tuple(out)

@@ -346,8 +346,6 @@ class Windowed(NamedTuple):
     """(W, k, p) of the outputs; zero where a sample is missing"""
     seen: np.ndarray
     """(W, p) 1 where all samples of an output are there, else 0"""
-    own: np.ndarray
-    """(k, p, m) where an input and an output have more power than the window's sidelobes bring"""
     left_out: dict[str, str]
     """by output that is left out, why"""
 
@@ -445,40 +443,22 @@ def windowed(
     )
     starts = tuple(_starts(f, length) for f in flights)
     outputs, seen, left_out = _complete(flights, starts, length, (length * dt, len(inputs)))
-    cut = _Cut(starts, length, lines, dt)
-    U, of_inputs = cut.transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
-    Z = U
+
+    def transforms(signals: list[np.ndarray]) -> np.ndarray:
+        """(W, k, c) of signals (c, N) by flight."""
+        parts = [
+            window_transforms(x, s, length, lines, dt) for x, s in zip(signals, starts, strict=True)
+        ]
+        return np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
+
+    Z = U = transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
     if instruments:
         kinds = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
         signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in kinds]
-        Z = cut.transforms([np.stack(s) for s in signals])[0]
-    Y, of_outputs = cut.transforms([_filled(f, outputs) for f in flights])
-    own = of_inputs[:, None, :] & of_outputs[:, :, None]
-    Y = Y * seen[:, None, :]
+        Z = transforms([np.stack(s) for s in signals])
+    Y = transforms([_filled(f, outputs) for f in flights]) * seen[:, None, :]
     names, numbers = (inputs, instruments, outputs), tuple(lines.tolist())
-    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, own, left_out)
-
-
-class _Cut(NamedTuple):
-    """How flights are cut into windows."""
-
-    starts: tuple[tuple[int, ...], ...]
-    length: int
-    lines: np.ndarray
-    dt: float
-
-    def transforms(self, signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """(W, k, c) of signals (c, N) by flight, and (k, c) where they have more power than the
-        window's sidelobes bring from other lines."""
-        # Of all lines first: what leaks into those that are kept comes from any.
-        parts = [
-            window_transforms(x, s, self.length, range(self.length // 2), self.dt)
-            for x, s in zip(signals, self.starts, strict=True)
-        ]
-        whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
-        power = np.mean(np.abs(whole) ** 2, axis=0).T
-        own = [is_own(S)[self.lines] for S in power]
-        return whole[:, self.lines], np.stack(own, axis=1)
+    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, left_out)
 
 
 def _complete(

@@ -364,7 +364,7 @@ def responses(agreement: ResponseAgreement | None) -> Table | None:
     if agreement is None:
         return None
     usual = f"J (usual: < {USUAL_J:g})"
-    head = ("response", "Hz", "lines", "coherence", "chi-squared", usual, "model")
+    head = ("response", "Hz", "lines", "coherence", "chi-squared", usual)
     rows = [
         (
             f"{p.input} to {p.output}",
@@ -373,14 +373,13 @@ def responses(agreement: ResponseAgreement | None) -> Table | None:
             number(p.coherence, 2),
             number(p.chi_squared, 3),
             number(p.J, 3) if math.isfinite(p.J) else NOTHING,
-            "in windows" if p.simulated else "in windows, ends free",
         )
         for p in agreement.pairs
         if p.lines
     ]
     between = f"{number(agreement.lower95, 3)} to {number(agreement.upper95, 3)}"
-    rows.append(("all together", "", "", "", number(agreement.chi_squared, 3), "", ""))
-    rows.append(("expected", "", "", "", between, "", ""))
+    rows.append(("all together", "", "", "", number(agreement.chi_squared, 3), ""))
+    rows.append(("expected", "", "", "", between, ""))
     return Table(head, rows)
 
 

@@ -1,21 +1,14 @@
 """Fit of frequency responses: estimates, an unstable machine in a loop, and what is refused."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
-import scipy.signal
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax import config as configuration
 from heli_jax.analysis.spectra import PairOptions, ResponseOptions
-from heli_jax.dynamics.jacobians import StateSpace
-from heli_jax.identification.estimation.frequency_lines import Matrices, Signals
-from heli_jax.identification.estimation.frequency_response import simulated_outputs
 from heli_jax.identification.estimation.residual import differentiate, rows_of
-from heli_jax.identification.estimation.response_weights import forgets
 from heli_jax.identification.search import first_guess
 from tests.identification.bench import BENCH, record, vehicle
 from tests.test_log_responses import CONFIG
@@ -49,31 +42,9 @@ def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
     assert found.responses.lower95 < found.responses.chi_squared < found.responses.upper95
     assert found.adequate
     [pair] = found.responses.pairs
-    assert pair.simulated
     assert pair.J < 100.0
     # The simulation in time has an initial state and a bias of its own.
     assert found.metrics["roll"].vaf > 0.999
-
-
-def test_the_simulation_of_a_machine_is_that_of_scipy():
-    rng = np.random.default_rng(0)
-    A = np.array([[0.95, 0.1], [-0.2, 0.9]])
-    B, C, D = (rng.standard_normal(s) for s in ((2, 2), (3, 2), (3, 2)))
-    U, x0 = rng.standard_normal((90, 2)), rng.standard_normal(2)
-    machine = Matrices(*(jnp.asarray(v) for v in (A, B, C, D)))
-    signals = Signals(jnp.asarray(U), jnp.asarray(U))
-    _, y, _ = scipy.signal.dlsim((A, B, C, D, 1.0), U, x0=x0)
-    simulated = jax.jit(simulated_outputs, static_argnums=3)(machine, signals, jnp.asarray(x0), 32)
-    np.testing.assert_allclose(simulated, y.T, rtol=1e-10, atol=1e-12)
-
-
-def test_only_outputs_that_forget_within_a_window_are_simulated():
-    # A lag of 2 s, its integral, and a divergence that only the third output feels.
-    A = np.array([[-0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.2]])
-    matrices = StateSpace(*(jnp.asarray(v) for v in (A, np.eye(3)[:, :1], np.eye(3), A[:, :1])))
-    assert forgets(matrices, 0.02, np.ones(1), 500, 6000).tolist() == [True, False, False]
-    # Shorter than the lag remembers.
-    assert not forgets(matrices, 0.02, np.ones(1), 80, 6000)[0]
 
 
 @pytest.mark.slow
@@ -91,9 +62,9 @@ def test_rows_of_flights_of_several_lengths_and_their_slopes():
     for i in range(3):
         step = 1e-5 * np.eye(z.size)[i]
         up, down = (rows(at.layout, at.data, at.noise, jnp.asarray(z + s * step)) for s in (1, -1))
-        slope = np.asarray(up - down) / 2e-5
-        assert np.linalg.norm(slope) > 0
-        np.testing.assert_allclose(made.J[:, i], slope, atol=1e-6 * np.max(np.abs(slope)))
+        # What the projection of the ends' effects moves is orthogonal to the rows (Kaufman).
+        slope = float(up @ up - down @ down) / 4e-5
+        assert float(made.J[:, i] @ made.r) == pytest.approx(slope, rel=1e-3)
     # Initial states are numbers here.
     assert not np.asarray(made.J)[: -z.size, 3:].any()
 

@@ -26,7 +26,7 @@ from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.numerics.jitted import jitted
 from heli_jax.simulation.hold import between_samples
-from heli_jax.simulation.stepping import held_columns, start_state
+from heli_jax.simulation.stepping import held_columns
 
 # The records that frequency error transforms: flights, cut where an output has a missing sample.
 #
@@ -187,8 +187,6 @@ class Machines(NamedTuple):
     """of all of them, or with a leading axis where parameters are known of each flight"""
     signals: Signals
     """with a leading axis"""
-    x0: Float[Array, "f n"]
-    """initial states"""
     by: Signals | None
     """likewise with the inputs by instrument; None without"""
 
@@ -221,14 +219,14 @@ def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> 
         here = u._replace(
             states=_with(u.states, first, state), offsets=_with(u.offsets, first, offset)
         )
-        matrices, signals, x0 = _machine(layout, data, here, (first, flight))
+        matrices, signals = _machine(layout, data, here, (first, flight))
         if flight.by_instrument is None:
-            return Machines(matrices, signals, x0, None)
+            return Machines(matrices, signals, None)
         # A point to linearise about knows means alone, which inputs by instrument have as well.
         by = flight._replace(inputs=flight.by_instrument)
-        return Machines(matrices, signals, x0, _machine(layout, data, here, (first, by))[1])
+        return Machines(matrices, signals, _machine(layout, data, here, (first, by))[1])
 
-    axes = Machines(None if _one_machine(data, members) else 0, 0, 0, 0)  # pyright: ignore
+    axes = Machines(None if _one_machine(data, members) else 0, 0, 0)  # pyright: ignore
     return jax.vmap(of_one, out_axes=axes)(*jax.tree.map(lambda *v: jnp.stack(v), *own))
 
 
@@ -242,7 +240,7 @@ def _one_machine(data: Data, members: list[int]) -> bool:
 
 def _machine(
     layout: Layout, data: Data, u: Unknowns, of: tuple[int, Any]
-) -> tuple[Matrices, Signals, Float[Array, " n"]]:
+) -> tuple[Matrices, Signals]:
     i, flight = of
     data = data._replace(flights=_with(data.flights, i, flight))
     condition = layout.flight_facts[i].condition if layout.flight_facts else None
@@ -251,8 +249,7 @@ def _machine(
     Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    x0 = naming.ravel(start_state(model, drive.params, drive.state, drive.inputs), Ad.dtype)
-    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting), x0
+    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)
 
 
 def by_flight(

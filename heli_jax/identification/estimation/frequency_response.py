@@ -6,11 +6,10 @@ the measured outputs less the simulated ones, what the model misses of the respo
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
 The model goes through the same windows as the record: what windows do to a response they do to
-both, and nothing is biased. Where it is unstable, or remembers longer than a window, its bounded
-solution is taken in place of a simulation, and what the ends of the record add to it is projected
-out. Errors are complex and linear, whitened between outputs and inputs by the noise's spectral
-matrix: what no response explains of the errors. Lines of a window count for as much as they are
-independent.
+both, and nothing is biased. Its bounded solution is taken in place of a simulation, so that it may
+be unstable, and what the ends of the record add to it is projected out. Errors are complex and
+linear, whitened between outputs and inputs by the noise's spectral matrix: what no response
+explains of the errors. Lines of a window count for as much as they are independent.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
@@ -27,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax import naming
 from heli_jax.analysis.response_agreement import (
     APART,
     ResponseAgreement,
@@ -59,12 +57,10 @@ from heli_jax.identification.estimation.response_weights import (
     gusts_through,
     noise_density,
     on_device,
-    outputs_that_forget,
     response_of,
     weighed,
 )
 from heli_jax.identification.estimation.simulated_flights import (
-    driven,
     least_noise,
     signals,
     simulated_at,
@@ -79,9 +75,6 @@ from heli_jax.identification.unknowns.layout import (
     Unknowns,
     unpack,
 )
-from heli_jax.simulation.blocks import blockwise
-from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs
 
 # The model through the windows of the record.
 #
@@ -137,16 +130,6 @@ def bounded_outputs(
     return _in_time(lines, turns) + m.D @ signals.acting.T
 
 
-def simulated_outputs(
-    m: Matrices, signals: Signals, x0: Float[Array, " n"], block: int
-) -> Float[Array, "p N"]:
-    """The outputs from the first sample on."""
-    dt = jnp.ones((), m.Ad.dtype)
-    args = ZeroOrderHoldArgs(None, tuple(signals.U.T), dt, None, Discrete(m.Ad, m.B, None))
-    states = jnp.stack(blockwise(args, block, tuple(x0)))
-    return m.C @ states + m.D @ signals.acting.T
-
-
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
     """Of half of the lines z (K,), the others being conjugate, and exp(i pi t / N) (N,)."""
     # The odd record's line at Nyquist's frequency is its own conjugate.
@@ -177,20 +160,17 @@ class _Group(NamedTuple):
     """their numbers"""
     starts: tuple[int, ...]
     """first samples of the windows"""
-    simulated: np.ndarray
-    """which of the outputs in windows are simulated"""
-    bounded: np.ndarray
-    """which do not forget; the flights do not have the others"""
+    outputs: np.ndarray
+    """which of the outputs in windows they have"""
 
 
 def _groups(layout: Layout, data: Data, weights: ResponseWeights) -> list[_Group]:
     """Those that have windows."""
-    w, sent, made = weights.windows, np.asarray(weights.simulated), []
+    w, made = weights.windows, []
     for members in alike(layout, data):
         seen = np.array([n in layout.outputs[members[0]] for n in w.outputs])
         if starts := w.starts[members[0]]:
-            which = (np.flatnonzero(seen & sent), np.flatnonzero(seen & ~sent))
-            made.append(_Group(members, starts, *which))
+            made.append(_Group(members, starts, np.flatnonzero(seen)))
     return made
 
 
@@ -223,56 +203,43 @@ def _by_flight(
     u: Unknowns,
     group: _Group,
     ends: Float[Array, "f n"] | None,
-    body: Callable[[Array, Array | None, _Measured], Any],
+    body: Callable[[Array, Array, _Measured], Any],
 ) -> Any:
     """`body(E, effects, measured)` of each flight of a group, with a leading axis: E (p, W, k) what
     the model misses of the outputs in windows, effects (p, n, W, k) what the ends of the record add
-    there, None where all outputs forget.
+    there.
 
     Args:
         ends: of each flight; zero unless given.
     """
-    w, (states, offsets) = weights.windows, weights.begun
+    w = weights.windows
     N = next(iter(data.flights[group.members[0]].outputs.values())).shape[0]
-    # Numbers, not unknowns: they are found in time, since responses hardly tell them.
-    u = u._replace(states=states, offsets=offsets)
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
     machines = machines_of(of_windows, data, u, group.members)
 
-    def windows(rows: np.ndarray, y: Array) -> Complex[Array, "p *c W k"]:
-        """Of some outputs (., *c, N), zero for the others."""
-        y = jnp.zeros((len(w.outputs), *y.shape[1:]), y.dtype).at[rows].set(y)
+    def windows(y: Array) -> Complex[Array, "p *c W k"]:
+        """Of the group's outputs (., *c, N), zero for the others."""
+        y = jnp.zeros((len(w.outputs), *y.shape[1:]), y.dtype).at[group.outputs].set(y)
         E = window_transforms(y.reshape(-1, N), group.starts, w.length, w.numbers, w.dt)
         return jnp.asarray(E).reshape(*y.shape[:-1], *E.shape[1:])
 
-    def ready(m: Matrices) -> tuple[Matrices, Resolved | None, Array | None]:
-        if not group.bounded.size:
-            return m, None, None
-        at = resolved(_of(m, group.bounded), N)
-        return m, at, windows(group.bounded, at.ends(N))
+    def ready(m: Matrices) -> tuple[Matrices, Resolved, Array]:
+        m = m._replace(C=m.C[group.outputs], D=m.D[group.outputs])
+        at = resolved(m, N)
+        return m, at, windows(at.ends(N))
 
-    def of_some(of: tuple[Matrices, Resolved | None, Array | None], some: Any) -> Any:
+    def of_some(of: tuple[Matrices, Resolved, Array], some: Any) -> Any:
         m, at, effects = of
 
-        def of_one(signals: Signals, x0: Array, measured: _Measured, ends: Any) -> Any:
-            y = measured.y
-            if group.simulated.size:
-                own = simulated_outputs(_of(m, group.simulated), signals, x0, layout.block)
-                y = y.at[group.simulated].add(-own)
-            if at is not None:
-                own = bounded_outputs(_of(m, group.bounded), signals, at, ends)
-                y = y.at[group.bounded].add(-own)
-            return body(windows(np.arange(len(y)), y), effects, measured)
+        def of_one(signals: Signals, measured: _Measured, ends: Any) -> Any:
+            left = measured.y[group.outputs] - bounded_outputs(m, signals, at, ends)
+            return body(windows(left), effects, measured)
 
         return jax.vmap(of_one)(*some)
 
-    each = (machines.signals, machines.x0, _measured(data, w, group.members), ends)
+    each = (machines.signals, _measured(data, w, group.members), ends)
     # One at a time: what is made of a flight's windows for each unknown fills the caches.
     return by_flight(data, group.members, ready, of_some, machines.matrices, each, together=1)
-
-
-def _of(m: Matrices, outputs: np.ndarray) -> Matrices:
-    return m._replace(C=m.C[outputs], D=m.D[outputs])
 
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:
@@ -305,33 +272,29 @@ def rows_of_responses(
     """
     rest, groups = jax.lax.stop_gradient(u), _groups(layout, data, weights)
 
-    def sums(v: Array, ends: list[Array | None], body: Callable[..., Any]) -> list[Any]:
+    def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
         here = with_shared(layout, rest, v)
         each = zip(groups, ends, strict=True)
         return [_by_flight(layout, data, weights, here, g, end, body) for g, end in each]
 
-    def projected(v: Array) -> tuple[Array, Array | None, list[Array | None]]:
+    def projected(v: Array) -> tuple[Array, Array, list[Array]]:
         """The rows, directions of what the ends add, and by group the ends that suit the errors
         best."""
 
-        def body(E: Array, effects: Array | None, own: _Measured) -> Any:
-            return _cross(own, E[:, None]), None if effects is None else _cross(own, effects)
+        def body(E: Array, effects: Array, own: _Measured) -> Any:
+            return _cross(own, E[:, None]), _cross(own, effects)
 
         made = sums(v, [None] * len(groups), body)
         rows = _whitened(weights, _summed(S for S, _ in made))[:, 0]
         effects = [of_ends for _, of_ends in made]
         # The states of each flight in turn, as columns.
-        columns = [
-            jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for e in effects if e is not None
-        ]
-        if not columns:
-            return rows, None, [None] * len(groups)
+        columns = [jnp.moveaxis(e, 0, 3).reshape(*e.shape[1:4], -1) for e in effects]
         basis = _whitened(weights, jnp.concatenate(columns, axis=3))
         S = orthonormal(basis.T @ basis)
         Q = basis @ S
         along = Q.T @ rows
-        each = iter(jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1]))
-        ends = [None if e is None else next(each).reshape(len(e), -1) for e in effects]
+        each = jnp.split(S @ along, np.cumsum([c.shape[3] for c in columns])[:-1])
+        ends = [v.reshape(len(e), -1) for v, e in zip(each, effects, strict=True)]
         return rows - Q @ along, Q, ends
 
     @jax.custom_jvp
@@ -350,8 +313,7 @@ def rows_of_responses(
         J = jax.jacfwd(errors)(at[0])
         # Variable projection: about the ends that suit these unknowns best, whose own effect moves
         # with the unknowns.
-        J = J if Q is None else J - Q @ (Q.T @ J)
-        return made, J @ along[0]
+        return made, (J - Q @ (Q.T @ J)) @ along[0]
 
     return rows(shared_of(layout, u))
 
@@ -365,10 +327,8 @@ def errors_in_windows(
     # Of all that is seen in the windows, each output by its noise, and not of the responses alone.
     power = jnp.real(jnp.einsum("kii->ki", weights.density))
 
-    def left(E: Array, effects: Array | None, own: _Measured) -> Array:
+    def left(E: Array, effects: Array, own: _Measured) -> Array:
         seen = own.seen.T[:, :, None].astype(E.dtype)
-        if effects is None:
-            return E * seen
         scale = seen / jnp.sqrt(power).T[:, None, :].astype(E.dtype)
 
         def rows(v: Array) -> Array:
@@ -429,15 +389,11 @@ class FrequencyResponse(Objective):
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum of what no response explains of the errors."""
         z = in_time(layout, data, noise, z)
-        u, weights = unpack(layout, data, z), back(noise.whitening)
-        drives = [driven(layout, data, u, i) for i in range(len(data.flights))]
-        flown = [(d.params, naming.asdict(d.inputs)) for d in drives]
-        simulated = outputs_that_forget(layout.model, flown, weights.windows)
-        weights = weights._replace(simulated=simulated, begun=(u.states, u.offsets))
-        errors = np.asarray(errors_in_windows(layout, data, on_device(weights), z))
+        weights = back(noise.whitening)
+        errors = np.asarray(errors_in_windows(layout, data, noise.whitening, z))
         shape = gusts_through(layout, data, z, weights.windows)
         density = noise_density(weights.windows, weights.averages, errors, shape)
-        weights = weighed(weights, weights.simulated, density)
+        weights = weighed(weights, density)
         level = -2.0 * weights.log_determinant / max(weights.numbers, 1.0)
         sd = _sd(layout, data, weights, z)
         return z, Noise(sd, np.asarray(level), on_device(weights))
@@ -485,13 +441,11 @@ class FrequencyResponse(Objective):
         H = response_of(w, weights.averages, w.Y)
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
         # What the ends of the records add takes its part.
-        ends = 0 if all(weights.simulated) else len(data.flights) * len(layout.states)
+        ends = len(data.flights) * len(layout.states)
         taken = len(layout.of_interest)
         freedom = max(2.0 * weights.numbers - taken - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
-        pairs = pair_agreements(
-            w, used, H, E, weights.variance(), weights.coherence, weights.simulated
-        )
+        pairs = pair_agreements(w, used, H, E, weights.variance(), weights.coherence)
         left_out = [f"{n}: its responses take no part, {why}." for n, why in w.left_out.items()]
         return ResponseAgreement(
             pairs,
@@ -516,13 +470,11 @@ def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple
     for i, name in signals(layout):
         y = np.asarray(data.flights[i].outputs[name])
         left = (y - runs[i][name])[np.isfinite(y)]
-        stands = name not in w.outputs or weights.simulated[w.outputs.index(name)]
         # A simulation that diverges overflows in its square.
         with np.errstate(all="ignore"):
-            size = float(np.sqrt(np.mean(left**2))) if stands else np.nan
-        if not np.isfinite(size):
-            j = w.outputs.index(name) if name in w.outputs else 0
-            size = float(in_band[j])
+            size = float(np.sqrt(np.mean(left**2)))
+        if name in w.outputs and not size < np.nanstd(y):
+            size = float(in_band[w.outputs.index(name)])
         sd[i][name] = np.asarray(max(size, least_noise(y)), y.dtype)
     return tuple(sd)
 

@@ -18,9 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Bool, Complex, Float
 
 from heli_jax import naming
@@ -35,8 +33,6 @@ from heli_jax.analysis.spectra import (
     octave_mean,
     windowed,
 )
-from heli_jax.dynamics.jacobians import StateSpace, jacobians
-from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
@@ -331,32 +327,6 @@ def pairs_used(
     return used
 
 
-_LAGS = 48
-"""lags, from a sample to the record's length, at which an impulse response is looked at"""
-
-
-def forgets(
-    matrices: StateSpace, dt: float, sizes: Float[np.ndarray, " m"], length: int, samples: int
-) -> Bool[np.ndarray, " p"]:
-    """Of each output whether what an input did has decayed to a part of e after a window, and stays
-    so over the record: then a simulation of the whole record is sound.
-
-    Args:
-        dt: [s].
-    """
-    A, B, C = (np.asarray(v, float) for v in matrices[:3])
-    if not all(np.isfinite(v).all() for v in (A, B, C)):
-        return np.zeros(C.shape[0], bool)
-    Ad = scipy.linalg.expm(A * dt)
-    lags = np.geomspace(1, max(samples, 2 * length), _LAGS).astype(int)
-    lags = np.unique(np.append(lags, length))
-    with np.errstate(all="ignore"):
-        powers = [np.linalg.matrix_power(Ad, int(t)) for t in lags]
-        g = np.array([np.linalg.norm(C @ P @ (B * sizes), axis=1) for P in powers])
-        peak = np.max(g[lags <= length], axis=0)
-        return np.all(g[lags >= length] <= np.exp(-1.0) * peak, axis=0)
-
-
 # Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
 
 
@@ -366,23 +336,16 @@ class ResponseWeights(NamedTuple):
     windows: Windowed
     averages: Averages
     """with zeros in place of what is not determined"""
-    asked: Any
-    """(k, p, m) which responses are asked for and coherent enough"""
     coherence: Any
     """(k, p, m) partial"""
-    simulated: tuple[bool, ...]
-    """by output whether the model is simulated and sent through the windows"""
     used: Any
-    """(k, p, m) which take part"""
+    """(k, p, m) which take part: asked for, and coherent enough"""
     density: Any
     """(k, p, p) the noise's spectral matrix, per Hz"""
     whitening: Any
     """(k, r, r), r = p m: rows whose squares count for as much as a line is independent"""
     share: Any
     """(k,) of each line how much of an independent one it is"""
-    begun: Any
-    """by flight the initial States (None where they are the model's own) and the inputs' offsets by
-    name, as they suit the record in time best; zero before these are known"""
 
     @property
     def log_determinant(self) -> float:
@@ -430,62 +393,22 @@ def first_weights(problem: Problem, flights: Sequence[Flight]) -> ResponseWeight
         )
     coherence = partial_coherence(w, at)
     at = at._replace(P=np.nan_to_num(at.P))
-    asked = pairs_used(w, options, coherence, sound)
-    _require_lines(w, options, asked)
-    start = problem.start_params()
-    flown = [(naming.replace(start, **f.known), f.inputs) for f in flights]
-    forgetful = outputs_that_forget(problem.model, flown, w)
+    used = pairs_used(w, options, coherence, sound)
+    _require_lines(w, options, used)
     density = noise_density(w, at, w.Y)
-    begun = _at_rest(problem, len(flights))
-    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, None, begun)
-    weights = weighed(weights, forgetful, density)
+    weights = weighed(ResponseWeights(w, at, coherence, used, density, None, None), density)
     _require_numbers(problem, weights)
     return weights
 
 
-def _at_rest(problem: Problem, flights: int) -> tuple[tuple[Any, ...], tuple[dict, ...]]:
-    """Initial states and offsets of zero, in the form in which they are found later."""
-    # The same form from the beginning: another one would be compiled anew.
-    state = zeros(problem.model.State) if problem.nuisance.initial_state else None
-    offsets = {n: jnp.zeros(()) for n in problem.offset_inputs}
-    return (state,) * flights, (offsets,) * flights
-
-
-def weighed(
-    weights: ResponseWeights, simulated: tuple[bool, ...], density: Complex[np.ndarray, "k p p"]
-) -> ResponseWeights:
+def weighed(weights: ResponseWeights, density: Complex[np.ndarray, "k p p"]) -> ResponseWeights:
     """The same with another spectrum of the noise."""
-    w = weights.windows
-    # What goes through the same windows as the record may be of their sidelobes: so is the other.
-    # A response at one frequency is not told from the window's shape by less than two periods.
-    through = np.asarray(simulated, bool)[None, :, None]
-    own = w.own & (w.lines >= 2)[:, None, None]
-    used = weights.asked & (through | own)
+    used = weights.used
     each = np.moveaxis(weights.averages.share, 0, 1)
     share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
     share = np.where(share > 0, share, 1.0)
     W = whitening(weights.averages, density, used) * np.sqrt(share)[:, None, None]
-    return weights._replace(
-        simulated=simulated, used=used, density=density, whitening=W, share=share
-    )
-
-
-# model is a Model and parameters are its Params: records of any model.
-def outputs_that_forget(
-    model: Any, flights: Sequence[tuple[Any, dict[str, Any]]], w: Windowed
-) -> tuple[bool, ...]:
-    """By output in windows whether the model may be simulated over every flight.
-
-    Args:
-        flights: parameters, and inputs by name (N,).
-    """
-    fine = np.ones(len(w.outputs), bool)
-    rows = [naming.names(model.Outputs).index(n) for n in w.outputs]
-    for params, u in flights:
-        sizes = np.array([np.std(np.asarray(u[n])) for n in naming.names(model.Inputs)])
-        samples = len(next(iter(u.values())))
-        fine &= forgets(jacobians(model, params), w.dt, sizes, w.length, samples)[rows]
-    return tuple(bool(v) for v in fine)
+    return weights._replace(density=density, whitening=W, share=share)
 
 
 def _require_names(problem: Problem, options: ResponseOptions) -> None:
@@ -499,7 +422,7 @@ def _require_names(problem: Problem, options: ResponseOptions) -> None:
                 )
 
 
-def _require_lines(w: Windowed, options: ResponseOptions, asked: Bool[np.ndarray, "k p m"]) -> None:
+def _require_lines(w: Windowed, options: ResponseOptions, used: Bool[np.ndarray, "k p m"]) -> None:
     for i, pair in enumerate(options.pairs):
         place = f"frequency.pairs[{i}] ({pair.input} to {pair.output})"
         if pair.input not in w.inputs:
@@ -513,7 +436,7 @@ def _require_lines(w: Windowed, options: ResponseOptions, asked: Bool[np.ndarray
                 f"{place}: expected a band that holds a line of the window within {w.hz[0]:.3g} to "
                 f"{w.hz[-1]:.3g} Hz, got {low:g} to {high:g} Hz"
             )
-    if not asked.any():
+    if not used.any():
         raise ValueError(
             "frequency: no response is left, expected one with the coherence asked for "
             f"({options.coherence:g}) in the mean over an octave"
