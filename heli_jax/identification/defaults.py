@@ -120,15 +120,27 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:
-    """True if a free parameter is added to the rates at zero state and zero inputs."""
+    """Whether a free parameter is added to the rates whatever the state and the inputs are."""
+    rng = np.random.default_rng(11)
     dtype = jnp.result_type(float)
 
-    def rates(values: dict[str, Array]) -> Any:
-        zero = (
-            record(**dict.fromkeys(naming.names(record), jnp.zeros((), dtype)))
-            for record in (model.State, model.Inputs)
-        )
-        return model.vector_field(naming.replace(params, **values), *zero)
+    def draw(record: type) -> Any:
+        names = naming.names(record)
+        return record(**{n: jnp.asarray(rng.standard_normal(), dtype) for n in names})
+
+    def rates(values: dict[str, Array], x: Any, u: Any) -> Any:
+        return model.vector_field(naming.replace(params, **values), x, u)
 
     values = {n: jnp.asarray(getattr(params, n), dtype) for n in free}
-    return any(np.abs(v) > 0 for v in jax.tree.leaves(jax.jacfwd(rates)(values)))
+    slopes_at_points = []
+    # A constant term has the same derivative everywhere. Three random points: one where the
+    # derivative of another term happens to be the same is as good as impossible.
+    for _ in range(3):
+        slopes = jax.jacfwd(rates)(values, draw(model.State), draw(model.Inputs))
+        by_state = naming.asdict(slopes)
+        slopes_at_points.append(np.array([[float(d[n]) for d in by_state.values()] for n in free]))
+    for slopes in zip(*slopes_at_points, strict=True):
+        first, size = slopes[0], np.max(np.abs(slopes[0]))
+        if size > 0 and all(np.max(np.abs(s - first)) <= 1e-9 * size for s in slopes):
+            return True
+    return False
