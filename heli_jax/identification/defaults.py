@@ -99,7 +99,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     # Only what the outputs show has to come to rest: the span of C', A'C', ...
     V, further = np.zeros((len(A), 0)), C.T
     while further.size:
-        sizes = np.linalg.norm(further, axis=0)
+        sizes = np.max(np.abs(further), axis=0)
         further = further[:, sizes > 0] / sizes[sizes > 0]
         left = further - V @ (V.T @ further)
         U, s, _ = np.linalg.svd(left - V @ (V.T @ left), full_matrices=False)
@@ -107,15 +107,16 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
         V, further = np.hstack([V, further]), A.T @ further
     rates, drive = V.T @ A @ V, V.T @ B
     x = np.linalg.lstsq(rates, -drive, rcond=_ROUNDING)[0]
-    rests = np.linalg.norm(rates @ x + drive, axis=0) <= 1e-6 * np.linalg.norm(drive, axis=0)
     largest = np.array([np.ptp(flight.inputs[n]) / 2.0 for n in inputs])
     rms = np.array([np.sqrt(np.nanmean(np.square(y))) for y in flight.outputs.values()])
-    # From another initial state it is there from the first sample on, unless that state leaves in
-    # an unstable mode what was measured.
+    # Start values may be so large that their squares overflow: nothing is taken up then.
     with np.errstate(all="ignore"):
+        rests = np.linalg.norm(rates @ x + drive, axis=0) <= 1e-6 * np.linalg.norm(drive, axis=0)
+        # From another initial state it is there from the first sample on, unless that state leaves
+        # in an unstable mode what was measured.
         end = C @ V @ scipy.linalg.expm(rates * flight.duration) @ x
-    moved = np.stack([C @ V @ x, end])
-    near = np.all(np.abs(moved) * largest <= _ALLOWED * rms[:, None], axis=(0, 1))
+        moved = np.stack([C @ V @ x, end])
+        near = np.all(np.abs(moved) * largest <= _ALLOWED * rms[:, None], axis=(0, 1))
     return {n for n, taken in zip(inputs, rests & near, strict=True) if taken}
 
 
