@@ -169,7 +169,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     white = _without(known, residual)
     freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
     trials = list(_trials(records, drives, X.T))
-    gains = [one.gains(angles, known, white)[:, 0] for one in trials]
+    back = np.exp(-1j * angles)
+    gains = [one.gains(back, known, white)[:, 0] for one in trials]
     one, of = max(zip(trials, gains, strict=True), key=lambda pair: float(np.max(pair[1])))
     at = int(np.argmax(of))
     drive, gain = one.drives[at], float(of[at] * freedom / squares)
@@ -184,9 +185,9 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     anew = _real(_complex(white).astype(phases.dtype) * phases)
     anew = _without(known.astype(np.float32), anew)
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-    chance = np.max([each.gains(angles, known, anew).max(axis=0) for each in trials], axis=0)
+    chance = np.max([each.gains(back, known, anew).max(axis=0) for each in trials], axis=0)
     alone = one._replace(columns=one.columns[[*range(one.beside), one.beside + at]])
-    steps = _steps(rows, alone.through(angles).T, residual)
+    steps = _steps(rows, alone.through(back).T, residual)
     return Strongest(drive, gain, _by_chance(gain, chance), one.damping, one.frequency, *steps)
 
 
@@ -205,20 +206,23 @@ class _Trial(NamedTuple):
         """How many columns stand before the drives."""
         return len(self.columns) - len(self.drives)
 
-    def through(self, angles: Float[np.ndarray, " K"]) -> Float[np.ndarray, "c2 K2"]:
-        """The columns through the filter, each by itself and one sample later."""
-        back = np.exp(-1j * angles)
+    def through(self, back: Complex[np.ndarray, " K"]) -> Float[np.ndarray, "c2 K2"]:
+        """The columns through the filter, each by itself and one sample later.
+
+        Args:
+            back: what a delay of one sample multiplies a line by.
+        """
         x = self.columns
         if np.isfinite(self.damping):
             size = np.exp(-self.damping * self.frequency)
             turn = self.frequency * np.sqrt(max(1.0 - self.damping**2, 0.0))
             x = x / (1.0 - 2.0 * size * np.cos(turn) * back + (size * back) ** 2)
-        both = np.stack([x, x * back], axis=1).reshape(-1, len(angles))
+        both = np.stack([x, x * back], axis=1).reshape(-1, len(back))
         return np.concatenate([np.real(both), np.imag(both)], axis=1)
 
     def gains(
         self,
-        angles: Float[np.ndarray, " K"],
+        back: Complex[np.ndarray, " K"],
         known: Float[np.ndarray, "K2 q"],
         residuals: Float[np.ndarray, "K2 r"],
     ) -> Float[np.ndarray, "d r"]:
@@ -228,7 +232,7 @@ class _Trial(NamedTuple):
         Args:
             known: orthonormal; the residuals have nothing of it.
         """
-        rows, b, d = self.through(angles), 2 * self.beside, len(self.drives)
+        rows, b, d = self.through(back), 2 * self.beside, len(self.drives)
         of_known, answers = rows @ known, rows.astype(residuals.dtype) @ residuals
         whole = rows @ rows[:b].T
         left = whole - of_known @ of_known[:b].T
