@@ -43,6 +43,8 @@ _AT_LEAST = 14.0
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
 _EULER = 0.5772156649015329
+_AT_ONCE = 16
+"""filters that are tried together"""
 
 
 class Lines(NamedTuple):
@@ -168,15 +170,16 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     known = directions(rows, _SAME)
     white = _without(known, residual)
     freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
-    trials = list(_trials(records, drives, X.T))
-    back = np.exp(-1j * angles)
-    gains = [one.gains(back, known, white)[:, 0] for one in trials]
-    one, of = max(zip(trials, gains, strict=True), key=lambda pair: float(np.max(pair[1])))
-    at = int(np.argmax(of))
-    drive, gain = one.drives[at], float(of[at] * freedom / squares)
+    trials, back = list(_trials(records, drives, X.T)), np.exp(-1j * angles)
+    gains = [each.gains(back, known, white)[:, :, 0] for each in trials]
+    best = int(np.argmax([np.max(of) for of in gains]))
+    one, of = trials[best], gains[best]
+    of_filter, at = np.unravel_index(int(np.argmax(of)), of.shape)
+    drive, gain = one.drives[at], float(of[of_filter, at] * freedom / squares)
+    damping, frequency = one.filters[of_filter].tolist()
     if not gain > _AT_LEAST:
         nothing = np.zeros(J.shape[1])
-        return Strongest(drive, gain, 1.0, one.damping, one.frequency, nothing, nothing, 0.0)
+        return Strongest(drive, gain, 1.0, damping, frequency, nothing, nothing, 0.0)
     # The same phases for the same residual, whoever tests it. In single precision, half the work:
     # what chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
@@ -185,18 +188,20 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     anew = _real(_complex(white).astype(phases.dtype) * phases)
     anew = _without(known.astype(np.float32), anew)
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-    chance = np.max([each.gains(back, known, anew).max(axis=0) for each in trials], axis=0)
-    alone = one._replace(columns=one.columns[[*range(one.beside), one.beside + at]])
-    steps = _steps(rows, alone.through(back).T, residual)
-    return Strongest(drive, gain, _by_chance(gain, chance), one.damping, one.frequency, *steps)
+    of_chance = [each.gains(back, known, anew).max(axis=(0, 1)) for each in trials]
+    alone = one._replace(
+        filters=one.filters[[of_filter]], columns=one.columns[[*range(one.beside), one.beside + at]]
+    )
+    steps = _steps(rows, alone.through(back)[0].T, residual)
+    p_value = _by_chance(gain, np.max(of_chance, axis=0))
+    return Strongest(drive, gain, p_value, damping, frequency, *steps)
 
 
 class _Trial(NamedTuple):
-    """One filter, and the drives that are tried through it beside the same columns."""
+    """Some filters, and the drives that are tried through them beside the same columns."""
 
-    damping: float
-    frequency: float
-    """[rad a sample]"""
+    filters: Float[np.ndarray, "f 2"]
+    """damping and frequency [rad a sample]; infinite damping is no filter"""
     drives: tuple[Drive, ...]
     columns: Complex[np.ndarray, "c K"]
     """those beside first, then the drives"""
@@ -206,26 +211,28 @@ class _Trial(NamedTuple):
         """How many columns stand before the drives."""
         return len(self.columns) - len(self.drives)
 
-    def through(self, back: Complex[np.ndarray, " K"]) -> Float[np.ndarray, "c2 K2"]:
-        """The columns through the filter, each by itself and one sample later.
+    def through(self, back: Complex[np.ndarray, " K"]) -> Float[np.ndarray, "f c2 K2"]:
+        """The columns through each filter, each by itself and one sample later.
 
         Args:
             back: what a delay of one sample multiplies a line by.
         """
-        x = self.columns
-        if np.isfinite(self.damping):
-            size = np.exp(-self.damping * self.frequency)
-            turn = self.frequency * np.sqrt(max(1.0 - self.damping**2, 0.0))
-            x = x / (1.0 - 2.0 * size * np.cos(turn) * back + (size * back) ** 2)
-        both = np.stack([x, x * back], axis=1).reshape(-1, len(back))
-        return np.concatenate([np.real(both), np.imag(both)], axis=1)
+        both = np.stack([self.columns, self.columns * back], axis=1).reshape(-1, len(back))
+        damping, w = self.filters.T
+        none = ~np.isfinite(damping)
+        damping = np.where(none, 1.0, damping)
+        size = np.where(none, 0.0, np.exp(-damping * w))
+        twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+        H = 1.0 / (1.0 - twice[:, None] * back + (size[:, None] * back) ** 2)
+        values = both * H[:, None, :]
+        return np.concatenate([np.real(values), np.imag(values)], axis=2)
 
     def gains(
         self,
         back: Complex[np.ndarray, " K"],
         known: Float[np.ndarray, "K2 q"],
         residuals: Float[np.ndarray, "K2 r"],
-    ) -> Float[np.ndarray, "d r"]:
+    ) -> Float[np.ndarray, "f d r"]:
         """The part of each residual's squares that each drive explains beyond what is known, by
         products of columns: a basis for each filter and drive would take ten times as long.
 
@@ -234,16 +241,16 @@ class _Trial(NamedTuple):
         """
         rows, b, d = self.through(back), 2 * self.beside, len(self.drives)
         of_known, answers = rows @ known, rows.astype(residuals.dtype) @ residuals
-        whole = rows @ rows[:b].T
-        left = whole - of_known @ of_known[:b].T
-        taken = left[b:] @ _inverse(left[:b], whole[:b])
-        answers = (answers[b:] - taken @ answers[:b]).reshape(d, 2, -1)
+        whole = rows @ _turned(rows[:, :b])
+        left = whole - of_known @ _turned(of_known[:, :b])
+        taken = left[:, b:] @ _inverse(left[:, :b], whole[:, :b])
+        answers = (answers[:, b:] - taken @ answers[:, :b]).reshape(len(rows), d, 2, -1)
         each, of_known, left, taken = (
-            v[-2 * d :].reshape(d, 2, -1) for v in (rows, of_known, left, taken)
+            v[:, -2 * d :].reshape(len(rows), d, 2, -1) for v in (rows, of_known, left, taken)
         )
         own = each @ _turned(each)
         over = _inverse(own - of_known @ _turned(of_known) - taken @ _turned(left), own)
-        return np.sum(answers * (over @ answers), axis=1)
+        return np.sum(answers * (over @ answers), axis=2)
 
 
 def _trials(
@@ -260,14 +267,16 @@ def _trials(
     ):
         those = tuple(group)
         columns = np.concatenate([ends, X[[*beside]], X[[d.column for d in those]]])
-        if plain:
-            yield _Trial(np.inf, 0.0, those, columns)
+        filters = [(np.inf, 0.0)] if plain else []
         for damping, step in bank:
             w = low
             while w < high:
-                yield _Trial(damping, w, those, columns)
+                filters.append((damping, w))
                 # No finer than lines lie.
                 w *= np.exp(max(step, 0.25 * low / w))
+        # A few at a time stay in the caches.
+        for k in range(0, len(filters), _AT_ONCE):
+            yield _Trial(np.array(filters[k : k + _AT_ONCE]), those, columns)
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:
