@@ -15,4 +15,4 @@ def test_every_file_that_the_architecture_names_exists():
 
 def test_it_stays_short():
     text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) < 150
+    assert len(text.splitlines()) < 170
