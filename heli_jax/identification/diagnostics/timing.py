@@ -17,7 +17,6 @@ from heli_jax.identification.validation.logging_rate import (
 )
 from heli_jax.identification.validation.other_hold import (
     BEYOND_DOUBT,
-    likelihood_gain,
     moving_inputs,
     other_hold,
 )
@@ -244,9 +243,12 @@ def hold_matters(c: Context) -> Iterator[Finding]:
     """Estimates that the other hold of the inputs would change by more than their sd."""
     if c.fitted:
         sds = {n: x.sd for n, x in c.estimates.items() if x.sd is not None}
-        changes = other_hold(c.problem, c.at, c.e, sds, in_doubt=True) if c.arrived else {}
+        other = other_hold(c.problem, c.at, c.e, sds, in_doubt=True) if c.arrived else None
     else:
-        changes = other_hold(c.problem, c.at, c.e, skip=c.undetermined)
+        other = other_hold(c.problem, c.at, c.e, skip=c.undetermined)
+    if other is None:
+        return
+    changes = other.changes
     large = sorted((n for n in changes if changes[n][1] > 1.0), key=lambda n: -changes[n][1])
     if not large:
         return
@@ -258,8 +260,8 @@ def hold_matters(c: Context) -> Iterator[Finding]:
     }
     # Autocorrelated residuals make the record worth fewer samples.
     wider = max((e.sd / e.sd_white for e in c.estimates.values() if e.sd and e.sd_white), default=1)
-    gain = likelihood_gain(c.problem, c.at, c.e) / wider**2 if c.fitted else 0.0
-    contradicted = gain > BEYOND_DOUBT
+    gain = other.gain / wider**2
+    contradicted = c.fitted and gain > BEYOND_DOUBT
     yield found(
         "timing.likelier-hold" if contradicted else "timing.other-hold",
         "doubt" if contradicted else "note",

@@ -4,6 +4,7 @@ two the record bears out.
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -27,6 +28,15 @@ BEYOND_DOUBT = 20.0
 """gain in twice the log-likelihood from which on the record contradicts the hold"""
 
 
+class OtherHold(NamedTuple):
+    """Effect of the other hold of the inputs."""
+
+    changes: dict[str, tuple[float, float]]
+    """by unknown how far it would change [SI], and the same in standard deviations"""
+    gain: float
+    """of twice the log-likelihood, to first order; 0 unless asked of inputs in doubt"""
+
+
 def other_hold(
     problem: Problem,
     at: Solution,
@@ -35,9 +45,8 @@ def other_hold(
     *,
     skip: Collection[str] = (),
     in_doubt: bool = False,
-) -> dict[str, tuple[float, float]]:
-    """By unknown how far the other hold of the inputs that move would change it [SI], and the same
-    in standard deviations; empty where nothing is told.
+) -> OtherHold | None:
+    """Return the effect of the other hold of the inputs that move; None if it is not known.
 
     Args:
         at: the point, with the layout and the numbers that it belongs to.
@@ -48,7 +57,7 @@ def other_hold(
     """
     moving = [moving_inputs(problem, f, in_doubt) for f in problem.training]
     if not any(moving) or not np.all(np.isfinite(e.J)):
-        return {}
+        return None
     # Other inputs to the same program in place of another program: compiling costs far more than an
     # evaluation.
     if not feeds_through(problem):
@@ -56,30 +65,19 @@ def other_hold(
     elif not in_doubt:
         other = evaluate(_flipped(at.layout, moving), at.data, at.noise, at.z)
     else:
-        return {}
+        return None
     if not _is_finite(other):
-        return {}
+        return None
     names = at.layout.of_interest
     change = _change(e, other, len(names))
     if sd is None:
         sd = dict(zip(names, _white_sd(e, len(names)).tolist(), strict=True))
-    return {
+    changes = {
         n: (float(c), abs(float(c)) / sd[n])
         for n, c in zip(names, change, strict=True)
         if n not in skip and sd.get(n, 0.0) > 0
     }
-
-
-def likelihood_gain(problem: Problem, at: Solution, e: Evaluation) -> float:
-    """Gain in twice the log-likelihood, to first order, of holding the inputs that their log let
-    be taken as linear; 0 where there are none."""
-    moving = [moving_inputs(problem, f, in_doubt=True) for f in problem.training]
-    if not any(moving) or feeds_through(problem):
-        return 0.0
-    other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
-    if not (_is_finite(e) and _is_finite(other)):
-        return 0.0
-    return deviance_of(at, _least(other), _least(e))
+    return OtherHold(changes, deviance_of(at, _least(other), _least(e)) if in_doubt else 0.0)
 
 
 def _least(e: Evaluation) -> float:
