@@ -285,10 +285,8 @@ class FitConfig(Section):
     """what is estimated beside"""
     shooting: ShootingConfig | None = None
     """windows with initial states of their own"""
-    # Unless given, the number depends on what is free: the misfit has a valley for each period by
-    # which a delay is wrong, and one start finds the nearest.
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """points to start from; one unless given, five where a delay is free"""
+    """points to start from; default one, and restarts where a fit explains little"""
     seed: Annotated[int, Field(ge=0)] = 0
     """of random starts, bootstrap and NUTS"""
     max_steps: Annotated[int, Field(ge=1)] = 200
