@@ -306,7 +306,7 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
 
 
 def _diverged_at(run: Trajectory) -> float:
-    """When a run ceases to be finite [s]."""
+    """Return the time at which a run ceases to be finite [s]."""
     # argmin of booleans: the first sample at which any state is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
     return float(run.times[np.argmin(good)])

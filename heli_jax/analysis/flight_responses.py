@@ -54,7 +54,7 @@ type Names = tuple[list[str], tuple[str, ...]]
 
 
 class Windows(NamedTuple):
-    """How responses were taken."""
+    """Settings by which responses were computed."""
 
     records: Sequence[Float[np.ndarray, "c N"]]
     """inputs, instruments and outputs of each part of a flight"""
@@ -84,7 +84,7 @@ class Wanted(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Which frequencies, in windows of which length."""
+    """Frequencies and window length of responses."""
 
     band: tuple[float, float] | None = None
     """first and last frequency [Hz]; None: two periods in a window to 0.4 of the rate"""
@@ -111,7 +111,7 @@ class Pair(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What is known of one output."""
+    """Responses, coherence and noise of one output."""
 
     pairs: dict[str, Pair]
     """by input"""
@@ -275,7 +275,7 @@ def _moving_as_one(
 def _weak(
     omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """Where an instrument hardly moves its input, so that nothing is known of the responses."""
+    """Name the frequencies at which an instrument hardly moves its input."""
     notes = []
     for name in instruments:
         pairs = [output.pairs[name] for output in outputs.values()]
@@ -352,9 +352,8 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
 def steady_sd(
     omega: np.ndarray, output: Output, input: str, seconds: float
 ) -> tuple[np.ndarray, float]:
-    """Of a response's real and imaginary part (k,), the noise a mean over frequencies where there
-    are few averages, and its degrees of freedom: for weights, which a single frequency's would
-    mislead.
+    """Return the sd of a response's real and imaginary part (k,), and its degrees of freedom. With
+    few averages the noise is a mean over frequencies, so that weights stay smooth.
 
     Args:
         omega: (k,) [rad/s]
@@ -501,9 +500,7 @@ _BLOCK = 4096
 
 
 def forgets(fitted: TransferFit, seconds: float) -> bool:
-    """Whether a transfer function forgets within a window, so that what it does is known from the
-    record: its slowest mode falls to 1/e.
-    """
+    """True if the slowest mode of a transfer function falls to 1/e within a window."""
     poles = fitted.poles
     return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
 
@@ -511,9 +508,8 @@ def forgets(fitted: TransferFit, seconds: float) -> bool:
 def window_error(
     fitted: TransferFit, windows: Windows, input: int, hold: Hold
 ) -> Complex[np.ndarray, " k"] | None:
-    """What windows add to the response of a transfer function; None where it does not forget within
-    a window, so that what it does is not known from the record.
-    """
+    """Return the error that windows add to the response of a transfer function; None if it does
+    not decay within a window."""
     if not forgets(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})

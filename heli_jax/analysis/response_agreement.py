@@ -69,7 +69,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def doubt(self) -> str:
-        """Why the model does not explain the responses, in a few words; empty where it does."""
+        """Reason in a few words why the model does not explain the responses; empty if it does."""
         if self.chi_squared > max(self.upper95, _MISFIT):
             return (
                 f"squared errors of the responses are {self.chi_squared:.2g} times what their "

@@ -307,7 +307,7 @@ def _check_sticks(
 
 
 def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
-    """Why a stick that carries the weight is past its end; empty for the others."""
+    """Reason why the stick that carries the weight is past its end; empty for other sticks."""
     if stick not in ("x_throttle", "x_collective"):
         return ""
     weight = float(params.m * params.g)

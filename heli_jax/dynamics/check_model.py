@@ -488,7 +488,7 @@ def starting_at(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | None = None) -> str:
-    """Why a model cannot begin at its initial state, with the remedy; empty where it can.
+    """Reason why a model cannot begin at its initial state, with the remedy; empty if it can.
 
     Rates and outputs have to be finite there, and their derivatives by the states.
 

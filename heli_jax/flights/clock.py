@@ -244,7 +244,7 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
 
 
 def clock_scale(table: Table, time: Signal) -> float:
-    """Of the unit of a clock, or of its counts [s]."""
+    """Return the size of a clock's unit or count [s]."""
     if time.scale != 1.0:
         return time.scale
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.

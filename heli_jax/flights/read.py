@@ -147,7 +147,7 @@ def read_parts(
 
 
 def _moves(signal: Timed, start: float, end: float) -> bool:
-    """Whether a signal moves from `start` to `end` [s]."""
+    """True if a signal moves from `start` to `end` [s]."""
     values = signal.values[(signal.seconds >= start) & (signal.seconds <= end)]
     return values.size > 1 and bool(np.ptp(values) > 0)
 

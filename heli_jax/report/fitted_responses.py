@@ -190,7 +190,8 @@ def _coherent(responses: FlightResponses) -> dict[tuple[str, str], float]:
 def _pairs(
     responses: FlightResponses, curves: _Curves, coherent: Mapping[tuple[str, str], float]
 ) -> list[FittedPair]:
-    """Those of input and output that are coherent anywhere, by the sum of their coherence there."""
+    """Return the pairs of input and output that are coherent anywhere, by the sum of their
+    coherence."""
     ranked = []
     for (input, name), total in coherent.items():
         if not total:

@@ -103,7 +103,7 @@ def write_responses(
 
 
 def _averages(responses: FlightResponses, request: Wanted) -> str:
-    """Of the response that a transfer function is fitted to, as text."""
+    """Describe the averages of the response that a transfer function is fitted to."""
     output = responses.outputs.get(request.output)
     return NOTHING if output is None else number(output.averages, 3)
 
@@ -212,7 +212,7 @@ def _number(c: Coefficient) -> dict[str, float]:
 
 
 def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
-    """What is to be heeded of a transfer function."""
+    """Return the cautions about a transfer function."""
     if isinstance(fit, str):
         return [f"not fitted: {fit}"]
     if not fit.determined:

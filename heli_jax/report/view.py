@@ -79,7 +79,7 @@ def write_view(
 
 
 def _good(run: Trajectory) -> np.ndarray:
-    """Which samples can be drawn."""
+    """Return a mask of the samples that can be drawn."""
     leaves = jax.tree.leaves((run.states, run.outputs))
     return np.all([np.abs(np.asarray(v)) < _HUGE for v in leaves], axis=0)
 
@@ -114,13 +114,13 @@ type Points = Float[np.ndarray, "n 3"]
 
 
 def moments_of(n: int) -> np.ndarray:
-    """Which of n samples are kept: all, or at most `MOST_MOMENTS` evenly among them."""
+    """Return the indices of the samples kept: all of n, or at most `MOST_MOMENTS` evenly spaced."""
     # Rounded, not truncated: the first and the last sample are among them.
     return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_MOMENTS))).astype(int))
 
 
 def size_of(run: Trajectory, R: float) -> float:
-    """How many times its size the machine is drawn, so that it can be seen on a long path."""
+    """Return the magnification of the drawn vehicle, so that it is visible on a long path."""
     path = _path(run.states)
     # Whole numbers: the page says 'drawn 3 times its size'.
     length = float(np.max(np.ptp(path, axis=0)))

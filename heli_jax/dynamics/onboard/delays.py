@@ -239,7 +239,8 @@ def line_states(name: str, order: int) -> tuple[str, ...]:
 
 
 def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
-    """What comes out of a delay line: the signal one delay ago, or as it is now for none.
+    """Return the output of a delay line: the signal one delay ago, or the current value without
+    delay.
 
     Args:
         delay: [s].

@@ -72,7 +72,7 @@ def _measured_and_simulated(signals: Signals, output: str) -> tuple[Series, Seri
 
 
 def time_label(log_start: float | None) -> str:
-    """Of an axis: time in the log where the flight has one, else from its first sample."""
+    """Label of a time axis: time in the log if the flight has one, else from its first sample."""
     return "time [s]" if log_start is None else "time in the log [s]"
 
 
