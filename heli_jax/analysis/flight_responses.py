@@ -257,7 +257,7 @@ def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names:
 def _moving_as_one(
     flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """A doubt about inputs that move together, whose responses cannot be told apart."""
+    """Doubt about inputs that move together, whose responses cannot be separated."""
     pairs = (pair for output in outputs.values() for pair in output.pairs.values())
     if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
         return []
@@ -396,7 +396,7 @@ def _fitted(
     low, high = request.band or (0.0, np.inf)
     used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
-    # With its hold, which is half a sample late, so that the delay is the machine's own.
+    # With its hold, which is half a sample late, so that the delay is the vehicle's own.
     hold = holds[request.input]
     sd, freedom = steady_sd(omega, output, request.input, windows.seconds)
     measured = Measured(omega, H, sd, windows.seconds, pair.coherence, hold, freedom)

@@ -108,7 +108,7 @@ class ResponseAgreement(NamedTuple):
         if not self.chi_squared > self.upper95:
             return ""
         why = (
-            "the model lacks something, the machine is not linear, or an input follows the outputs"
+            "the model lacks something, the vehicle is not linear, or an input follows the outputs"
             if self.doubt
             else "chance makes as much in one of forty; the model lacks something, or its "
             "intervals are too narrow"

@@ -1,6 +1,6 @@
 """Frequency responses from averaged spectra: several inputs at once, with coherence and errors.
 
-Inputs that move together are told apart (conditioned responses), and with an instrument, an
+Inputs that move together are separated (conditioned responses), and with an instrument, an
 excitation that was logged and that no feedback reaches, the responses are those of the vehicle
 where pilot or autopilot close the loop.
 
@@ -159,7 +159,7 @@ def sd_of_ratio(
     half95: float,
 ) -> Float[np.ndarray, "k l m"]:
     """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
-    NaN where these have no end.
+    NaN where these are unbounded.
 
     Args:
         omega: frequencies [rad/s].

@@ -204,7 +204,7 @@ class NuisanceConfig(Section):
     """whether a factor of each input is"""
     input_offset: bool | list[str] | None = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
-    the sticks of a machine in free flight"""
+    the sticks of a vehicle in free flight"""
 
 
 class IntervalsConfig(Section):
@@ -324,7 +324,7 @@ class RLSConfig(Section):
     # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
     """of the discrete transfer function"""
-    # One forgets nothing: all samples count alike, as for a machine that does not change in a
+    # One forgets nothing: all samples count alike, as for a vehicle that does not change in a
     # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
     """factor by which each sample counts less than the next"""

@@ -312,7 +312,7 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     if len(rates) != 1:
         return None
     rate, words = next(iter(rates.items()))
-    # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
+    # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
 

@@ -156,9 +156,9 @@ def at_times(
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
-    # A linear machine answers a filtered stick with the filtered motion. The mean of each step,
+    # A linear vehicle answers a filtered stick with the filtered motion. The mean of each step,
     # beside an output that is filtered alone, leaves the ringing of the output's jumps to be
-    # explained by the machine.
+    # explained by the vehicle.
     low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":

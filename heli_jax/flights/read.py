@@ -28,7 +28,7 @@ from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
 _SHORTEST = 0.05
-"""s: no machine answers a stick sooner"""
+"""s: no vehicle answers a stick sooner"""
 _STILL = 1e-100
 """SI: an output that moves by no more does not move"""
 
@@ -229,7 +229,7 @@ def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
 
 
 def require_some_time(flight: Flight) -> None:
-    """Refuse a flight in which no machine can have moved.
+    """Refuse a flight in which no vehicle can have moved.
 
     Raises:
         InputError: with its length, and where to look.

@@ -39,7 +39,7 @@ _RECUR = 0.5
 _LATE = 0.25
 """of the time between two measurements, by which one of a regular clock is off"""
 _MOVES = 0.5
-"""part of its samples at which another output moves, which shows that the machine did"""
+"""part of its samples at which another output moves, which shows that the vehicle did"""
 
 
 def usual_run(values: np.ndarray) -> int | None:
@@ -156,7 +156,7 @@ def repeats_removed(
         elif usual is None:
             continue
         elif not (moving or sure):
-            # Nothing else shows that the machine moved while this signal stood still.
+            # Nothing else shows that the vehicle moved while this signal stood still.
             words = (
                 f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
                 "`repeats: missing`"

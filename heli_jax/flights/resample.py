@@ -88,7 +88,7 @@ def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
 def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The value of the sample before each time: a stick stays until the next sample.
 
-    For modes and counters, of which no mean makes sense; what acts on a machine takes `held_mean`.
+    For modes and counters, of which no mean makes sense; what acts on a vehicle takes `held_mean`.
     A time that misses a stamp by rounding alone counts as at the stamp.
 
     Args:
@@ -124,9 +124,9 @@ def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray)
 def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The mean of a stepwise signal over each step of a grid, from its time to the next.
 
-    What a machine makes of a step is its integral. The mean keeps it wherever the step falls; the
+    What a vehicle makes of a step is its integral. The mean keeps it wherever the step falls; the
     value at the grid's time would be late by half a grid step on average, which a fit takes for
-    the machine's lag.
+    the vehicle's lag.
 
     Args:
         seconds: stamps (N,) [s], increasing; each sample stays until the next.
@@ -472,7 +472,7 @@ def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
         at: where the samples stand (N,), in steps.
         values: the samples (N,).
     """
-    # From the middle, where the machine is most likely at work; the ends are pulled to the line
+    # From the middle, where the vehicle is most likely at work; the ends are pulled to the line
     # whatever the ridge.
     first = max(0, (at.size - _TRIED) // 2)
     at, values = at[first : first + _TRIED], values[first : first + _TRIED]

@@ -190,7 +190,7 @@ def facts_of_all[K: Hashable](
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
         for key in outputs:
             others = [one for other, one in signals.items() if other != key]
-            # A machine that stands on the ground holds everything still, and no sensor is stuck.
+            # A vehicle that stands on the ground holds everything still, and no sensor is stuck.
             found = [
                 one
                 for one in _stretches(*signals[key], facts[key])

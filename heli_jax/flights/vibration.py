@@ -18,7 +18,7 @@ _SURROUNDINGS = 15
 SMALLEST = 0.01
 """share of the variance below which a line biases nothing"""
 _SLOWEST = 4.0
-"""Hz: below are the machine's own motion and the sticks', whose doublets have lines too"""
+"""Hz: below are the vehicle's own motion and the sticks', whose doublets have lines too"""
 _HIGHEST = 12
 """harmonics of the rotor that are looked for"""
 _HIGHEST_FOLDED = 4

@@ -312,7 +312,7 @@ def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
         remark = f"not asked: the model puts {share} of this output down to this input"
     elif coherence.expected < COHERENCE:
         # A simulation has no noise: what it lacks is the segments' doing (leakage, a memory longer
-        # than one of them, a nonlinear machine), and no measurement could have more.
+        # than one of them, a nonlinear vehicle), and no measurement could have more.
         remark = f"not asked: in the simulation it is {coherence.expected:.2g} too"
     else:
         return _least(what, of, coherence.value, "", COHERENCE, remark + band)

@@ -172,8 +172,7 @@ _LEAST = 2000
 """points that a line keeps in any case"""
 _MISSING = 65535
 _STEPS = 65534
-"""parts of an array's range that are told apart: far below a pixel, and below a hundredth of a
-percent"""
+"""resolution of an array's range: far below a pixel, and below a hundredth of a percent"""
 
 
 class Logged(NamedTuple):

@@ -251,7 +251,7 @@ def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
 
 
 def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
-    """The shortest ends of paths that tell them apart."""
+    """Return the shortest unique ends of paths."""
     paths = [d.absolute().parts for d in directories]
     for depth in range(1, max(map(len, paths)) + 1):
         labels = ["/".join(p[-depth:]) for p in paths]

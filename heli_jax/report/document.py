@@ -209,7 +209,7 @@ class IntervalsContent(TypedDict, total=False):
     profiles: dict[str, Profile]
     sentences: list[str]
     bootstrap_failures: Annotated[int, lambda i: i.bootstrap.failures if i.bootstrap else ABSENT]
-    """of a bootstrap: refits that did not arrive"""
+    """refits of the bootstrap that did not converge"""
     nuts: Annotated[Nuts, lambda i: i.posterior or ABSENT]
     """of NUTS"""
 

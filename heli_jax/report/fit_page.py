@@ -366,7 +366,7 @@ def model_remark(problem: Problem) -> str:
         return ""
     factor = float(np.asarray(problem.vehicle.cyclic_moment))
     return (
-        "Ixx and If are numbers of the paper's model, not of the machine: eqs 14-15 have the "
+        "Ixx and If are numbers of the paper's model, not of the vehicle: eqs 14-15 have the "
         f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
         "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
         "Compare an estimate with a weighed or swung inertia only with that in mind."

@@ -1,7 +1,6 @@
 """Responses of a fitted model beside those of the flights that it was fitted to, both with errors.
 
-The measured ones are conditioned: sticks that move together are told apart, and flights count
-together (`heli_jax.analysis.flight_responses`).
+The measured ones are conditioned: inputs that move together are separated, and all flights count (`heli_jax.analysis.flight_responses`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +56,7 @@ class FittedPair(NamedTuple):
     """of its real and of its imaginary part"""
     coherence: np.ndarray
     model: Point
-    """of the machine in continuous time"""
+    """of the vehicle in continuous time"""
     half95: float = _Z95
     """half of a 95 % interval of what was measured, in sd"""
 

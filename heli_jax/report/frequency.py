@@ -184,7 +184,7 @@ def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -
 
     Args:
         dt: between two of them [s].
-        memory: how long the machine remembers its input [s].
+        memory: how long the vehicle remembers its input [s].
     """
     most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
     length, lowest = max(_needed(dt, memory), most), 0.0

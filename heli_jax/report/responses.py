@@ -223,7 +223,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     if fit.chi_squared > _TOO_LARGE:
         said.append(
             f"squared errors are {number(fit.chi_squared, 2)} times what the random errors let "
-            "expect: the order is too low, the machine is not linear, or a window of "
+            "expect: the order is too low, the vehicle is not linear, or a window of "
             f"{window:.3g} s does not resolve it"
         )
     if not forgets(fit, window):
@@ -241,12 +241,12 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
         said.append(
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
-            "the machine is not, a stick logged late, feedback or a wrong order makes it so"
+            "the vehicle is not, a stick logged late, feedback or a wrong order makes it so"
         )
     if known and all(c.determined for c in fit.numerator) and (beside := _cancelled(fit)):
         said.append(
             f"beside {_root_words(beside)} lie zeros, within a tenth, that all but cancel them: "
-            "they may be no modes of the machine, and a lower order may say as much "
+            "they may be no modes of the vehicle, and a lower order may say as much "
             "(see whether chi² stays)"
         )
     return said

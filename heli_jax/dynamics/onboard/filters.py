@@ -315,7 +315,7 @@ class _Filtered(Device):
         return value - (1.0 - section.left) * band
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the machine had always been where it starts: low-passes there, their rates at zero.
+        # As if the vehicle had always been where it starts: low-passes there, their rates at zero.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         for n, sections in self.sections.items():

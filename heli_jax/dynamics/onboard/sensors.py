@@ -105,7 +105,7 @@ class _LowPass(Device):
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the machine had always been where it starts.
+        # As if the vehicle had always been where it starts.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         # Zero in its place would show as a start-up transient of the filter, which a logger that
         # runs before the record begins has long behind it.

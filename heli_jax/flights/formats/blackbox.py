@@ -119,7 +119,7 @@ def _flight(
         sha256=sha256,
         topics=tuple(topics),
         firmware=head.settings.get("Firmware revision", head.settings.get("Firmware type", "")),
-        # The lines named Field say how the bytes are packed, which is no setting of the machine.
+        # The lines named Field say how the bytes are packed, which is no setting of the vehicle.
         parameters={k: v for k, v in head.settings.items() if not k.startswith("Field ")},
         notes=_losses(frames, main),
         flight=flight,

@@ -344,7 +344,7 @@ def _by_instance(table: _Table) -> dict[str, np.ndarray]:
     if instance is None or not _are_counts(table.rows[instance]):
         return {table.name: table.rows}
     counts = np.unique(table.rows[instance]).astype(np.int64)
-    # A machine with one sensor has instance 0 alone; a name without an index is what its user
+    # A vehicle with one sensor has instance 0 alone; a name without an index is what its user
     # expects.
     if len(counts) == 1 and not counts[0]:
         return {table.name: table.rows}
