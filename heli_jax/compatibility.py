@@ -218,8 +218,8 @@ def r_squared_of(run: FitRun) -> dict[str, float]:
 
 
 def _drifting(run: FitRun) -> set[str]:
-    """Return the outputs whose reconstruction drifts as far as the noise of gyros and accelerometers
-    explains, by one-step predictions."""
+    """Return the outputs whose reconstruction drifts as far as the sensors' noise explains, by
+    one-step predictions."""
     fit = run.fit
     if run.problem.noise_model != "disturbance":
         return set()

@@ -1,6 +1,7 @@
 """Responses of a fitted model beside those of the flights that it was fitted to, both with errors.
 
-The measured ones are conditioned: inputs that move together are separated, and all flights count (`heli_jax.analysis.flight_responses`).
+The measured ones are conditioned: inputs that move together are separated, and all flights count
+(`heli_jax.analysis.flight_responses`).
 """
 
 from collections.abc import Mapping, Sequence
