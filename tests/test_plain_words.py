@@ -24,7 +24,7 @@ DIALECT = re.compile(
     re.IGNORECASE,
 )
 COMPUTERS = re.compile(
-    r"(?:this|another|a) machine|more machines|of the machine, and whoever|a machine's memory"
+    r"(?:this|another) machine|more machines|of the machine, and whoever|a machine's memory"
 )
 LONGEST_MESSAGE, LONGEST = 30, 35
 
@@ -40,18 +40,18 @@ def docstrings() -> Iterator[tuple[str, str]]:
 
 
 def prose(page: Path) -> Iterator[str]:
-    """Paragraphs, items and cells of a page, without links and headings, `code` for what is code."""
+    """Paragraphs, items and cells of a page, with `code` for a row of code and without headings."""
     text = page.read_text("utf-8")
     text = re.sub(r"^ *```.*?^ *```|<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(?:    |#).*$", "", text, flags=re.MULTILINE)
-    text = re.sub(r"`[^`]*`", "code", text)
+    text = re.sub(r"(?:`[^`]*`,? )*`[^`]*`", "code", text)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text).replace("**", "")
     for part in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) |\|", text):
         yield " ".join(part.split())
 
 
 def sentences(text: str) -> list[str]:
-    return re.split(r"(?<=[.!?:;])\s+", text)
+    return re.split(r"(?<=[.!?;])\s+", text)
 
 
 def test_docstrings_begin_with_a_noun_an_imperative_or_true_if():
