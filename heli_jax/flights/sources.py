@@ -10,7 +10,7 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
-from heli_jax.flights.derived import DerivedTable, with_derived
+from heli_jax.flights.derived import with_derived
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.log import ChannelLog
@@ -108,23 +108,16 @@ def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
 
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
-    log = log or _of_file(request)
-    if request.time is None and not isinstance(log, ChannelLog):
+    log = log or open_log(request.path, request.options.number)
+    if request.time is None and isinstance(log, ArrayTable):
         # Arrays may have clocks of their own beside them in the file.
-        table = log.table if isinstance(log, DerivedTable) else log
-        grouped = by_clocks(table) if isinstance(table, ArrayTable) else None
-        if grouped is not None:
-            return with_derived(grouped, log.swashplate if isinstance(log, DerivedTable) else None)
+        log = by_clocks(log) or log
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
         problem = "its topics have clocks of their own, expected no time to be stated, got "
         raise wrong(log.path, problem + shown(request.time.name))
-    return log
-
-
-def _of_file(request: Request) -> ChannelLog | Table:
-    return with_derived(open_log(request.path, request.options.number))
+    return with_derived(log, request.options.swashplate)
 
 
 def _only(request: Request, keys: frozenset[Key]) -> Request:
@@ -146,7 +139,7 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Requ
     options = ReadOptions(number=also.number)
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already may be large.
-    file = also.log or _of_file(asked)
+    file = also.log or open_log(asked.path, asked.options.number)
     other = _open(asked, file)
     asked = with_file_units(other, asked)
     signals, _ = signals_of(other, asked)
