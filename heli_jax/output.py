@@ -171,7 +171,7 @@ _GATES = 5
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
-    # An unstable machine leaves any record: numbers would say nothing.
+    # An unstable vehicle leaves any record: numbers would say nothing.
     if diverges(m, FAR):
         tell(f"{what}: diverges")
         return

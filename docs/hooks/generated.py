@@ -15,6 +15,7 @@ import io
 import os
 import re
 import shutil
+import string
 import subprocess
 import sys
 import tempfile
@@ -197,6 +198,31 @@ def _configurations() -> str:
     return "\n\n".join(parts)
 
 
+def _findings() -> str:
+    from heli_jax.messages import Message, messages
+
+    def words(template: str) -> str:
+        parts = []
+        for text, field, kind, _ in string.Formatter().parse(template):
+            kind = kind or ""
+            name = "" if field is None or kind.startswith("?") else f"*{field}*"
+            # A word for one or for several: that for several.
+            shown = kind.partition("/")[2] or name
+            parts += [_cell(text), shown]
+        return "".join(parts)
+
+    def entry(code: str, message: Message) -> str:
+        lines = [f"{message.title}. {words(message.text)}", words(message.remedy)]
+        lines += [f"Compared: {words(message.measure)}."] if message.measure else []
+        lines += [f"[{message.page}](../{message.page}.md)"] if message.page else []
+        return f"`{code}`\n:   {'<br>'.join(filter(None, lines))}"
+
+    groups: dict[str, list[str]] = {}
+    for code, message in messages().items():
+        groups.setdefault(code.partition(".")[0], []).append(entry(code, message))
+    return "\n\n".join("\n\n".join((f"## {g}", *entries)) for g, entries in groups.items())
+
+
 def _linear_models() -> str:
     from heli_jax.linear_models.read import linear_model, shipped
 
@@ -294,6 +320,7 @@ _PARTS: dict[str, Callable[[], str]] = {
     "keys": _keys,
     "fit-keys": _fit_keys,
     "commands": _commands,
+    "findings": _findings,
     "configurations": _configurations,
     "linear-models": _linear_models,
     "models": _models,

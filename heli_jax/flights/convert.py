@@ -46,7 +46,7 @@ _LONGEST = 3 * 10**8
 
 @dataclass(frozen=True)
 class Selection:
-    """What is taken of a log.
+    """Signals, rate and window that are converted.
 
     Attributes:
         signals: names of channels, in which * stands for anything, and of derived ones; all

@@ -51,7 +51,7 @@ def row_groups(columns: Mapping[str, np.ndarray]) -> list[RowGroup]:
 
 
 def takes_turns(groups: Sequence[RowGroup]) -> bool:
-    """Whether two of the groups hardly share a row."""
+    """True if two of the groups hardly share a row."""
     counts = [int(np.count_nonzero(g.rows)) for g in groups]
     some = [(g.rows, n) for g, n in zip(groups, counts, strict=True) if n >= _FEWEST]
     return any(
@@ -63,7 +63,7 @@ def takes_turns(groups: Sequence[RowGroup]) -> bool:
 def is_joined(
     seconds: np.ndarray, columns: Mapping[str, np.ndarray], needed: Collection[str]
 ) -> bool:
-    """Whether the rows of a table are those of several topics.
+    """True if the rows of a table are those of several topics.
 
     Args:
         seconds: of the rows (N,) [s].

@@ -54,7 +54,7 @@ class LoadedTable:
 
     @property
     def first_time(self) -> float:
-        """Of the first stamp [s], from which windows count."""
+        """Time of the first stamp [s], from which windows count."""
         return float(self.stamps[0] * self.scale)
 
     @property
@@ -64,7 +64,7 @@ class LoadedTable:
 
     @contextlib.contextmanager
     def hinting(self) -> Iterator[None]:
-        """What is said of the unit behind errors that a wrong one makes."""
+        """Add a hint about the unit to errors that a wrong unit causes."""
         try:
             yield
         except InputError as e:

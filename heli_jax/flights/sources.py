@@ -1,4 +1,4 @@
-"""What a flight is read from: a log, and others of the same flight with clocks of their own."""
+"""Sources of a flight: a log, and others of the same flight with clocks of their own."""
 
 import copy
 import dataclasses
@@ -45,7 +45,7 @@ class Beside(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """What is read for one flight."""
+    """Logs that are read for one flight."""
 
     log: ChannelLog | LoadedTable
     keys: frozenset[Key]
@@ -194,7 +194,7 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
 def _aligned(
     log: ChannelLog | LoadedTable, request: Request, also: Also, file: ChannelLog | Table, name: str
 ) -> tuple[float, Finding]:
-    """What has to be added to the times of a further log [s], by a motion that both hold."""
+    """Return the correction of a further log's times [s], by a motion that both logs hold."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))

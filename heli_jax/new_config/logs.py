@@ -176,7 +176,7 @@ def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
 
 
 def _without_time(info: LogInfo) -> str:
-    """Why none of a table's columns is a time, in words."""
+    """Reason why none of a table's columns is a time."""
     strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
     notes = [strays, *(n.sentence for n in info.notes if n.code == COUNTS_ROWS)]
     return "; ".join(filter(None, ("no column is a time", *notes)))
