@@ -77,9 +77,8 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
-    held = fit.held_out_frequency
-    for flight in held.flights if held is not None else ():
-        tell(f"{flight.flight}, held out, in frequency: {flight.in_words}")
+    if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
+        _tell_table(held)
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
         _tell_table(responses)

@@ -7,9 +7,7 @@ import pytest
 import scipy.signal
 
 from heli_jax.identification.diagnostics.excitation import excited_bands
-from heli_jax.identification.diagnostics.loop import feedback_tested
 from heli_jax.identification.diagnostics.timing import of_rates
-from heli_jax.identification.fit import context_of
 from heli_jax.identification.validation.excited_band import excitation_of, seen_parts
 from tests.identification.test_enough import DT, TRUTH, flight, found_of, problem, response
 
@@ -64,15 +62,6 @@ def test_a_line_of_vibration_is_no_band():
     f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
     assert severities(f) == ["note"]
     assert excitation_of([f]).share is not None
-
-
-def test_feedback_that_was_not_tested_is_said():
-    short = problem(replace(swept(150), sd={"phi": 0.01}))
-    [found] = feedback_tested(context_of(short))
-    assert (found.code, found.severity) == ("loop.not-tested", "note")
-    jumps = problem(flight(0))
-    [found] = feedback_tested(context_of(jumps))
-    assert (found.code, found.severity) == ("loop.not-tested", "note")
 
 
 def test_modes_that_do_not_swing_ask_for_a_rate_too():

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.agreement import (
     correlated_residuals,
@@ -90,7 +89,8 @@ class HeldOut(NamedTuple):
     signals: tuple[Signals, ...] = ()
     free_run: tuple[Signals, ...] = ()
     """with windows: simulated in one piece"""
-    notes: tuple[Finding, ...] = ()
+    converged: bool = True
+    """whether their initial states and biases were found"""
     in_frequency: HeldOutFrequency | None = None
 
 
@@ -337,11 +337,8 @@ class Context:
             Record(s.flight, flight.dt, s.measured, s.simulated)
             for s, (_, flight) in zip(self.signals, self.flights, strict=True)
         )
-        innovations = tuple(
-            None if s.innovations is None else dict(s.innovations) for s in self.signals
-        )
         unknowns = self.at.layout.determined
-        return Evidence(records, self.metrics, self.whiteness, expected, unknowns, innovations)
+        return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
 
     @property
     def _predicted(self) -> Evidence:
@@ -471,7 +468,7 @@ class Context:
         if self.arrived:
             feedback = (self.loop.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
-        return HeldOut(signals_of(checked.e, flights), free_run, checked.notes, in_frequency)
+        return HeldOut(signals_of(checked.e, flights), free_run, checked.converged, in_frequency)
 
     @cached_property
     def rounding(self) -> bool:

@@ -22,7 +22,6 @@ import scipy.special
 
 from heli_jax import naming
 from heli_jax.analysis.operating_point import modes_of_flight
-from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
@@ -35,9 +34,6 @@ from heli_jax.identification.validation.metrics import (
 from heli_jax.messages import sentence
 from heli_jax.numerics.white_noise import white_part
 
-# What to do about an output that the model does not explain.
-
-
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
 GATE = 0.9
@@ -45,8 +41,6 @@ GATE = 0.9
 FAR_FROM_WHITE = 0.5
 """autocorrelation of innovations at one sample beyond which the filter predicts badly; a
 disturbance with one pole too few leaves 0.1 to 0.3"""
-_DIVERGED = 10.0
-"""a simulation that leaves the measured range by this factor"""
 _GROWTH = 3.0
 """an unstable mode that grows by e to this over the record"""
 
@@ -91,49 +85,6 @@ class Record(NamedTuple):
     simulated: Mapping[str, np.ndarray]
 
 
-def advice_for(
-    problem: Problem,
-    output: OutputAdequacy,
-    records: Sequence[Record],
-    unstable: bool,
-) -> str:
-    """What to do about an output that is not explained: the most telling that this problem can do.
-
-    Args:
-        problem: what was fitted: what it has switched on already is no advice.
-        unstable: whether the model is, over the length of the record.
-    """
-    name, filtered = output.output, problem.noise_model == "disturbance"
-    diverged = _diverges(name, records)
-    if problem.window is not None and diverged:
-        return sentence("advice.shorter-windows")
-    # Filter error corrects its states at every sample, and needs no windows.
-    if problem.window is None and (diverged or unstable) and not filtered:
-        return sentence(
-            "advice.windows",
-            state="" if problem.nuisance.initial_state else "fit.nuisance.initial_state",
-            shift="fit.nuisance.time_shift" if problem.nuisance.time_shift else "",
-        )
-    if output.lag1 > FAR_FROM_WHITE and not filtered:
-        axes = disturbable(problem.model)
-        code = "advice.disturbance" if axes else "advice.other-model"
-        return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
-    return sentence("advice.columns") if output.vaf >= 0 else ""
-
-
-def _diverges(name: str, records: Sequence[Record]) -> bool:
-    """Whether in some flight the simulation leaves what was measured by far."""
-    for r in records:
-        if name not in r.measured:
-            continue
-        simulated = r.simulated[name]
-        if not np.isfinite(simulated).all():
-            return True
-        if np.max(np.abs(simulated)) > _DIVERGED * np.nanmax(np.abs(r.measured[name])):
-            return True
-    return False
-
-
 def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
     """Whether a mode of the linearised model grows by e to `growth` over the longest window;
     `params` is a record of the model's Params, SI."""
@@ -145,34 +96,6 @@ def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
         if linearised is not None and np.max(np.real(linearised[0])) * longest > growth:
             return True
     return False
-
-
-# Does a filter predict anything of an output, beyond what its mean or the last sample says?
-
-
-BETTER = 0.8
-"""share of the squared error of the mean, or of the sample before, that a prediction may leave at
-most: more is what smoothing a noisy signal leaves without any model"""
-
-
-def predicts_nothing(flights: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Whether predictions one step ahead are hardly better than the mean of the flight, or than the
-    sample before (persistence).
-
-    Args:
-        flights: by flight the measured output (N,) and the errors of its prediction (N,), SI, NaN
-            where nothing was measured.
-    """
-    left, mean, before = 0.0, 0.0, 0.0
-    for measured, error in flights:
-        y, error = np.asarray(measured), np.asarray(error)
-        # A sample is foretold by the one before only where both were measured.
-        both = np.isfinite(y[1:]) & np.isfinite(y[:-1])
-        if both.any():
-            left += float(np.sum(error[1:][both] ** 2))
-            mean += float(np.sum((y[1:][both] - np.nanmean(y)) ** 2))
-            before += float(np.sum(np.diff(y)[both] ** 2))
-    return left > BETTER * min(mean, before) > 0.0
 
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -235,8 +158,6 @@ class Evidence(NamedTuple):
     unknowns: int = 0
     """how many were estimated; a response that explains no more than as many unknowns explain of
     noise by chance shows nothing"""
-    innovations: tuple[Mapping[str, np.ndarray] | None, ...] = ()
-    """by flight and output (N,), SI: the errors of the prediction one step ahead"""
     ahead: float | None = None
     """[s] that is predicted at most, from a filter's states, where that stands in place of the
     simulation: of an unstable model"""
@@ -278,7 +199,9 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
-    unmoved = tuple(o.output for o in outputs if o.adequate and _nothing_explained(o, evidence))
+    unmoved = tuple(
+        o.output for o in outputs if o.adequate and not disturbed and _of_noise(o, evidence)
+    )
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
     return Adequacy(outputs, False, evidence.ahead, unmoved, still, unstable)
 
@@ -291,21 +214,6 @@ def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool
     """Whether the response of some output stands out of the noise."""
     # One output that stands out is enough: the others may be ones that these inputs do not move.
     return not outputs or not all(_of_noise(output, evidence) for output in outputs)
-
-
-def _nothing_explained(output: OutputAdequacy, evidence: Evidence) -> bool:
-    """Whether of an output nothing is explained, simulated or one step ahead."""
-    if evidence.error_ratio is None:
-        return _of_noise(output, evidence)
-    if not output.explained < 1.0 - EXPLAINED:
-        return False
-    return predicts_nothing(
-        [
-            (r.measured[output.output], ahead[output.output])
-            for r, ahead in zip(evidence.records, evidence.innovations, strict=False)
-            if ahead is not None and output.output in r.measured
-        ]
-    )
 
 
 def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:

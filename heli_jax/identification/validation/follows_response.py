@@ -31,7 +31,6 @@ from jaxtyping import Float
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
-from heli_jax.numbers import percent
 
 # How one signal is correlated with sums over past samples of another, and how surely.
 #
@@ -183,7 +182,7 @@ _LONG_REST, _AT_REST = 20, 0.5
 such rests take in one whose input was programmed"""
 _STILL = 1e-4
 """of the range of an input, below which a difference is no motion"""
-SEEN = 0.8
+_SEEN = 0.8
 """part of the samples of an output that is used"""
 
 
@@ -222,8 +221,8 @@ def feedback(
         together: how many flights are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    tested = [tested_at(flight, earlier or {}, rate) for rate in rates_of(flight)]
-    each = [one for one in tested if isinstance(one, Tested)]
+    tested = [_tested_at(flight, earlier or {}, rate) for rate in _rates_of(flight)]
+    each = [one for one in tested if one is not None]
     label, found = flight.name or "flight 1", {}
     for one in each:
         for name in dict.fromkeys(n for view in one.views for n in view.free):
@@ -239,7 +238,7 @@ def _sureness(one: Feedback) -> tuple[float, float]:
     return one.p_value, one.correlation
 
 
-def rates_of(flight: Flight) -> tuple[float, ...]:
+def _rates_of(flight: Flight) -> tuple[float, ...]:
     """Samples a second at which a flight is looked at [Hz]."""
     # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
     # a sample, and how it moved there, is not known, and an output that answers to it would pass
@@ -255,7 +254,7 @@ def _frames(u: np.ndarray) -> float:
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
 
-def _dependence(tested: "Tested", name: str, together: int) -> Feedback:
+def _dependence(tested: "_Tested", name: str, together: int) -> Feedback:
     """Of one input the past innovations that it follows most surely."""
     views = [view for view in tested.views if name in view.free]
     count = len(views[0].innovations)
@@ -282,7 +281,7 @@ class _View(NamedTuple):
     innovations: Float[np.ndarray, "N p"]
 
 
-class Tested(NamedTuple):
+class _Tested(NamedTuple):
     """A flight at one rate."""
 
     views: tuple[_View, ...]
@@ -293,15 +292,9 @@ class Tested(NamedTuple):
     dt: float
 
 
-class Untested(NamedTuple):
-    """Why nothing of a flight is correlated."""
-
-    reason: str
-    """in words"""
-
-
-def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
-    """Return the signals of a flight that are correlated, or the reason why none are.
+def _tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> _Tested | None:
+    """Return the signals of a flight that are correlated; None where all outputs stay or lack too
+    much, the record is too short, or no input moves freely.
 
     Args:
         earlier: by input, how much earlier than logged it is to be taken [s].
@@ -310,21 +303,15 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     # Half of a record at most: a delay beyond is none that it could show.
     most = flight.n_samples // 2
     steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
-    inputs, outputs, parts, dt = decimated(flight, steps, rate)
-    if not outputs:
-        most = percent(1 - SEEN, 0)
-        return Untested(f"every output stays where it is or lacks more than {most} of its samples")
-    n = next(iter(outputs.values())).size
-    if n < _LEAST:
-        expected = f"expected {_LEAST * dt:.3g} s at least"
-        return Untested(f"the record is too short ({n * dt:.3g} s, {expected})")
+    inputs, outputs, parts, dt = _decimated(flight, steps, rate)
+    if not outputs or next(iter(outputs.values())).size < _LEAST:
+        return None
     # Steps are slopes at a lower rate.
-    quick = decimated(flight, steps, RATE).inputs
+    quick = _decimated(flight, steps, RATE).inputs
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        why = "inputs move as programmed ones do (in jumps, between rests, or as foreseen)"
-        return Untested(why)
+        return None
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
@@ -336,9 +323,7 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     given = arx_residuals(y, np.concatenate([y, now], axis=1))
     past = arx_residuals(y, np.concatenate([y, u], axis=1))
     views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
-    if not views:
-        return Untested("too few samples stand in a row without a missing one")
-    return Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt)
+    return _Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt) if views else None
 
 
 def _unforeseen(
@@ -381,7 +366,7 @@ def _rests(u: Float[np.ndarray, " N"]) -> float:
     return float(np.sum(runs[runs >= _LONG_REST])) / u.size
 
 
-class Decimated(NamedTuple):
+class _Decimated(NamedTuple):
     """Signals at a moderate rate, by name."""
 
     inputs: dict[str, np.ndarray]
@@ -393,7 +378,7 @@ class Decimated(NamedTuple):
     dt: float
 
 
-def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decimated:
+def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Decimated:
     """A flight averaged down.
 
     Args:
@@ -423,12 +408,12 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
     inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
     outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
     # A record of less than one block leaves none.
-    return Decimated(
+    return _Decimated(
         {n: thinned(u) for n, u in inputs.items()},
         {
             n: y
             for n, y in outputs.items()
-            if y.size and np.mean(np.isfinite(y)) >= SEEN and np.nanstd(y) > 0
+            if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
         },
         {n: within(u) for n, u in inputs.items()},
         flight.dt * every,
@@ -436,19 +421,6 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
 
 
 # Whether the inputs of a problem's flights follow the response.
-
-
-def why_untested(problem: Problem) -> Untested | None:
-    """Why nothing was tested of any flight; None where something was."""
-    reasons = {
-        label: tested
-        for label, f in zip(labels(problem.training), problem.training, strict=True)
-        if isinstance(tested := tested_at(f, {}, rates_of(f)[0]), Untested)
-    }
-    kinds = list(dict.fromkeys(reasons.values()))
-    if len(kinds) < 2:
-        return kinds[0] if kinds else None
-    return Untested("; ".join(f"{label}: {one.reason}" for label, one in reasons.items()))
 
 
 def feedback_of(
@@ -491,14 +463,3 @@ def _delay(
         if sd is not None:
             delay, variance, estimated = delay + value, variance + sd**2, True
     return delay, math.sqrt(variance), estimated
-
-
-def untested(problem: Problem) -> dict[tuple[str, ...], list[str]]:
-    """By outputs of which feedback cannot be told, since too much is missing, the flights."""
-    lacking: dict[tuple[str, ...], list[str]] = {}
-    for label, flight in zip(labels(problem.training), problem.training, strict=True):
-        tested = decimated(flight, {}, RATE).outputs
-        gappy = [n for n, y in flight.outputs.items() if n not in tested and np.isnan(y).any()]
-        if gappy:
-            lacking.setdefault(tuple(gappy), []).append(label)
-    return lacking

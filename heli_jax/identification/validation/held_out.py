@@ -1,6 +1,6 @@
 """Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -34,7 +34,6 @@ from heli_jax.identification.validation.excitation_test import (
     errors_against_excitation,
 )
 from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
-from heli_jax.numbers import p_value, percent, plain_words
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -47,7 +46,8 @@ class Validation(NamedTuple):
     free_run: tuple[dict[str, np.ndarray], ...] | None
     """with windows: by flight and output the simulation (N,) in one piece from the initial state of
     the first window, with the bias; None without windows"""
-    notes: tuple[Finding, ...]
+    converged: bool
+    """whether initial states and biases were found"""
 
 
 def validate(
@@ -55,8 +55,6 @@ def validate(
 ) -> Validation:
     """Predict the flights held out with the estimates; only their initial states (of every window)
     and biases are adjusted, by least squares.
-
-    Nothing is raised where that fails: the notes say so.
 
     Args:
         z: (q,) the optimum of the fitted flights in `layout`.
@@ -87,7 +85,7 @@ def validate(
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
         free_run = simulated_outputs(one_piece, data, whole)
-    return Validation(e, free_run, tuple(_notes(held, e, converged)))
+    return Validation(e, free_run, converged)
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
@@ -139,17 +137,6 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
 
 
-def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Finding]:
-    astray = [
-        label
-        for label, simulated in zip(labels(held), e.simulated, strict=True)
-        if not all(np.isfinite(v).all() for v in simulated.values())
-    ]
-    if astray:
-        return [found("held-out.not-finite", "note", *astray)]
-    return [] if converged else [found("held-out.nuisances-not-found", "note")]
-
-
 # Flights held out, judged in frequency: nothing is simulated, so that unstable models can be
 # judged too, and gusts raise the noise and not the doubt.
 #
@@ -199,37 +186,6 @@ class HeldOutFlight(NamedTuple):
         """True if the flight gives other estimates."""
         return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
 
-    @property
-    def in_words(self) -> str:
-        """The estimates and what is explained, in a line."""
-        known = []
-        if self.estimates_p_value is not None:
-            verb = "differ" if self.differs else "agree"
-            known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
-        shares = [
-            f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
-            for n, v in self.explained.items()
-        ]
-        if shares:
-            known.append(f"explained of what follows the excitation: {', '.join(shares)}")
-        return "; ".join(known) or "says nothing of the model"
-
-    @property
-    def findings(self) -> Iterator[Finding]:
-        """What contradicts the fit."""
-        if self.worse:
-            yield found(
-                "held-out.worse-than-none", "doubt", self.flight, *self.worse, denies=True,
-                flight=self.flight, names=self.worse,
-            )  # fmt: skip
-        if self.differs and self.furthest is not None:
-            f = self.furthest
-            yield found(
-                "held-out.other-estimates", "doubt", self.flight, value=self.estimates_p_value,
-                shifts={f.parameter: f.own - f.fitted}, limit=LEVEL, flight=self.flight,
-                **f._asdict(),
-            )  # fmt: skip
-
 
 class HeldOutFrequency(NamedTuple):
     """The flights held out of a fit in frequency."""
@@ -237,11 +193,6 @@ class HeldOutFrequency(NamedTuple):
     flights: tuple[HeldOutFlight, ...]
     notes: tuple[Finding, ...]
     """why a flight is not judged"""
-
-    @property
-    def findings(self) -> list[Finding]:
-        """What they contradict, and which of them are not judged."""
-        return [*self.notes, *(finding for f in self.flights for finding in f.findings)]
 
 
 class _Fitted(NamedTuple):
