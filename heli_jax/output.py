@@ -11,12 +11,12 @@ from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
 from heli_jax.identification.design.accuracy import GUESSED, too_good
+from heli_jax.identification.diagnostics.excitation import NOTHING_FOLLOWS
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import (
     WORST,

@@ -16,7 +16,7 @@ from heli_jax.identification.validation.adequacy import (
     WORSE,
     OutputAdequacy,
 )
-from heli_jax.identification.validation.excitation_test import LEVEL
+from heli_jax.identification.validation.excitation import LEVEL
 from heli_jax.identification.validation.held_out import HeldOutFlight
 from heli_jax.messages import sentence
 
@@ -215,7 +215,8 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
     elif not held.converged:
         yield found("held-out.nuisances-not-found", "note")
     if held.in_frequency is not None:
-        yield from held.in_frequency.notes
+        for label in held.in_frequency.not_judged:
+            yield found("held-out.not-judged", "note", label, flight=label)
         for flight in held.in_frequency.flights:
             yield from _contradicted(flight)
     # With gusts in the model, or no simulation in the fit, a simulation says little.

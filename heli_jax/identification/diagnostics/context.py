@@ -50,13 +50,13 @@ from heli_jax.identification.validation.closed_loop_trust import (
     held_upright,
     moved_by_feedback,
 )
-from heli_jax.identification.validation.excitation_test import (
+from heli_jax.identification.validation.excitation import (
     LEVEL,
+    Excitation,
     Followed,
-    outputs_against_excitation,
+    excitation_of,
     residual_against_excitation,
 )
-from heli_jax.identification.validation.excited_band import Excitation, excitation_of
 from heli_jax.identification.validation.follows_response import Feedback, feedback_of
 from heli_jax.identification.validation.held_out import (
     HeldOutFrequency,
@@ -157,7 +157,7 @@ class Context:
     @cached_property
     def excitation(self) -> Excitation:
         """Frequencies that the inputs excite, and outputs that follow them."""
-        return excitation_of(self.problem.training)
+        return excitation_of(self.problem)
 
     # What is left of the record.
 
@@ -320,7 +320,7 @@ class Context:
         that holds of every output; else empty."""
         if not (self.fitted and self.at.layout.noise_model == "spectrum"):
             return {}
-        p_values = outputs_against_excitation(self.problem)
+        p_values = {n: f.p_value for n, f in self.excitation.outputs.items()}
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
 
     @property

@@ -39,8 +39,8 @@ LEVEL = 0.01
 """of the test of all outputs together"""
 _FIRST, _GROWTH = 12, 1.15
 """lines of the lowest band, and how much wider the next one is"""
-_POWER = (0.05, 0.95)
-"""the band of an input holds its power between these parts"""
+_LOW, _HIGH = 0.05, 0.95
+"""parts of an input's power between which its band lies"""
 _LEAST_POWER = 1e-3
 """of an input's largest density of power: below that it does not excite"""
 _SEEN = 0.8
@@ -83,30 +83,26 @@ class Excitation(NamedTuple):
 def excitation_of(problem: Problem) -> Excitation:
     """Return what the inputs of the fitted flights excite."""
     flights, by = problem.training, instruments_of(problem)
-    moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights)]
-    hz, X = _pooled(flights, [[f.inputs[n] for n in moving] for f in flights])
-    powers = {}
-    for name, power in zip(moving, np.abs(X.T) ** 2, strict=True):
-        sums = np.cumsum(power) / np.sum(power)
-        low, high = (hz[min(int(np.searchsorted(sums, p)), hz.size - 1)] for p in _POWER)
-        powers[name] = (float(low), float(high))
-    return Excitation(powers, _outputs(flights, by), _pairs(X, moving))
-
-
-def _pooled(
-    flights: Sequence[Flight], signals: Sequence[Sequence[np.ndarray]]
-) -> tuple[Float[np.ndarray, " K"], Complex[np.ndarray, "K c"]]:
-    """Frequencies [Hz] and lines of the same signals of all flights, as if of one record."""
-    if not any(signals):
-        return np.zeros(0), np.zeros((0, 0), complex)
-    lines = [
-        lines_of(np.stack(v, axis=1)) * f.dt**0.5 for f, v in zip(flights, signals, strict=True)
-    ]
-    hz = [
-        np.arange(1, len(v) + 1) / (f.n_samples * f.dt) for f, v in zip(flights, lines, strict=True)
-    ]
-    order = np.argsort(np.concatenate(hz), kind="stable")
-    return np.concatenate(hz)[order], np.concatenate(lines)[order]
+    # A flight at rest has lines without power, among which those of another would be few in a band.
+    flown = [f for f in flights if any(np.ptp(u) > 0 for u in f.inputs.values())]
+    if not flown:
+        return Excitation({}, {}, ())
+    names = [n for n in flown[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flown)]
+    lines = [lines_of(np.stack([f.inputs[n] for n in names], 1)) * f.dt**0.5 for f in flown]
+    # The lines of all flights in one order, as if of one record.
+    each = zip(flown, lines, strict=True)
+    hz = np.concatenate([np.arange(1, len(v) + 1) / (f.n_samples * f.dt) for f, v in each])
+    order = np.argsort(hz, kind="stable")
+    hz, X = hz[order], np.concatenate(lines)[order]
+    sums = np.cumsum(np.abs(X.T) ** 2, axis=1)
+    powers = {
+        n: (
+            float(hz[np.searchsorted(s, _LOW * s[-1])]),
+            float(hz[np.searchsorted(s, _HIGH * s[-1])]),
+        )
+        for n, s in zip(names, sums, strict=True)
+    }
+    return Excitation(powers, _outputs(flown, by), _pairs(X, names))
 
 
 def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed]:

@@ -10,7 +10,6 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
@@ -29,11 +28,7 @@ from heli_jax.identification.unknowns.layout import (
     flight_places,
     layout_of,
 )
-from heli_jax.identification.validation.excitation_test import (
-    LEVEL,
-    errors_against_excitation,
-)
-from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
+from heli_jax.identification.validation.excitation import LEVEL, errors_against_excitation
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -191,8 +186,8 @@ class HeldOutFrequency(NamedTuple):
     """The flights held out of a fit in frequency."""
 
     flights: tuple[HeldOutFlight, ...]
-    notes: tuple[Finding, ...]
-    """why a flight is not judged"""
+    not_judged: tuple[str, ...]
+    """the flights that cannot be compared with the fitted ones"""
 
 
 class _Fitted(NamedTuple):
@@ -218,36 +213,32 @@ def validate_in_frequency(
     if not held or at.layout.noise_model != "spectrum" or not np.isfinite(J).all():
         return None
     fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
-    flights, notes = [], []
+    judged, others = [], []
     for label, flight in zip(labels(tuple(held)), held, strict=True):
-        part, why = _comparable(problem, at, flight, feedback=feedback)
-        judged = None
+        part, one = _comparable(problem, at, flight, feedback=feedback), None
         if part is not None:
             with np.errstate(all="ignore"):
-                judged = _judged(problem, at, fitted, label, part)
-            why = why if judged is not None else "its errors have no spectrum"
-        flights += [judged] if judged is not None else []
-        if why:
-            notes.append(found("held-out.not-judged", "note", label, flight=label, why=why))
-    return HeldOutFrequency(tuple(flights), tuple(notes))
+                one = _judged(problem, at, fitted, label, part)
+        if one is None:
+            others.append(label)
+        else:
+            judged.append(one)
+    return HeldOutFrequency(tuple(judged), tuple(others))
 
 
-def _comparable(
-    problem: Problem, at: Solution, flight: Flight, *, feedback: bool
-) -> tuple[Flight | None, str]:
-    """The flight with the outputs that can be judged, or None; what is left out, and why."""
-    if feedback:
-        return None, "inputs follow the outputs, and no instrument is used"
+def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: bool) -> Flight | None:
+    """The flight with the outputs that can be judged; None if there are none, no instrument moves,
+    or inputs follow the outputs and no instrument is used."""
     by = instruments_of(problem)
-    if by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by):
-        return None, "none of its instruments moves"
-    common = [n for n in flight.outputs if n in at.layout.outputs[0]]
-    if not common:
-        return None, f"it has none of the fitted outputs ({', '.join(at.layout.outputs[0])})"
-    sound, still = moving_outputs(with_outputs(flight, common))
-    if sound is not None and not parts_of(sound):
-        return None, "no part of it has all of its outputs"
-    return sound, still
+    if feedback or (by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by)):
+        return None
+    common = (n for n in flight.outputs if n in at.layout.outputs[0])
+    moving = {n for n in common if np.nanmin(flight.outputs[n]) < np.nanmax(flight.outputs[n])}
+    outputs, sd = (
+        {n: v for n, v in of.items() if n in moving} for of in (flight.outputs, flight.sd)
+    )
+    part = replace(flight, outputs=outputs, sd=sd) if moving else None
+    return part if part is not None and parts_of(part) else None
 
 
 def _judged(
