@@ -11,7 +11,6 @@ from heli_jax.compatibility import Compatibility
 from heli_jax.config.frequency import missing_handling
 from heli_jax.finding import Finding
 from heli_jax.identification.design.accuracy import GUESSED, too_good
-from heli_jax.identification.diagnostics.excitation import NOTHING_FOLLOWS
 from heli_jax.identification.equation_error.rls import Baseline
 from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
@@ -204,11 +203,10 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
         tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    follows = all(f.code != NOTHING_FOLLOWS for f in check.findings)
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
-    if doubt := too_good(sds, bool(check.guessed), nothing_follows=not follows):
+    if check.guessed and (doubt := too_good(sds)):
         tell(f"! {doubt.sentence}")
     tell("\nIs this log enough?")
     print_findings(check.findings, verbose=verbose)

@@ -25,7 +25,7 @@ from heli_jax.analysis.operating_point import modes_of_flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
+from heli_jax.identification.unknowns.layout import FlightData, Solution
 from heli_jax.identification.validation.metrics import (
     Metrics,
     Whiteness,
@@ -195,14 +195,14 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         for name, m in evidence.agreement.items()
         if name not in still
     )
-    bad = [output for output in outputs if not output.adequate]
-    if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
+    bad = any(not output.adequate for output in outputs)
+    noise = () if disturbed else tuple(o for o in outputs if _of_noise(o, evidence))
+    # One output that stands out is enough: the others may be ones that these inputs do not move.
+    if outputs and not bad and noise == outputs:
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
-    unmoved = tuple(
-        o.output for o in outputs if o.adequate and not disturbed and _of_noise(o, evidence)
-    )
-    unstable = unstable or (bool(bad) and is_unstable(problem, params))
+    unmoved = tuple(o.output for o in noise if o.adequate)
+    unstable = unstable or (bad and is_unstable(problem, params))
     return Adequacy(outputs, False, evidence.ahead, unmoved, still, unstable)
 
 
@@ -210,14 +210,8 @@ _BY_CHANCE = 1e-3
 """probability that noise alone is explained as well"""
 
 
-def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool:
-    """Whether the response of some output stands out of the noise."""
-    # One output that stands out is enough: the others may be ones that these inputs do not move.
-    return not outputs or not all(_of_noise(output, evidence) for output in outputs)
-
-
 def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
-    """Whether of an output no more is explained than of noise alone: a likelihood ratio of the
+    """True if no more of an output is explained than of noise alone: a likelihood ratio of the
     model against a constant (Wilks, 1938)."""
     unknowns = evidence.unknowns
     if unknowns < 1 or not np.isfinite(output.vaf):
@@ -291,12 +285,11 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
 
 
 def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
-    """The verdict; where the inputs explain nothing that determines no parameter."""
+    """Return the verdict; that nothing is determined if the inputs explain nothing."""
     # Without a disturbance that is asked of the response: it has to stand out of the noise.
     if not verdict.identifiable or not e.innovations:
         return verdict
-    gain = gain_of_inputs(at, e)
-    free = len(at.layout.free)
+    gain, free = gain_of_inputs(at, e), len(at.layout.free)
     # Written so that a gain that is no number changes nothing.
     if not scipy.special.chdtrc(free, max(gain, 0.0)) >= _BY_CHANCE:
         return verdict
@@ -311,30 +304,27 @@ def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Ver
 
 
 def gain_of_inputs(at: Solution, e: Evaluation) -> float:
-    """Twice the log-likelihood that the inputs gain at the optimum over inputs that rest at their
-    means; NaN where no input moves.
+    """Return twice the log-likelihood that the inputs gain at the optimum over inputs that rest at
+    their means; NaN where no input moves.
 
     All unknowns stay as they are: estimated anew without the inputs the likelihood could only be
     larger, and the gain smaller, so that a gain of no account is certain.
     """
-    if not any(_moving(flight) for flight in at.data.flights):
+    layout, data, noise, z = at
+    if not any(_moving(flight) for flight in data.flights):
         return float("nan")
-    still = at.data._replace(flights=tuple(_at_rest(flight) for flight in at.data.flights))
-    without = evaluate(at.layout, still, at.noise, at.z)
+    resting = []
+    for flight in data.flights:
+        inputs = naming.asdict(flight.inputs)
+        means = {n: jnp.full_like(u, jnp.mean(u)) for n, u in inputs.items()}
+        resting.append(flight._replace(inputs=naming.replace(flight.inputs, **means)))
+    still = data._replace(flights=tuple(resting))
+    without = evaluate(layout, still, noise, z)
     if not np.isfinite(without.r).all():
         return float("nan")
-    return 2.0 * (_likelihood(at, at.data, e) - _likelihood(at, still, without))
-
-
-def _likelihood(at: Solution, data: Data, e: Evaluation) -> float:
-    return at.layout.objective.log_likelihood(at.layout, data, at.noise, e)
+    likelihood = layout.objective.log_likelihood
+    return 2.0 * (likelihood(layout, data, noise, e) - likelihood(layout, still, noise, without))
 
 
 def _moving(flight: FlightData) -> list[str]:
     return [n for n, u in naming.asdict(flight.inputs).items() if np.ptp(np.asarray(u)) > 0]
-
-
-def _at_rest(flight: FlightData) -> FlightData:
-    """The flight with each input at its mean, of the same shapes and types."""
-    still = {n: jnp.full_like(u, jnp.mean(u)) for n, u in naming.asdict(flight.inputs).items()}
-    return flight._replace(inputs=naming.replace(flight.inputs, **still))

@@ -1,4 +1,4 @@
-"""Whether inputs follow the response: feedback, by a pilot or a controller.
+"""Feedback: do inputs follow the response, through a pilot or a controller?
 
 Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
 multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
@@ -31,12 +31,6 @@ from jaxtyping import Float
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
-
-# How one signal is correlated with sums over past samples of another, and how surely.
-#
-# The variance of such a correlation between two autocorrelated signals is Bartlett's: the sum over
-# all lags of the product of both autocorrelations (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
-
 
 _NOTHING = 1e-7
 """of the root of what a sum's power is at least where its terms are unrelated, below which it is
@@ -213,29 +207,44 @@ class Feedback(NamedTuple):
 def feedback(
     flight: Flight, together: int = 1, earlier: Mapping[str, float] | None = None
 ) -> tuple[Feedback, ...]:
-    """By input that moves freely, whether it follows past innovations; nothing where the record is
-    too short to tell.
+    """Return for each input that moves freely the past innovations that it follows most surely;
+    nothing where the record is too short to tell.
 
     Args:
         flight: inputs and outputs as measured; no model is asked.
-        together: how many flights are tested side by side, for the p values.
+        together: number of flights that are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    tested = [_tested_at(flight, earlier or {}, rate) for rate in _rates_of(flight)]
-    each = [one for one in tested if one is not None]
-    label, found = flight.name or "flight 1", {}
-    for one in each:
-        for name in dict.fromkeys(n for view in one.views for n in view.free):
-            made = _dependence(one, name, together * len(each))
-            late = one.steps.get(name, 0) * flight.dt
-            now = made._replace(flight=label, earlier=late)
-            found[name] = min(found.get(name, now), now, key=_sureness)
+    # Half of a record at most: a delay beyond is none that it could show.
+    most, dt = flight.n_samples // 2, flight.dt
+    steps = {n: min(math.ceil(s / dt - 1e-9), most) for n, s in (earlier or {}).items()}
+    by_rate = [views for rate in _rates_of(flight) if (views := _views(flight, steps, rate))]
+    found: dict[str, Feedback] = {}
+    for views in by_rate:
+        N = len(views[0].innovations)
+        blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
+        seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
+        for name in dict.fromkeys(n for view in views for n in view.free):
+            those = [view for view in views if name in view.free]
+            # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+            count = len(those) * those[0].inputs * len(those[0].outputs) * len(blocks)
+            for view in those:
+                each = correlations_with_sums(view.free[name], view.innovations, blocks)
+                for k, b in np.ndindex(each.p_value.shape):
+                    one = Feedback(
+                        flight.name or "flight 1",
+                        name,
+                        view.outputs[k],
+                        float(each.correlation[k, b]),
+                        seconds[b],
+                        min(1.0, together * len(by_rate) * count * float(each.p_value[k, b])),
+                        steps.get(name, 0) * dt,
+                    )
+                    # Of several that are sure beyond all numbers the correlation decides.
+                    found[name] = min(
+                        found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
+                    )
     return tuple(found.values())
-
-
-def _sureness(one: Feedback) -> tuple[float, float]:
-    # Of several that are sure beyond all numbers the correlation decides.
-    return one.p_value, one.correlation
 
 
 def _rates_of(flight: Flight) -> tuple[float, ...]:
@@ -254,64 +263,35 @@ def _frames(u: np.ndarray) -> float:
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
 
-def _dependence(tested: "_Tested", name: str, together: int) -> Feedback:
-    """Of one input the past innovations that it follows most surely."""
-    views = [view for view in tested.views if name in view.free]
-    count = len(views[0].innovations)
-    blocks = lag_blocks(max(1, min(round(_LONGEST / tested.dt), count // 10)))
-    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-    tests = together * len(views) * len(tested.inputs) * len(tested.outputs) * len(blocks)
-    made = []
-    for view in views:
-        each = correlations_with_sums(view.free[name], view.innovations, blocks)
-        k, b = min(
-            np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
-        )
-        lag = (blocks[b][0] * tested.dt, blocks[b][1] * tested.dt)
-        p, correlation = min(1.0, tests * float(each.p_value[k, b])), float(each.correlation[k, b])
-        made.append(Feedback("", name, tested.outputs[k], correlation, lag, p))
-    return min(made, key=_sureness)
-
-
 class _View(NamedTuple):
-    """What is correlated: of the past, and of an input what is compared with it."""
+    """Signals of a flight at one rate, of which the past is compared with inputs."""
 
     free: dict[str, np.ndarray]
     """by input what its own past does not foretell (N,)"""
     innovations: Float[np.ndarray, "N p"]
-
-
-class _Tested(NamedTuple):
-    """A flight at one rate."""
-
-    views: tuple[_View, ...]
-    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    steps: dict[str, int]
-    """by input by how many samples of the flight it was taken earlier"""
+    inputs: int
+    """how many inputs move"""
     dt: float
 
 
-def _tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> _Tested | None:
-    """Return the signals of a flight that are correlated; None where all outputs stay or lack too
-    much, the record is too short, or no input moves freely.
+def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
+    """Two pairs of what is compared; none where all outputs stay or lack too much, the record is
+    too short, or no input moves freely.
 
     Args:
-        earlier: by input, how much earlier than logged it is to be taken [s].
+        steps: by how many samples an input is taken earlier than logged, where it is.
         rate: samples a second at most [Hz].
     """
-    # Half of a record at most: a delay beyond is none that it could show.
-    most = flight.n_samples // 2
-    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
     inputs, outputs, parts, dt = _decimated(flight, steps, rate)
     if not outputs or next(iter(outputs.values())).size < _LEAST:
-        return None
+        return []
     # Steps are slopes at a lower rate.
     quick = _decimated(flight, steps, RATE).inputs
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        return None
+        return []
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
@@ -322,8 +302,9 @@ def _tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> _Te
     now = np.concatenate([now[1:], now[-1:]])
     given = arx_residuals(y, np.concatenate([y, now], axis=1))
     past = arx_residuals(y, np.concatenate([y, u], axis=1))
-    views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
-    return _Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt) if views else None
+    names = tuple(outputs)
+    pairs = ((free, given), (finer, past))
+    return [_View(v, e, names, len(inputs), dt) for v, e in pairs if e is not None and v]
 
 
 def _unforeseen(
