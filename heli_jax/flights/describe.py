@@ -114,6 +114,11 @@ class TimeInfo:
     runs: int = 1
     numbering: str = ""
 
+    @property
+    def signal(self) -> Signal:
+        """The clock as a signal of the log."""
+        return Signal(self.column, self.unit, "s", scale=1.0 / (self.counted or 1.0))
+
 
 @dataclass(frozen=True)
 class TopicInfo:

@@ -19,10 +19,10 @@ from heli_jax.flights.clock import (
 )
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
-from heli_jax.flights.joined import in_runs, rate_note
 from heli_jax.flights.log import ChannelLog, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.read_table import in_runs, rate_note
 from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.new_config.guess import Series
 
