@@ -16,7 +16,6 @@ from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import (
     WORST,
@@ -86,9 +85,8 @@ def _print_details(run: FitRun) -> None:
     ):
         for name, m in agreement.items():
             _print_agreement(f"{name}, {what}", m)
-    held = fit.held_out_frequency
-    for flight in held.flights if held is not None else ():
-        tell(f"{flight.flight}, held out, in frequency: {flight.in_words}")
+    if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
+        _tell_table(held)
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
         _tell_table(responses)
@@ -213,11 +211,10 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         if verbose or name in check.guessed:
             guess = f" ({GUESSED})" if name in check.guessed else ""
             tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    follows = all(f.code != NOTHING_FOLLOWS for f in check.findings)
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
-    if doubt := too_good(sds, bool(check.guessed), nothing_follows=not follows):
+    if check.guessed and (doubt := too_good(sds)):
         tell(f"! {doubt.sentence}")
     if verbose:
         _print_rank(verdict)
