@@ -1,4 +1,4 @@
-"""What is set right and noted of signals before anything is made of them: marks, and turns.
+"""First corrections of logged signals: marks for missing values, and turns of angles.
 
 Both would be spread over their neighbours by any filter or straight line: a -9999 that stands for
 no value, and the jump of an angle from 180 deg to -180 deg.
@@ -52,7 +52,8 @@ class AsLogged:
     notes: tuple[Finding, ...]
 
     def source(self, source: Source, begin: float, end: float) -> Source:
-        """Of a flight from `begin` to `end` [s] on the signals' clocks, with what they were."""
+        """Return the source of a flight from `begin` to `end` [s] on the signals' clocks, with
+        their facts."""
         facts = {key: f.within(begin, end) for key, f in self.facts.items()}
         return replace(source, facts=facts)
 
@@ -106,7 +107,7 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
 
 
 def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log the configuration says to stand for no value."""
+    """Return a mask of the numbers (N,) that the configuration states to stand for no value."""
     at = np.zeros(numbers.shape, bool)
     for value in signal.missing:
         # Numbers have been through their unit and back.
@@ -157,7 +158,7 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
 
 
 def is_wrapped(values: np.ndarray, turn: float) -> bool:
-    """Whether an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
+    """True if an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
     y = values[np.isfinite(values)]
     if y.size < FEWEST or not np.ptp(y) <= _TURN * turn:
         return False

@@ -244,7 +244,7 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
 
 
 def clock_scale(table: Table, time: Signal) -> float:
-    """Of the unit of a clock, or of its counts [s]."""
+    """Return the size of a clock's unit or count [s]."""
     if time.scale != 1.0:
         return time.scale
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
@@ -312,7 +312,7 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     if len(rates) != 1:
         return None
     rate, words = next(iter(rates.items()))
-    # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
+    # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
 

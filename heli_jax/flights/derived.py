@@ -26,7 +26,7 @@ _MOST_CONDITION = 100.0
 
 @dataclass(frozen=True)
 class Swashplate:
-    r"""Where a swashplate's servos lift it, and what their channels mean.
+    r"""Geometry of a swashplate's servos, and the scale of their channels.
 
     Servo i, seen from above at the angle $\psi_i$ clockwise from the nose and at the radius $r_i$,
     lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the other
@@ -118,7 +118,7 @@ _LONGEST_NAME = 400
 
 @dataclass(frozen=True)
 class Derivation:
-    """How a channel is computed.
+    """Computation of a derived channel.
 
     Attributes:
         groups: the channels it is computed from. The last group has the clock of the result, and
@@ -135,7 +135,7 @@ class Derivation:
 def derivation(
     name: str, known: Collection[str], swashplate: Swashplate | None = None
 ) -> Derivation | None:
-    """How a channel of this name is computed; None where the name is that of a plain channel.
+    """Return the computation of a channel of this name; None for a plain channel.
 
     Args:
         swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
@@ -252,7 +252,7 @@ class DerivedLog(ChannelLog):
     swashplate: Swashplate | None = None
 
     def is_derived(self, name: str) -> bool:
-        """Whether a name is that of a derived channel, well formed or not."""
+        """True if a name is that of a derived channel, well formed or not."""
         try:
             return derivation(name, frozenset(self.names), self.swashplate) is not None
         except ValueError:
@@ -338,7 +338,7 @@ class DerivedTable(TableView):
             raise wrong(self.path, str(e), f"column {shown(name)}") from e
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell; of a derived column the number."""
+        """Text of a cell; of a derived column the number."""
         if self._derivation(name) is None:
             return super().cell_text(name, row)
         return f"{self.numbers([name])[name][row]:g}"

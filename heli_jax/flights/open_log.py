@@ -1,4 +1,4 @@
-"""Which reader opens a log."""
+"""Choice of the reader for a log."""
 
 import sys
 from collections.abc import Callable

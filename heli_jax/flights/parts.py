@@ -40,7 +40,7 @@ def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
 
 
 def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> bool:
-    """Whether a stretch [s] is left out."""
+    """True if a stretch [s] is too short to be a flight."""
     fastest = min(float(np.median(np.diff(seconds))) for seconds in clocks)
     length = stretch[1] - stretch[0]
     return length < SHORTEST or length < (FEWEST - 1.5) * fastest

@@ -1,4 +1,4 @@
-"""How far the reading of a file is, as a stage of the work."""
+"""Progress of reading a file, as a stage of the work."""
 
 import contextlib
 import functools

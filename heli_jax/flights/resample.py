@@ -26,7 +26,7 @@ _CELLS = 16
 
 @dataclass(frozen=True)
 class Clock:
-    """Where to sample: `times` (M,) [s], `dt` apart, and what to tell the reader of it."""
+    """Grid to sample at: `times` (M,) [s], `dt` apart, with notes for the reader."""
 
     times: np.ndarray
     dt: float
@@ -76,7 +76,7 @@ def _long_steps(seconds: np.ndarray, usual: float) -> tuple[Finding, ...]:
 
 
 def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Whether each of the times (M,) lies in a gap of the stamps (N,) that is not bridged."""
+    """Return a mask of the times (M,) that lie in a gap of the stamps (N,) that is not bridged."""
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
     step = seconds[behind] - seconds[behind - 1]
     away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
@@ -88,7 +88,7 @@ def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
 def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The value of the sample before each time: a stick stays until the next sample.
 
-    For modes and counters, of which no mean makes sense; what acts on a machine takes `held_mean`.
+    For modes and counters, of which no mean makes sense; what acts on a vehicle takes `held_mean`.
     A time that misses a stamp by rounding alone counts as at the stamp.
 
     Args:
@@ -124,9 +124,9 @@ def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray)
 def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The mean of a stepwise signal over each step of a grid, from its time to the next.
 
-    What a machine makes of a step is its integral. The mean keeps it wherever the step falls; the
+    What a vehicle makes of a step is its integral. The mean keeps it wherever the step falls; the
     value at the grid's time would be late by half a grid step on average, which a fit takes for
-    the machine's lag.
+    the vehicle's lag.
 
     Args:
         seconds: stamps (N,) [s], increasing; each sample stays until the next.
@@ -176,7 +176,7 @@ def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) 
 
 
 def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:
-    """Whether `resampled` low-passes samples at these stamps (N,) [s] for these times (M,) [s]."""
+    """True if `resampled` low-passes samples at these stamps (N,) [s] for these times (M,) [s]."""
     return bool(
         times.size >= 2 and np.median(np.diff(seconds)) < _GOES_DOWN * (times[1] - times[0])
     )
@@ -254,7 +254,7 @@ class Placed(NamedTuple):
 
 
 def usual_step(seconds: np.ndarray) -> float:
-    """Of stamps (N,) [s]; infinite where there are fewer than two."""
+    """Return the usual step of stamps (N,) [s]; infinite for fewer than two."""
     return float(np.median(np.diff(seconds))) if seconds.size > 1 else float("inf")
 
 
@@ -269,7 +269,7 @@ def own_clock(signal: Timed) -> Timed:
 
 
 def is_slower(signal: Timed, rate: float) -> bool:
-    """Whether a signal was sampled clearly more slowly than `rate` [Hz]."""
+    """True if a signal was sampled clearly more slowly than `rate` [Hz]."""
     # 1e-6: a step of exactly the limit, but for its rounding, is none that is longer.
     return usual_step(own_clock(signal).seconds) * rate > SLOWER * (1 + 1e-6)
 
@@ -343,7 +343,7 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
 
 
 def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
-    """What was done to a slow output, in a sentence.
+    """Describe the treatment of a slow output, in one sentence.
 
     Args:
         placed: what `at_nearest` made of it.
@@ -472,7 +472,7 @@ def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
         at: where the samples stand (N,), in steps.
         values: the samples (N,).
     """
-    # From the middle, where the machine is most likely at work; the ends are pulled to the line
+    # From the middle, where the vehicle is most likely at work; the ends are pulled to the line
     # whatever the ridge.
     first = max(0, (at.size - _TRIED) // 2)
     at, values = at[first : first + _TRIED], values[first : first + _TRIED]
@@ -533,8 +533,8 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
 # that choose among them and all, serve them all.
 @functools.lru_cache(maxsize=2)
 def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which even samples each sample is a sum of (N, taps), with which weights (N, taps), and the
-    diagonals (taps, size) of the equations of least squares, with the penalty.
+    """Return the even samples that each sample is a sum of and their weights (N, taps), and the
+    diagonals (taps, size) of the least-squares equations with the penalty.
 
     Args:
         stamps: where the samples stand (N,) in steps, float64.

@@ -26,7 +26,7 @@ class Survey:
 
 
 class Table(Protocol):
-    """What a reader of one format offers. Rows count from 0, places are for people."""
+    """Interface of a reader of tables. Rows count from 0, places are for people."""
 
     # A protocol and no base class: a reader is chosen by the file's ending in `open_log` alone, and
     # the next format is one more module there.
@@ -42,7 +42,7 @@ class Table(Protocol):
 
     @property
     def sha256(self) -> str:
-        """Of the whole file; of a large one it is waited for."""
+        """Fingerprint of the whole file; waits for that of a large one."""
         ...
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -54,11 +54,11 @@ class Table(Protocol):
         ...
 
     def place(self, row: int) -> str:
-        """Where a row stands: `line 12` of a text file, `row 3` (from 1) of another."""
+        """Place of a row: `line 12` of a text file, `row 3` (from 1) of another."""
         ...
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         ...
 
     def time_unit(self, name: str) -> str | None:
@@ -219,7 +219,7 @@ class TableView:
 
     @property
     def sha256(self) -> str:
-        """Of the file."""
+        """Fingerprint of the file."""
         return self.table.sha256
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -244,11 +244,11 @@ class TableView:
         return made
 
     def place(self, row: int) -> str:
-        """Where a row stands in the file."""
+        """Place of a row in the file."""
         return self.table.place(row if self._rows is None else int(self._rows[row]))
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         if name not in self.table.names:
             return str(row)
         return self.table.cell_text(name, row if self._rows is None else int(self._rows[row]))

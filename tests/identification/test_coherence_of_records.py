@@ -55,11 +55,10 @@ def test_modes_that_do_not_swing_ask_for_a_rate_too():
         [found] = of_rates(asked, [{"phi": 1e-6}])
         assert found.severity == severity
         assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
-        # Guessed noise as large as the motion hides no mode; a stated one does, and it is said.
+        # Guessed noise as large as the motion hides no mode; a stated one does.
         [guessed] = of_rates(replace(asked, flights=(replace(slow, sd={}),)), [{"phi": 1.0}])
         assert guessed.severity == severity
-        [hidden] = of_rates(asked, [{"phi": 1.0}])
-        assert (hidden.severity, hidden.value) == ("doubt", None)
+        assert not list(of_rates(asked, [{"phi": 1.0}]))
 
 
 def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_together():

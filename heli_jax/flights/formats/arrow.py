@@ -175,7 +175,7 @@ class ColumnTable:
 
     @property
     def sha256(self) -> str:
-        """Of the file: a log's columns are read in less time."""
+        """Fingerprint of the whole file; reading a log's columns takes less time."""
         try:
             return self._digest.hex()
         except OSError as e:
@@ -233,7 +233,7 @@ class ColumnTable:
         return f"row {row + 1}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         value = self._read([name]).column(name)[row].as_py()
         return "nothing" if value is None else repr(value)[:40]
 

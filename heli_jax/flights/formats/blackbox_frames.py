@@ -1,4 +1,4 @@
-"""How a blackbox log is packed: its header, the fields of a frame, and where frames begin and end.
+"""Blackbox format: header, fields of a frame, and the places of frames.
 
 The header is lines of `H name:value` that say how the frames are written. Every decoder takes the
 bytes of the log (B,) uint8 and the positions (M,) where M groups of fields begin, and returns their
@@ -277,7 +277,7 @@ class FrameLayout:
 
 @dataclass(frozen=True)
 class Header:
-    """What the header says: `settings` by name, `layouts` by the frames' letter.
+    """Header: `settings` by name, `layouts` by the frames' letter.
 
     `start` is where the frames begin [bytes from the flight's first].
     """
@@ -524,12 +524,12 @@ class _Chain:
             i = int(self.following[last])
 
     def next_behind(self, at: int, otherwise: int) -> int:
-        """Where the next candidate behind `at` begins."""
+        """Return the place of the next candidate behind `at`."""
         i = int(np.searchsorted(self.starts, at, side="right"))
         return int(self.starts[i]) if i < self.starts.size else otherwise
 
     def visited(self) -> np.ndarray:
-        """Where those begin that were followed."""
+        """Places of the candidates that were followed."""
         edges = np.zeros(self.starts.size + 1, np.int64)
         for first, end in self.ranges:
             edges[first] += 1
@@ -618,7 +618,7 @@ class _Walk:
         self.in_damage = True
 
     def _event_end(self, at: int) -> int:
-        """Where the event at `at` ends; 0 where it is none."""
+        """Return the end of the event at `at`; 0 if there is none."""
         kind = self.data[at + 1] if at + 1 < len(self.data) else -1
         # The type alone is one byte, which damage makes by chance. The words behind it do not come
         # about so, and the end of a log is believed only with them.

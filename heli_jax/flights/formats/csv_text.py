@@ -144,7 +144,7 @@ def is_gzipped(path: Path) -> bool:
 
 
 def inner_ending(path: Path) -> str:
-    """What a file would end in if it were not packed: `.csv` of `log.csv.gz`, of `log.csv` too."""
+    """Return the ending of a file without its packing: `.csv` of `log.csv.gz` and of `log.csv`."""
     return Path(path.stem if is_gzipped(path) else path.name).suffix.lower()
 
 
@@ -410,7 +410,7 @@ class CsvTable:
 
     @property
     def sha256(self) -> str:
-        """Of the file."""
+        """Fingerprint of the file."""
         return self._digest.hex()
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -478,7 +478,7 @@ class CsvTable:
         return f"line {self._record(row)[0]}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         cell = self._record(row)[1][self.names.index(name)].strip()
         return shown(cell) if cell else "nothing"
 

@@ -54,7 +54,8 @@ _LABELS = {"degheading": "deg", "deglatitude": "deg", "deglongitude": "deg", "sa
 
 @dataclass(frozen=True)
 class Format:
-    """What a message FMT says of another: its fields' kinds, one letter each, and their names."""
+    """Format of a message from its FMT message: kinds of the fields, one letter each, and their
+    names."""
 
     name: str
     kinds: str
@@ -62,12 +63,12 @@ class Format:
 
     @property
     def dtype(self) -> np.dtype:
-        """How the fields stand in the bytes."""
+        """NumPy type of the fields in the bytes."""
         return np.dtype([(c, FIELDS[k][0]) for c, k in zip(self.columns, self.kinds, strict=True)])
 
     @property
     def is_valid(self) -> bool:
-        """Whether the fields are known, each with a name of its own."""
+        """True if the fields are known, each with a name of its own."""
         return (
             len(self.kinds) == len(self.columns) == len(set(self.columns))
             and set(self.kinds) <= FIELDS.keys()
@@ -343,7 +344,7 @@ def _by_instance(table: _Table) -> dict[str, np.ndarray]:
     if instance is None or not _are_counts(table.rows[instance]):
         return {table.name: table.rows}
     counts = np.unique(table.rows[instance]).astype(np.int64)
-    # A machine with one sensor has instance 0 alone; a name without an index is what its user
+    # A vehicle with one sensor has instance 0 alone; a name without an index is what its user
     # expects.
     if len(counts) == 1 and not counts[0]:
         return {table.name: table.rows}
@@ -519,7 +520,7 @@ _TEXTS = "nNZ"
 
 
 def is_dataflash_text(head: bytes) -> bool:
-    """Whether the first bytes of a file hold the format of a message, as such logs begin."""
+    """True if the first bytes of a file hold the format of a message, as such logs begin."""
     return any(line.startswith(b"FMT,") for line in head.splitlines())
 
 

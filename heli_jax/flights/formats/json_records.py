@@ -126,7 +126,7 @@ def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
 
 
 def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """What is in records within records, by path."""
+    """Yield the cells of nested records by path."""
     for key, value in record.items():
         name = f"{path}.{key}" if path else str(key)
         # Columns of pandas are no records: {"0": 0.1, "1": 0.2}.

@@ -169,7 +169,7 @@ def _netcdf_3(path: Path, sets: DataSets) -> None:
         for name, variable in file.variables.items():
             values: Any = variable.data
             values = np.asarray(values)
-            # In the machine's own order of bytes.
+            # In the vehicle's own order of bytes.
             values = values.astype(values.dtype.newbyteorder("="))
             sets.add(str(name), values, variable._attributes)
 

@@ -86,7 +86,7 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
             ticks = array.astype(np.int64).astype(np.float64)
             sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
     elif holds_numbers(array.dtype, array.ndim):
-        # In the machine's own order of bytes.
+        # In the vehicle's own order of bytes.
         sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
     else:
         sets.leave_out(name, array.dtype, array.shape)
