@@ -1,6 +1,6 @@
 """A first guess of a problem's parameters by frequency error, for a fit in time.
 
-The misfit in time has valleys and plateaus far from its optimum, and an unstable machine's
+The misfit in time has valleys and plateaus far from its optimum, and an unstable vehicle's
 simulation overflows there; the one in frequency simulates nothing.
 """
 

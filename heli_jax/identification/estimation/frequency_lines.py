@@ -284,7 +284,7 @@ def by_flight(
 
 
 def first_machine(m: Matrices) -> Machine:
-    """That of the first flight of a group: records of one length share a spectrum.
+    """The spectrum of the first flight of a group: records of one length share it.
 
     Args:
         m: of all of them, or with a leading axis.

@@ -1,4 +1,4 @@
-"""Whether the log is fast enough for the dynamics, at the start values or the estimates.
+"""The logging rate against the dynamics, at the start values or the estimates.
 
 Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
 aliases. An input that was sampled while it moved is known at its samples alone: between them a
@@ -193,15 +193,15 @@ def _modes_that_show(
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     modes = _modes_of(problem, naming.replace(params, **known), flight)
     behind = states_behind(problem.model)
-    machine = [n not in behind for n in naming.names(problem.model.State)]
+    vehicle = [n not in behind for n in naming.names(problem.model.State)]
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # A filter's own mode has no part in the machine. Its constants are known, and it is no
+        # A filter's own mode has no part in the vehicle. Its constants are known, and it is no
         # motion that a log would have to show.
         right = modes.right[:, k]
-        if np.linalg.norm(right[machine]) < 1e-6 * np.linalg.norm(right):
+        if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
         part, u, y = modes.strongest(k, problem, flight, sizes)
         if part >= 1.0:
