@@ -191,7 +191,7 @@ def choose(
     candidates = {name: _candidate(name, fits[name]) for name in fits}
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
     tests = [t for t in compared if t.degrees > 0]
-    # A fit that has not converged has a likelihood too, of no optimum: it comes last, whatever it is.
+    # A fit that has not converged has a likelihood too, of no optimum: it comes last in any case.
     # Rounded, since a disturbance that does not show leaves the same model: the one named first.
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
