@@ -301,11 +301,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def require_output(out: Path, log: str | Path) -> None:
-    """Refuse a name that no format that is written ends with, and a file that is there already.
-
-    Raises:
-        InputError: naming the endings.
-    """
+    """Refuse a name that no format that is written ends with, and a file that is there already."""
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
     # By the file and not by the name: a link to the log, or another spelling of its path, would

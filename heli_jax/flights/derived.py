@@ -137,9 +137,6 @@ def derivation(
 ) -> Derivation | None:
     """Return the computation of a channel of this name; None for a plain channel.
 
-    Args:
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
-
     Raises:
         ValueError: it looks like a derived channel and is none.
     """
@@ -259,11 +256,7 @@ class DerivedLog(ChannelLog):
             return True
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel; of a derived one that whose clock it has.
-
-        Raises:
-            InputError: there is no such channel, or those it is computed from have several clocks.
-        """
+        """The topic that holds a channel; of a derived one that whose clock it has."""
         # Of all topics, as `names` would have it, but without a tuple of thousands at every call.
         if any(name in topic.columns for topic in self.topics):
             return super().topic_of(name)
@@ -317,11 +310,7 @@ class DerivedTable(TableView):
         self.swashplate = swashplate
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty.
-
-        Raises:
-            InputError: a column is missing, or a name is none of a derived one.
-        """
+        """The columns as float64 (N,), NaN where a cell is empty."""
         derived = {name: d for name in names if (d := self._derivation(name)) is not None}
         plain = [name for name in names if name not in derived]
         plain += [n for d in derived.values() for group in d.groups for n in group]
@@ -347,12 +336,7 @@ class DerivedTable(TableView):
 def with_derived(
     log: Table | ChannelLog, swashplate: Swashplate | None = None
 ) -> DerivedTable | DerivedLog:
-    """A log whose derived channels can be asked for by name.
-
-    Args:
-        log: as `open_log` gives it.
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
-    """
+    """A log whose derived channels can be asked for by name."""
     if not isinstance(log, ChannelLog):
         return DerivedTable(log, swashplate)
     fields = {field.name: getattr(log, field.name) for field in dataclasses.fields(ChannelLog)}

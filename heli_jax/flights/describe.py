@@ -243,9 +243,6 @@ def describe_table(
     Args:
         rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
             clock, or a column that counts them, unless `time` names one.
-
-    Raises:
-        InputError: it has no such column.
     """
     surveys = table.survey()
     signal, guessed, said = table_clock(table, surveys, time, unit, rate)

@@ -233,12 +233,7 @@ class Flight:
         return self.dt * (self.n_samples - 1)
 
     def logged_step(self, name: str, kind: str) -> float:
-        """Usual time between a signal's samples as they were logged [s]; `dt` where none is known.
-
-        Args:
-            name: the model's.
-            kind: `input` or `output`.
-        """
+        """Usual time between a signal's samples as logged [s]; `dt` where none is known."""
         facts = self.source.facts.get((name, kind)) if self.source else None
         return facts.usual if facts is not None and facts.usual > 0 else self.dt
 

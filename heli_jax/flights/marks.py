@@ -188,11 +188,6 @@ class Strays:
 def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays, ...]:
     """Samples that may well be none and are not sure to be: single ones to which no motion leads,
     and many that are larger than any measurement.
-
-    Args:
-        seconds: stamps (N,) [s].
-        numbers: (N,), as the log has them, NaN where there is none or a mark stood.
-        kind: `input` or `output`.
     """
     alone, far = _unreached(seconds, numbers, kind)
     off = f"which no motion leads to: more than {far:g} times the range of all others away"

@@ -51,11 +51,7 @@ class Digest:
         _ = self._made
 
     def hex(self) -> str:
-        """The fingerprint, once it is there.
-
-        Raises:
-            OSError: the file could not be read to its end.
-        """
+        """The fingerprint, once it is there."""
         return self._made.result()
 
 

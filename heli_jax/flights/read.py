@@ -229,11 +229,7 @@ def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
 
 
 def require_some_time(flight: Flight) -> None:
-    """Refuse a flight in which no vehicle can have moved.
-
-    Raises:
-        InputError: with its length, and where to look.
-    """
+    """Refuse a flight in which no vehicle can have moved."""
     if flight.duration >= _SHORTEST:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
@@ -242,11 +238,7 @@ def require_some_time(flight: Flight) -> None:
 
 
 def require_moving_outputs(flight: Flight) -> None:
-    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise.
-
-    Raises:
-        InputError: naming the outputs and the values they keep.
-    """
+    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise."""
     seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
     still = {n: y[0] for n, y in seen.items() if y.size and np.ptp(y) <= _STILL}
     if not still or len(still) < len(seen):

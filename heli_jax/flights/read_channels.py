@@ -118,11 +118,7 @@ class ClockedSignal:
 def rows_in_window(
     path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
 ) -> slice:
-    """The rows of a clock (N,) [s] inside the window.
-
-    Raises:
-        InputError: they are too few.
-    """
+    """The rows of a clock (N,) [s] inside the window."""
     first, last = 0, elapsed.size
     where = ""
     if window is not None and elapsed.size > 1:
@@ -140,11 +136,7 @@ def rows_in_window(
 
 
 def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | None) -> TopicClock:
-    """Return the times of a topic inside the window [s], finite and increasing.
-
-    Raises:
-        InputError: they are no clock, or too few.
-    """
+    """Return the times of a topic inside the window [s], finite and increasing."""
     place = () if topic.rows else (f"topic {shown(topic.name)}",)
     elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
@@ -175,11 +167,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
 def signals_of(
     log: ChannelLog, request: Request
 ) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    """Return the signals in SI inside the window, each on the clock of its topic, and notes.
-
-    Raises:
-        InputError: a channel is missing or holds no finite numbers, or a clock is none.
-    """
+    """Return the signals in SI inside the window, each on the clock of its topic, and notes."""
     clocks: dict[str, TopicClock] = {}
     numbers: dict[Key, np.ndarray] = {}
     topics: dict[str, list[Key]] = {}
@@ -263,13 +251,6 @@ def flight_of_signals(
     Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
     their hold, outputs on straight lines where they are as fast as it; what is slower is missing
     between its samples.
-
-    Args:
-        signals: by key, in SI inside the window.
-        source: where they came from, with notes on it so far.
-
-    Raises:
-        InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
     clocks, rate = clocks_of(signals.values()), request.options.rate
     is_one = len(clocks) == 1 and (rate is None or clocks[0].topic.rows is not None)
@@ -416,9 +397,6 @@ def common_times(
         rate: of the times [Hz].
         on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid
             stay as they are; a mean of two neighbours has less noise, and that is not white.
-
-    Raises:
-        InputError: there are too few, or absurdly many.
     """
     # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
     # knows.

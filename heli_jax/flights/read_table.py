@@ -45,11 +45,7 @@ _NAMED = 2
 
 
 def load_table(table: Table, request: Request) -> ChannelLog:
-    """Return the columns that are asked for, with their clock.
-
-    Raises:
-        InputError: a column is missing or holds no numbers, or the time is none.
-    """
+    """Return the columns that are asked for, with their clock."""
     time, runs = request.time, request.options.runs
     if time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
@@ -147,9 +143,6 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     Args:
         time: the clock, where it is named; else guessed.
         rate: samples a second [Hz] of a table without times.
-
-    Raises:
-        InputError: it has no clock, or two columns of one name.
     """
     info = describe_table(table, time, unit, rate)
     clock, notes = info.time, []

@@ -68,10 +68,6 @@ def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
     So a forward-filled join does it, whose rows lie anywhere between: its runs are of any length.
     What tells is the resolution. A signal that moves by many of its steps before a value and after
     it does not measure the same value twice in a row; and new values come at a clock of their own.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), NaN where one is missing.
     """
     lengths, jumps = _runs(values)
     if lengths.size < _SURE:

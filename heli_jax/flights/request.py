@@ -77,11 +77,7 @@ class ReadOptions:
 def require_rate_and_window(
     path: str, rate: float | None, window: tuple[float, float] | None
 ) -> None:
-    """Refuse a rate or a window of which a log has no part.
-
-    Raises:
-        InputError: with what was expected.
-    """
+    """Refuse a rate or a window of which a log has no part."""
     # NaN passes no comparison, so each bound is written as what has to hold.
     if rate is not None and not (rate > 0 and math.isfinite(rate)):
         raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
@@ -93,11 +89,7 @@ def require_rate_and_window(
 
 
 class Request:
-    """The signals, the rate and the window that a user wants from a log.
-
-    Raises:
-        InputError: a column has two uses, a unit does not fit, a number makes no sense.
-    """
+    """The signals, the rate and the window that a user wants from a log."""
 
     def __init__(
         self,
@@ -202,9 +194,6 @@ def _problem(use: str, signal: Signal) -> str:
 def with_file_units(log: ChannelLog, request: Request) -> Request:
     """Return the request with the file's units where none was asked for, and with those that
     contradict what was.
-
-    Raises:
-        InputError: the file's unit is of another kind than what is asked for.
     """
     made = copy.copy(request)
     made.signals = {

@@ -152,12 +152,7 @@ class SignalFacts:
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
-    """The facts of one signal by itself.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        x: samples (N,), NaN where one is missing.
-    """
+    """The facts of one signal by itself."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     if not y.size:
@@ -180,11 +175,7 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 def facts_of_all[K: Hashable](
     signals: Mapping[K, tuple[np.ndarray, np.ndarray]], outputs: frozenset[K]
 ) -> dict[K, SignalFacts]:
-    """The facts of signals that were logged together, stuck outputs among them.
-
-    Args:
-        signals: stamps (N,) [s] and samples (N,) by key.
-    """
+    """The facts of signals that were logged together, stuck outputs among them."""
     # Differences of huge values overflow, and no more is known of such signals then.
     with np.errstate(over="ignore", invalid="ignore"):
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
@@ -335,11 +326,7 @@ def _at_rails(
 
 
 def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The samples at the largest value, where that is a rail.
-
-    Args:
-        x: samples (N,), NaN where one is missing.
-    """
+    """The samples at the largest value, where that is a rail."""
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))

@@ -52,9 +52,6 @@ class Opened(NamedTuple):
 def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Opened, Request]:
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
-
-    Raises:
-        InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
     request = with_file_units(first, request)
@@ -82,11 +79,7 @@ def clocked(logs: Opened, request: Request) -> tuple[dict[Key, ClockedSignal], t
 
 
 def flight_from(logs: Opened, request: Request) -> Flight:
-    """The flight inside the window.
-
-    Raises:
-        InputError: one sentence on what is wrong with a log, the window or the rate.
-    """
+    """The flight inside the window."""
     log, alongside = logs.log, tuple(one.note for one in logs.beside)
     notes = (*log.notes, *beyond(logs, request), *alongside)
     try:
@@ -205,11 +198,7 @@ def _as_one(
     theirs: tuple[float, float],
     name: str,
 ) -> Finding:
-    """A note that the times of two logs, from first to last [s], count alike.
-
-    Raises:
-        InputError: they hardly overlap, so that they have no clock in common.
-    """
+    """A note that the times of two logs, from first to last [s], count alike."""
     first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
     if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(

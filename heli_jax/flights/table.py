@@ -104,11 +104,7 @@ MOST_COLUMNS = 10_000
 
 
 def require_few_columns(path: str, count: int, *place: str) -> None:
-    """Refuse more columns than any log has.
-
-    Raises:
-        InputError: naming the number.
-    """
+    """Refuse more columns than any log has."""
     if count > MOST_COLUMNS:
         raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
 
@@ -132,11 +128,7 @@ class Budget:
         """bytes"""
 
     def take(self, count: int) -> None:
-        """Count bytes that are to be filled.
-
-        Raises:
-            InputError: they and those before are more than the file may take.
-        """
+        """Count bytes that are to be filled."""
         self._taken += count
         self.require(self._taken)
 
@@ -162,11 +154,7 @@ _LONGEST_NAME = 1000
 
 
 def require_short_names(path: str, names: Sequence[str]) -> None:
-    """Refuse a column's name that is no name.
-
-    Raises:
-        InputError: naming the length.
-    """
+    """Refuse a column's name that is no name."""
     longest = max(map(len, names), default=0)
     if longest > _LONGEST_NAME:
         problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
@@ -174,11 +162,7 @@ def require_short_names(path: str, names: Sequence[str]) -> None:
 
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
-    """Refuse a column that is missing or stands in the file twice.
-
-    Raises:
-        InputError: with the nearest name there is.
-    """
+    """Refuse a column that is missing or stands in the file twice."""
     for name in needed:
         count = have.count(name)
         # Which of the two is meant cannot be known, and pyarrow would return either.

@@ -85,12 +85,6 @@ def require_likely(
 ) -> tuple[Finding, ...]:
     """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
     that one or nobody stated seconds; a caution where somebody did.
-
-    Args:
-        stamps: (N,)
-
-    Raises:
-        InputError: with what to state.
     """
     named, likely = split_unit(name)[1], likely_unit(stamps)
     if unit != "s" or likely == "s":

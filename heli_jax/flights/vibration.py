@@ -79,11 +79,7 @@ def lines(
 
 
 def line_words(line: Line, rotor_hz: float | None) -> str:
-    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`.
-
-    Args:
-        rotor_hz: turns per second of the rotor, where they are known.
-    """
+    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
     share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
     if line.aliased:
         return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
@@ -144,11 +140,7 @@ def folded(hz: float, rate: float) -> float:
 
 
 def settling(frequencies: Sequence[float], q: float) -> float:
-    """Return the settling time of notches to 5 % [s].
-
-    Args:
-        frequencies: centres of the notches [Hz].
-    """
+    """Return the settling time of notches to 5 % [s]."""
     # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
     return 3.0 * q / (np.pi * min(frequencies))
 
@@ -163,11 +155,6 @@ def slow_step(x: np.ndarray) -> int:
 def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """As `notched`, of a sensor that is slower than the grid: by its own samples, and without the
     frequencies that it has no more; they are folded, and stay where they are.
-
-    Args:
-        x: samples (N,), NaN between those that were taken.
-        dt: of the grid [s].
-        frequencies: centres of the notches [Hz].
     """
     step = slow_step(x)
     own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]

@@ -88,11 +88,7 @@ class ArrayTable:
         require_few_columns(path, len(arrays))
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The arrays as float64 (N,).
-
-        Raises:
-            InputError: one is missing or they differ in length.
-        """
+        """The arrays as float64 (N,)."""
         require_columns(self.path, self.names, names)
         arrays = {name: np.asarray(self._arrays[name], np.float64) for name in names}
         # A summary of two numbers beside a log does no harm unless it is asked for.
@@ -281,11 +277,7 @@ def _labelled(
 def _named_columns(
     path: str, array: np.ndarray, texts: Mapping[str, Sequence[str]]
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """The names and the units of a matrix's columns, each empty where nothing states them.
-
-    Args:
-        texts: lists of texts by path, as many as columns in the one that names them.
-    """
+    """The names and the units of a matrix's columns, each empty where nothing states them."""
     if array.dtype.kind not in "biuf" or array.ndim > 2 or array.size < 2:
         return (), ()
     count, own = 1 if array.ndim < 2 else min(array.shape), _LEVEL.split(path)

@@ -51,12 +51,7 @@ class MainFrames:
 
 
 def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
-    """The flights of a blackbox file, without those that hold no frame.
-
-    Raises:
-        InputError: it is no blackbox file, or none of its flights can be read.
-        OSError: it cannot be read.
-    """
+    """The flights of a blackbox file, without those that hold no frame."""
     data = read_regular(path, "a blackbox log", _LARGEST)
     starts = _flight_starts(data)
     if not starts:

@@ -105,12 +105,7 @@ class _Table(NamedTuple):
 
 
 def open_dataflash(path: Path) -> ChannelLog:
-    """The flight of a binary DataFlash log.
-
-    Raises:
-        InputError: it is no DataFlash log, or holds no samples.
-        OSError: it cannot be read.
-    """
+    """The flight of a binary DataFlash log."""
     data = read_regular(path, "a DataFlash log", _LARGEST)
     if not data.startswith(MAGIC):
         raise wrong(str(path), "is no DataFlash log, expected one that begins with a format")
@@ -217,15 +212,7 @@ def _text(raw: bytes) -> str:
 def make_log(
     path: str, data: bytes, parts: Sequence[Part], damaged: int, scaled: bool = False
 ) -> ChannelLog:
-    """The log that messages make.
-
-    Args:
-        parts: the messages by description, those of one number in the file's order.
-        scaled: whether fields hold numbers that were multiplied already, as text does.
-
-    Raises:
-        InputError: no message holds a number.
-    """
+    """The log that messages make."""
     alone = {name: _joined([p for p in parts if p.form.name == name], scaled) for name in _OF_LOG}
     units = _units(parts, alone)
     tables = []
@@ -525,12 +512,7 @@ def is_dataflash_text(head: bytes) -> bool:
 
 
 def open_dataflash_text(path: Path) -> ChannelLog:
-    """The flight of a DataFlash log in text.
-
-    Raises:
-        InputError: it is no DataFlash log, or holds no samples.
-        OSError: it cannot be read.
-    """
+    """The flight of a DataFlash log in text."""
     data = read_regular(path, "a DataFlash log in text", _LARGEST_TEXT)
     formats: dict[str, _Described] = {}
     described: list[_Described] = []

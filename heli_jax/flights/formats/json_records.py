@@ -29,12 +29,7 @@ _LONGEST_LIST = 16
 
 
 def open_json(path: Path) -> ArrayTable:
-    """A file of JSON, or of a record a line.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no columns of numbers.
-        OSError: it cannot be read.
-    """
+    """A file of JSON, or of a record a line."""
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
     sets = DataSets(Budget(where, len(data)))

@@ -13,7 +13,6 @@ from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.unknowns.layout import unpack
 from heli_jax.identification.validation.excitation import least_rough
 
-
 NOTHING_FOLLOWS = "excitation.nothing-follows"
 """code of a record in which no output follows the inputs"""
 

@@ -1,20 +1,20 @@
-r"""Which estimates feedback may have moved, where nobody logged an excitation.
+r"""Estimates that feedback may have moved, where nobody logged an excitation.
 
-Feedback brings what disturbs the machine into its inputs. Directly the response is off by the part
+Feedback brings what disturbs the vehicle into its inputs. Directly the response is off by the part
 $\gamma^2$ of the input that comes of it, and the record does not tell that part: a model follows
 its inputs where it can, and its residual then shows nothing of it. Two things it does tell.
 
 What feedback may have brought in: from one output, at a constant gain, $|k|^2 S_{ee}$ of $S_{uu}$,
 which is nowhere more than all of the input; with the largest such gain, as a mean over the outputs,
-since nobody knows which is fed back. A loop holds the machine at low frequencies, where gusts are
+since nobody knows which is fed back. A loop holds the vehicle at low frequencies, where gusts are
 large in it and sweeps move sticks no more than elsewhere.
 
-An unstable machine that was held all the same had a loop with a bandwidth of twice its unstable
+An unstable vehicle that was held all the same had a loop with a bandwidth of twice its unstable
 pole at least: up to there all of the input may have come of it, whatever the residual is.
 
 Each is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
 there is a loop. Parameters are named where inputs were found to follow the response, or where
-somebody must have held the machine: the model is unstable, and the record does not grow. Inputs
+somebody must have held the vehicle: the model is unstable, and the record does not grow. Inputs
 that are taken by instrument bring in nothing.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
@@ -22,7 +22,7 @@ Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole a
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -54,7 +54,7 @@ MAY_BE = 0.25
 """part of the input that feedback may have brought in, where a parameter that is trusted shows"""
 HELD = 0.1
 """part of what tells of a parameter that is trusted from frequencies at which the loop that holds
-an unstable machine has to act: there all of the input may be that loop's"""
+an unstable vehicle has to act: there all of the input may be that loop's"""
 BESIDE = 0.05
 """the same where other inputs are taken by instrument: an input's effect is off by that part of it
 at least, in a fit that is taken for one that feedback does no harm to"""
@@ -76,7 +76,7 @@ class Moved(NamedTuple):
     may_be: float
     """part of the input that feedback may have brought in, 0 to 1"""
     held: float = 0.0
-    """part of what tells of it that lies where the loop which holds an unstable machine acts"""
+    """part of what tells of it that lies where the loop which holds an unstable vehicle acts"""
 
     @property
     def part(self) -> float:
@@ -113,30 +113,22 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     spectra = (W, smoothed([v[:, kept] for v in joint], _PART), smoothed(errors, _PART))
     room = once_a_length(functools.partial(_room, direct=direct), *spectra)
     q = len(layout.of_interest)
-    mean = mean_share(J[:q, :q].T @ J[:q, :q])
-    may_be, held = (mean(information(at, weights)) for weights in (room, _where_held(at)))
+    whole = J[:q, :q].T @ J[:q, :q]
+    may_be, held = (shares(information(at, w), whole) for w in (room, _where_held(at)))
     each = zip(layout.of_interest, may_be, held, strict=True)
     return {n: Moved(float(m), float(h)) for n, m, h in each}
 
 
-def mean_share(
-    information: Float[np.ndarray, "q q"],
-) -> Callable[[Float[np.ndarray, "q q"]], Float[np.ndarray, " q"]]:
-    """What makes of a part of the information the share that each unknown has of it, 0 to 1.
-
-    Args:
-        information: the whole information.
-    """
-    sd = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+def shares(
+    part: Float[np.ndarray, "q q"], whole: Float[np.ndarray, "q q"]
+) -> Float[np.ndarray, " q"]:
+    """Return the share that each unknown has of a part of the information, 0 to 1."""
+    sd = np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
     # A parameter that is not determined has no standard deviation to be moved by.
-    covariance = np.linalg.pinv(information / np.outer(sd, sd), rcond=1e-12, hermitian=True)
-
-    def mean(of: Float[np.ndarray, "q q"]) -> Float[np.ndarray, " q"]:
-        part = covariance @ (of / np.outer(sd, sd)) @ covariance
-        with np.errstate(all="ignore"):
-            return np.clip(np.nan_to_num(np.diagonal(part) / np.diagonal(covariance)), 0.0, 1.0)
-
-    return mean
+    covariance = np.linalg.pinv(whole / np.outer(sd, sd), rcond=1e-12, hermitian=True)
+    of_part = np.diagonal(covariance @ (part / np.outer(sd, sd)) @ covariance)
+    with np.errstate(all="ignore"):
+        return np.clip(np.nan_to_num(of_part / np.diagonal(covariance)), 0.0, 1.0)
 
 
 def _of_responses(at: Solution) -> dict[str, Moved]:
@@ -153,7 +145,7 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
     See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
     room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)
     by_line = information_by_line(at)
-    may_be = mean_share(by_line.sum(axis=0))(np.einsum("k,kab->ab", room, by_line))
+    may_be = shares(np.einsum("k,kab->ab", room, by_line), by_line.sum(axis=0))
     return {n: Moved(float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
 
 
@@ -173,7 +165,7 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
 
 
 def held_upright(at: Solution) -> bool:
-    """Whether the model is unstable and a record does not grow as it would alone.
+    """True if the model is unstable and a record does not grow as it would alone.
 
     Args:
         at: where the fit ended.
@@ -217,15 +209,15 @@ class Loop(NamedTuple):
     """Who closes a loop, as far as it is known."""
 
     found: Sequence[Feedback]
-    """whether inputs follow the response"""
+    """by flight and input, whether it follows the response"""
     instruments: Sequence[str] = ()
     """the inputs that are taken by instrument"""
     held: bool = False
-    """whether somebody must hold the machine"""
+    """whether somebody must hold the vehicle"""
 
     @property
     def closed(self) -> bool:
-        """Whether an input that is taken for given follows the response, or may: where only one
+        """True if an input that is taken for given follows the response, or may: where only one
         with an instrument was found to, whoever closes its loop may move the others as well."""
         if self.instruments:
             return bool(self.inputs) and any(one.present for one in self.found)
@@ -255,7 +247,7 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
 
 
 def knows_no_gusts(problem: Problem) -> bool:
-    """Whether a fit is one in time without gusts in its model."""
+    """True if a fit is one in time without gusts in its model."""
     objective = objective_of(problem.method)
     in_time = not (objective.noise_model == "spectrum" or objective.fits_responses)
     return in_time and objective.noise_model != "disturbance"
@@ -333,12 +325,12 @@ def weak_by_instrument(
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
     if layout.objective.fits_responses:
-        shares = _shares_of_responses(problem, at)
-        return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
-    if at.data.flights[0].by_instrument is None:
+        weak = _shares_of_responses(problem, at)
+    elif at.data.flights[0].by_instrument is None:
         return ()
-    shares = _of_lines(at)
-    return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
+    else:
+        weak = _of_lines(at)
+    return tuple(n for n, share in zip(layout.of_interest, weak, strict=True) if share > _MOST)
 
 
 def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:
@@ -352,7 +344,7 @@ def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:
     followed, F = _followed(signals, [(r.first, r.last) for r in records])
     direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
     weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
-    return mean_share(information(direct, followed))(information(direct, weak))
+    return shares(information(direct, weak), information(direct, followed))
 
 
 def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " q"]:
@@ -365,7 +357,7 @@ def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " 
     F = _followed(signals, [(0, f.n_samples) for f in flights])[1][0]
     hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
     weak = np.interp(at.noise.whitening.windows.hz, hz, F) < STRONG
-    return mean_share(by_line.sum(axis=0))(by_line[weak].sum(axis=0))
+    return shares(by_line[weak].sum(axis=0), by_line.sum(axis=0))
 
 
 def _followed(

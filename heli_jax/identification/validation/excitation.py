@@ -111,7 +111,7 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
     for flight in flights:
         drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
         drives = [v for v in drives if np.ptp(v) > 0]
-        measured = {n: _bridged(y) for n, y in flight.outputs.items() if _SEEN <= _seen(y)}
+        measured = {n: _bridged(y) for n, y in flight.outputs.items() if _seen(y) >= _SEEN}
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if not drives or not measured:
             continue
