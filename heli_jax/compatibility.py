@@ -218,8 +218,8 @@ def r_squared_of(run: FitRun) -> dict[str, float]:
 
 
 def _drifting(run: FitRun) -> set[str]:
-    """Outputs whose reconstruction drifts as far as noise that the gyros and accelerometers show
-    makes it drift, each sample being foretold from those before."""
+    """Return the outputs whose reconstruction drifts as far as the sensors' noise explains, by
+    one-step predictions."""
     fit = run.fit
     if run.problem.noise_model != "disturbance":
         return set()
@@ -282,7 +282,7 @@ def _untold(run: FitRun, errors: Sequence[SensorError]) -> str:
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
     """Return the fit's own doubts, and the errors that no real sensor has."""
-    # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
+    # That a simulation misses a channel is in the verdict, and its remedies are those of a vehicle.
     of_model = ("adequacy.", "dynamics.", "excitation.")
     notes = once(
         f for f in run.fit.findings if f.severity != "ok" and not f.code.startswith(of_model)
@@ -297,7 +297,7 @@ def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[Finding, ...]:
     each = ", ".join(f"{e.name} {100 * e.estimate.value:+.0f} %" for e in scales)
     words = (
         f"{each}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
-        "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
+        "two signals, or an angle that is an estimator's and not the vehicle's? Such numbers bring "
         "the log's signals together; which of them is wrong they do not say."
     )
     largest = max((e.estimate.value for e in scales), key=abs)

@@ -61,8 +61,8 @@ class Finding(NamedTuple):
 
 
 class Distrust(NamedTuple):
-    """Why the interval of one estimate may not be used. The names of the fields are keys of
-    fit.json."""
+    """Reason why the interval of one estimate may not be used. The names of the fields are keys
+    of fit.json."""
 
     code: str
     """of the finding"""

@@ -108,7 +108,7 @@ def generate(experiment: Experiment) -> Simulated:
     Its columns have the names and units of the first flight's `signals`, so that the same
     configuration reads it back; without flights, the model's names in SI. Its inputs are those that
     were commanded: where the model has delays, they act later than the log shows them, as in a log
-    of a machine. A whole helicopter begins in a trimmed flight, and its sticks are those of the
+    of a vehicle. A whole helicopter begins in a trimmed flight, and its sticks are those of the
     trim and what is added to them, by the configuration and by the pilot who holds the attitude.
 
     Raises:
@@ -139,7 +139,7 @@ def generate(experiment: Experiment) -> Simulated:
     run, commanded = _run(flown, settings, n, driven, where)
     if not bool(run.finite):
         raise InputError(f"{where}: {_diverged(experiment, run)}")
-    # A log ends where the machine is on the ground; the frozen state after it is no flight.
+    # A log ends where the vehicle is on the ground; the frozen state after it is no flight.
     notes = _notes(experiment, run)
     if np.isfinite(run.ended):
         run = run.first(int(np.searchsorted(run.times, run.ended, side="right")))
@@ -306,7 +306,7 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
 
 
 def _diverged_at(run: Trajectory) -> float:
-    """When a run ceases to be finite [s]."""
+    """Return the time at which a run ceases to be finite [s]."""
     # argmin of booleans: the first sample at which any state is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
     return float(run.times[np.argmin(good)])
@@ -320,7 +320,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[Finding, ...]:
         assert settings is not None
         ended = float(run.ended)
         words = (
-            f"the machine comes down to {settings.ground:g} m at {ended:.4g} s: nothing "
+            f"the vehicle comes down to {settings.ground:g} m at {ended:.4g} s: nothing "
             "is written after that"
         )
         notes.append(note("simulation.ends-on-ground", words, value=ended))

@@ -56,7 +56,7 @@ class Helicopter(eqx.Module):
     R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field(kw_only=True)
     c: Annotated[Scalar, "m", "main rotor blade chord"] = _field(kw_only=True)
     a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field(kw_only=True)
-    # What a machine without a flybar has not.
+    # What a vehicle without a flybar has not.
     R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _absent()
     R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _absent()
     L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(kw_only=True)
@@ -94,7 +94,7 @@ class Helicopter(eqx.Module):
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
     I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _absent()
     k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _absent()
-    # Blade-element theory has 1; measured machines tilt less.
+    # Blade-element theory has 1; measured vehicles tilt less.
     K_mu: Annotated[Scalar, "1", "speed stability over blade-element theory's"] = _field(1.0)
     h_T: Annotated[Scalar, "m", "tail rotor above the centre of gravity"] = _field(0.0)
     K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _absent()

@@ -15,6 +15,7 @@ import io
 import os
 import re
 import shutil
+import string
 import subprocess
 import sys
 import tempfile
@@ -108,16 +109,22 @@ def _made() -> Path:
             for name in re.findall(r"\]\((?:\.\./)?made/([^)#]+)", page.read_text("utf-8")):
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).touch()
-        (folder / "fit.txt").write_text("converged\nacceptance card\n", encoding="utf-8")
+        (folder / "fit.txt").write_text("1\n2\n3\nacceptance card\n", encoding="utf-8")
         return folder
     shutil.copytree(_ROOT / "configs", folder / "configs")
     # Commands name files as they are told, and a page must not show where it was built.
     with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["simulate", _DEMO, "--out", "runs/demo/bench.csv"]) == 0
-        assert main(["fit", _DEMO, "--set", "fit.starts=1", "--out", "fit"]) == 0
+        assert main(["fit", _DEMO, "--verbose", "--out", "fit"]) == 0
         Path("fit.txt").write_text(printed.getvalue(), encoding="utf-8")
         assert main(["sweep", *_SWEEP, "--out", "sweep"]) == 0
     return folder
+
+
+def _statements() -> str:
+    """The three statements that the demo's fit begins with."""
+    lines = (_made() / "fit.txt").read_text(encoding="utf-8").splitlines()
+    return "\n".join(["```text", *lines[:3], "```"])
 
 
 def _printed(begins: str) -> str:
@@ -189,6 +196,31 @@ def _configurations() -> str:
         text = path.read_text(encoding="utf-8")
         parts.append(f"## {name} {{#{path.stem}}}\n\n```yaml\n{text}```")
     return "\n\n".join(parts)
+
+
+def _findings() -> str:
+    from heli_jax.messages import Message, messages
+
+    def words(template: str) -> str:
+        parts = []
+        for text, field, kind, _ in string.Formatter().parse(template):
+            kind = kind or ""
+            name = "" if field is None or kind.startswith("?") else f"*{field}*"
+            # A word for one or for several: that for several.
+            shown = kind.partition("/")[2] or name
+            parts += [_cell(text), shown]
+        return "".join(parts)
+
+    def entry(code: str, message: Message) -> str:
+        lines = [f"{message.title}. {words(message.text)}", words(message.remedy)]
+        lines += [f"Compared: {words(message.measure)}."] if message.measure else []
+        lines += [f"[{message.page}](../{message.page}.md)"] if message.page else []
+        return f"`{code}`\n:   {'<br>'.join(filter(None, lines))}"
+
+    groups: dict[str, list[str]] = {}
+    for code, message in messages().items():
+        groups.setdefault(code.partition(".")[0], []).append(entry(code, message))
+    return "\n\n".join("\n\n".join((f"## {g}", *entries)) for g, entries in groups.items())
 
 
 def _linear_models() -> str:
@@ -283,11 +315,12 @@ _API = {
 }
 
 _PARTS: dict[str, Callable[[], str]] = {
-    "demo-first-line": lambda: _printed("converged"),
+    "demo-statements": _statements,
     "demo-card": lambda: _printed("acceptance card"),
     "keys": _keys,
     "fit-keys": _fit_keys,
     "commands": _commands,
+    "findings": _findings,
     "configurations": _configurations,
     "linear-models": _linear_models,
     "models": _models,

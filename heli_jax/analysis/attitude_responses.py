@@ -72,7 +72,7 @@ def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair
 
 
 def _stick(model: Model, axis: Axis) -> str | None:
-    """The input that turns the machine about an axis of roll, pitch or yaw."""
+    """The input that turns the vehicle about an axis of roll, pitch or yaw."""
     inputs = naming.names(model.Inputs)
     named = (axis.stick, _STICKS.get(axis.name))
     return next((str(n) for n in named if n in inputs), None) if axis.name in _ATTITUDES else None

@@ -54,7 +54,7 @@ type Names = tuple[list[str], tuple[str, ...]]
 
 
 class Windows(NamedTuple):
-    """How responses were taken."""
+    """Settings by which responses were computed."""
 
     records: Sequence[Float[np.ndarray, "c N"]]
     """inputs, instruments and outputs of each part of a flight"""
@@ -84,7 +84,7 @@ class Wanted(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Which frequencies, in windows of which length."""
+    """Frequencies and window length of responses."""
 
     band: tuple[float, float] | None = None
     """first and last frequency [Hz]; None: two periods in a window to 0.4 of the rate"""
@@ -111,7 +111,7 @@ class Pair(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What is known of one output."""
+    """Responses, coherence and noise of one output."""
 
     pairs: dict[str, Pair]
     """by input"""
@@ -257,7 +257,7 @@ def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names:
 def _moving_as_one(
     flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """A doubt about inputs that move together, whose responses cannot be told apart."""
+    """Doubt about inputs that move together, whose responses cannot be separated."""
     pairs = (pair for output in outputs.values() for pair in output.pairs.values())
     if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
         return []
@@ -275,7 +275,7 @@ def _moving_as_one(
 def _weak(
     omega: np.ndarray, instruments: tuple[str, ...], outputs: dict[str, Output]
 ) -> list[Finding]:
-    """Where an instrument hardly moves its input, so that nothing is known of the responses."""
+    """Name the frequencies at which an instrument hardly moves its input."""
     notes = []
     for name in instruments:
         pairs = [output.pairs[name] for output in outputs.values()]
@@ -352,9 +352,8 @@ def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: fl
 def steady_sd(
     omega: np.ndarray, output: Output, input: str, seconds: float
 ) -> tuple[np.ndarray, float]:
-    """Of a response's real and imaginary part (k,), the noise a mean over frequencies where there
-    are few averages, and its degrees of freedom: for weights, which a single frequency's would
-    mislead.
+    """Return the sd of a response's real and imaginary part (k,), and its degrees of freedom. With
+    few averages the noise is a mean over frequencies, so that weights stay smooth.
 
     Args:
         omega: (k,) [rad/s]
@@ -397,7 +396,7 @@ def _fitted(
     low, high = request.band or (0.0, np.inf)
     used = (octave_mean(omega, pair.coherence) >= request.coherence) & (hz >= low) & (hz <= high)
     H = np.where(used, pair.H, np.nan)
-    # With its hold, which is half a sample late, so that the delay is the machine's own.
+    # With its hold, which is half a sample late, so that the delay is the vehicle's own.
     hold = holds[request.input]
     sd, freedom = steady_sd(omega, output, request.input, windows.seconds)
     measured = Measured(omega, H, sd, windows.seconds, pair.coherence, hold, freedom)
@@ -501,9 +500,7 @@ _BLOCK = 4096
 
 
 def forgets(fitted: TransferFit, seconds: float) -> bool:
-    """Whether a transfer function forgets within a window, so that what it does is known from the
-    record: its slowest mode falls to 1/e.
-    """
+    """True if the slowest mode of a transfer function falls to 1/e within a window."""
     poles = fitted.poles
     return bool(np.isfinite(poles).all() and np.all(np.real(poles) * seconds < -1.0))
 
@@ -511,9 +508,8 @@ def forgets(fitted: TransferFit, seconds: float) -> bool:
 def window_error(
     fitted: TransferFit, windows: Windows, input: int, hold: Hold
 ) -> Complex[np.ndarray, " k"] | None:
-    """What windows add to the response of a transfer function; None where it does not forget within
-    a window, so that what it does is not known from the record.
-    """
+    """Return the error that windows add to the response of a transfer function; None if it does
+    not decay within a window."""
     if not forgets(fitted, windows.seconds):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})

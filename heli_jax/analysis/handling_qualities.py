@@ -56,7 +56,7 @@ _LINE = 60
 """frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
 _RISES = np.radians(10.0)
 """of phase from the lowest frequency to the crossover, from which on a loop is called one of an
-unstable machine"""
+unstable vehicle"""
 _VAGUE = 2.0
 """the factor by which a frequency's interval may reach to either side"""
 
@@ -108,7 +108,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     Args:
         curve: the response of an attitude to a stick, or an open loop's that is closed by negative
             unity feedback. The sign of an attitude's response does not matter: it is taken for
-            that of a machine whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
+            that of a vehicle whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
             is taken as it is.
     """
     grid = np.geomspace(*curve.band, _POINTS)
@@ -139,7 +139,7 @@ def _branch(grid: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
 
 def _loop_phase(points: Point) -> np.ndarray:
     """An open loop's phase (k,) [rad] unwrapped, between -360 and 0 deg at the crossover: its sign
-    is known, and that of an unstable machine may lag by 180 deg from the lowest frequency on."""
+    is known, and that of an unstable vehicle may lag by 180 deg from the lowest frequency on."""
     phase = np.unwrap(points.phase)
     falls = np.flatnonzero((points.log_gain[:-1] > 0) & (points.log_gain[1:] <= 0))
     if falls.size:
@@ -307,7 +307,7 @@ def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str])
             sentences.append(
                 "caution: the gain bandwidth is "
                 + ("indeterminate" if gain is None else "below the phase bandwidth")
-                + ", the machine may be prone to pilot-induced oscillations in super-precision "
+                + ", the vehicle may be prone to pilot-induced oscillations in super-precision "
                 "tasks or where the pilot is aggressive (ADS-33E-PRF, Figure 2)"
             )
     elif gain is not None and phase is not None:
@@ -377,7 +377,7 @@ def _low_gain(response: _Response, crossover: float, sentences: list[str]) -> No
     i = upward[-1] if upward.size else 0
     if upward.size or (values.size and values[0] < values[-1] - _RISES):
         sentences.append(
-            "caution: the phase rises up to the crossover, as where an unstable machine is in the "
+            "caution: the phase rises up to the crossover, as where an unstable vehicle is in the "
             f"loop; it may have a margin towards low gain too, {-_DB * response.gain[i]:.3g} dB at "
             f"{_hz(response.grid[i])}, where the phase is {np.degrees(response.phase[i]):.0f} deg"
         )

@@ -60,9 +60,9 @@ def operating_point(
     """
     if model.linear:
         return EVERYWHERE
-    # A trim solves for the states that the machine has; those of a disturbance are none of them.
+    # A trim solves for the states that the vehicle has; those of a disturbance are none of them.
     quiet = _undisturbed(model)
-    # A trim is a place where the machine can stay; the mean of a record is none, and its matrices
+    # A trim is a place where the vehicle can stay; the mean of a record is none, and its matrices
     # would hold accelerations that were only passing.
     if is_full_nonlinear(quiet):
         at_trim = _trimmed(quiet, params, mean_condition(outputs, dt))

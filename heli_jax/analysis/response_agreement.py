@@ -69,7 +69,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def doubt(self) -> str:
-        """Why the model does not explain the responses, in a few words; empty where it does."""
+        """Reason in a few words why the model does not explain the responses; empty if it does."""
         if self.chi_squared > max(self.upper95, _MISFIT):
             return (
                 f"squared errors of the responses are {self.chi_squared:.2g} times what their "
@@ -108,7 +108,7 @@ class ResponseAgreement(NamedTuple):
         if not self.chi_squared > self.upper95:
             return ""
         why = (
-            "the model lacks something, the machine is not linear, or an input follows the outputs"
+            "the model lacks something, the vehicle is not linear, or an input follows the outputs"
             if self.doubt
             else "chance makes as much in one of forty; the model lacks something, or its "
             "intervals are too narrow"

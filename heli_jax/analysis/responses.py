@@ -1,6 +1,6 @@
 """Frequency responses from averaged spectra: several inputs at once, with coherence and errors.
 
-Inputs that move together are told apart (conditioned responses), and with an instrument, an
+Inputs that move together are separated (conditioned responses), and with an instrument, an
 excitation that was logged and that no feedback reaches, the responses are those of the vehicle
 where pilot or autopilot close the loop.
 
@@ -29,7 +29,7 @@ Z95 = 1.959963984540054
 
 
 class TooFewAveragesError(ValueError):
-    """Of fewer averages than one more than the inputs no response is known."""
+    """Too few averages: at least one more than the inputs is needed."""
 
 
 class Responses(NamedTuple):
@@ -111,7 +111,7 @@ def responses(
 
 
 def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Of matrices (k, m, m); NaN where one is singular but for rounding.
+    """Return the inverse of matrices (k, m, m); NaN where one is singular but for rounding.
 
     Args:
         rows: densities (k, m) of the signals of the rows.
@@ -159,7 +159,7 @@ def sd_of_ratio(
     half95: float,
 ) -> Float[np.ndarray, "k l m"]:
     """Standard deviations of real and imaginary part whose 95 % intervals hold Fieller's discs;
-    NaN where these have no end.
+    NaN where these are unbounded.
 
     Args:
         omega: frequencies [rad/s].
@@ -209,7 +209,7 @@ _TRIANGLE = 1.5
 
 
 def independent_shares(omega: Float[np.ndarray, " k"], seconds: float) -> Float[np.ndarray, " k"]:
-    """Of each frequency (k,) how much of an independent one it is.
+    """Return the share of an independent frequency that each frequency (k,) has.
 
     Args:
         omega: (k,) [rad/s], rising.
@@ -297,8 +297,8 @@ def without_ends(
     ends: Complex[np.ndarray, "k m m"],
     seconds: float,
 ) -> tuple[Complex[np.ndarray, "k l m"], Float[np.ndarray, "k l m"]]:
-    """What windows add to responses at the ends of records and on the flanks of what an input
-    holds, to first order, and the standard deviation of the responses without it.
+    """Subtract, to first order, the errors that windows add at the ends of records and on the
+    flanks of held inputs; return the responses and their standard deviation.
 
     Args:
         omega: frequencies [rad/s], rising.
@@ -361,7 +361,7 @@ def _line(
     measured: tuple[Complex[np.ndarray, "k l"], Float[np.ndarray, "k l"]],
     seconds: float,
 ) -> _Line:
-    """How derivatives are taken from l responses to one input.
+    """Set up the derivatives of l responses to one input.
 
     Args:
         at: (k,) where the responses were measured.

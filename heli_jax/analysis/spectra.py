@@ -151,7 +151,8 @@ def octave_mean(
 
 
 def leakage(S: np.ndarray) -> np.ndarray:
-    """What the Hann window's sidelobes bring to each frequency from all others, (k,).
+    """Return the power that the Hann window's sidelobes bring to each frequency (k,) from all
+    others.
 
     Args:
         S: spectral density (k,) of segments in a Hann window.
@@ -281,7 +282,7 @@ class ResponseOptions(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """How flights are cut into windows, and what moves in them."""
+    """Windows of the flights, and the signals that move in them."""
 
     dt: float
     """[s]"""
@@ -381,7 +382,7 @@ class Windowed(NamedTuple):
 
     @property
     def together(self) -> bool:
-        """Whether there are windows enough to say how the errors of outputs go together: the
+        """True if there are windows enough for the correlation of the outputs' errors: the
         inverse of a spectral matrix from few averages is too large."""
         left = np.sum(self.common) / PER_AVERAGE - len(self.inputs)
         return len(self.outputs) == 1 or bool(left * _SMOOTHED >= _FOR_MATRIX * len(self.outputs))

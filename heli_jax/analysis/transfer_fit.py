@@ -59,7 +59,7 @@ class TransferFit(NamedTuple):
     """[s]; None where none was asked for"""
     chi_squared: float
     """squared errors over their random errors, per degree of freedom: near 1 where the order is
-    enough and the response is one of a linear machine"""
+    enough and the response is one of a linear vehicle"""
     J: float
     """Tischler's cost: below 100 usual for a good fit, below 50 for one as good as flight"""
     converged: bool
@@ -302,7 +302,7 @@ def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
     apart.
 
     In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, the more so
-    the farther p lies beyond: without a lot of evidence a machine has the pole that does not grow.
+    the farther p lies beyond: without a lot of evidence a vehicle has the pole that does not grow.
     A slow one is another matter: it stands in the band, or an interval about zero holds it.
     """
     poles = _roots(best, zeros)

@@ -31,9 +31,9 @@ _TRIES = 12
 """starts, the first from momentum theory and the others about it"""
 _ROUNDING = 1e-9
 _LOWEST = -0.3
-"""collective stick above which the machine is the right way up"""
+"""collective stick above which the vehicle is the right way up"""
 _UPRIGHT = 1.5
-"""roll and pitch [rad] below which a machine is not on its back"""
+"""roll and pitch [rad] below which a vehicle is not on its back"""
 
 
 class Condition(NamedTuple):
@@ -307,7 +307,7 @@ def _check_sticks(
 
 
 def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
-    """Why a stick that carries the weight is past its end; empty for the others."""
+    """Reason why the stick that carries the weight is past its end; empty for other sticks."""
     if stick not in ("x_throttle", "x_collective"):
         return ""
     weight = float(params.m * params.g)
@@ -324,7 +324,7 @@ def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
 def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:
     if model.limits is None:
         return
-    # A root of equations outside their range is a number without a machine, such as a flight with
+    # A root of equations outside their range is a number without a vehicle, such as a flight with
     # reversed flow over half of the rotor.
     limits = model.limits(params, result.state, result.inputs)
     outside = [name for name, out in limits.items() if bool(out)]

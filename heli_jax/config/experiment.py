@@ -422,7 +422,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     # But the one key whose absence means something else.
     if config.rls is None:
         content["rls"] = None
-    # A shipped model keeps its name, which means the same on any machine.
+    # A shipped model keeps its name, which means the same on any vehicle.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
     for free in content.get("fit", {}).get("free", {}).values():

@@ -49,7 +49,7 @@ def asked_handling(
 
 
 def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[Finding, ...]:
-    """Why axes that were logged have no handling qualities, where none are asked for by name."""
+    """Explain why logged axes have no handling qualities, if none are requested by name."""
     config = experiment.config.frequency or FrequencyConfig()
     gaps = handling_gaps(experiment.model, logged) if config.handling is None else ()
     return tuple(note("responses.no-handling", words) for words in gaps)

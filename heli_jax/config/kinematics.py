@@ -143,7 +143,7 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         model: any; the flight of another than a kinematic one stays as it is.
 
     Raises:
-        InputError: the machine points so steeply up or down that its angles mean nothing, turns
+        InputError: the vehicle points so steeply up or down that its angles mean nothing, turns
             faster than gyros measure, or a channel never moves.
     """
     if not is_kinematic(model):

@@ -153,7 +153,7 @@ def _noise_given(experiment: Experiment) -> bool:
 
 def _check(model: Model, f: FlightConfig, where: str) -> None:
     """Refuse what can be refused before the log is read."""
-    # A constant of one flight alone is part of the machine, so only a parameter can be one: a
+    # A constant of one flight alone is part of the vehicle, so only a parameter can be one: a
     # misspelt name would leave the vehicle's value in its place without a word.
     known = naming.names(model.Params)
     require_known(f.known, known, f"{where}.known", f"model {model.name} has no parameter")
@@ -387,7 +387,7 @@ def signals(
     known = naming.names(record)
     require_known(stated, known, f"{where}.{role}", f"model {model.name} has no {role[:-1]}")
     missing = [n for n in known if n not in stated]
-    # Every input acts on the machine, so none can be left out; of the outputs one is enough.
+    # Every input acts on the vehicle, so none can be left out; of the outputs one is enough.
     if role == "inputs" and missing:
         remedy = f"where it did not act, {missing[0]}: {{constant: 0}}"
         problem = f"{missing[0]} missing, model {model.name} needs it; {remedy}"

@@ -187,7 +187,7 @@ def coloured_noise_cautions(flight: Flight, model: Model) -> tuple[Finding, ...]
     """Outputs whose noise went through a modelled low-pass and is not white at the flight's rate,
     where filter error is told the measurement noise and so estimates no other.
 
-    The noise is then taken for a disturbance or a faster machine.
+    The noise is then taken for a disturbance or a faster vehicle.
     """
     return tuple(
         Finding(
@@ -215,11 +215,11 @@ def _not_modelled(name: str, output: OutputConfig, logged: LoggedFilters) -> Fin
     line += [f"scale: {output.scale:g}"] * (output.scale != 1.0)
     line += [f"offset: {output.offset:g}"] * (output.offset != 0.0)
     line += ["invert: true"] * output.invert
-    # The inputs were not: were both filtered alike, the machine would look the same.
+    # The inputs were not: were both filtered alike, the vehicle would look the same.
     words = (
         f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
         f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
-        f"that delay for the machine's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
+        f"that delay for the vehicle's; state `{name}: {{{', '.join(line)}, filter: from log}}` "
         "under outputs to model it, or `filter: []` there if it is of no account"
     )
     return Finding("filters.not-modelled", "doubt", words, 1e-3 * late, "delay [s]", (name,))
@@ -260,7 +260,7 @@ def unfiltered_cautions(flight: Flight, outputs: Mapping[str, OutputConfig]) -> 
                 f"{name}: its noise at {fast:.3g} Hz has {percent(there, 0)} of its power at "
                 f"{slow:.3g} Hz, of which the stated low-pass of {cutoff(filters):.3g} Hz leaves "
                 f"{percent(left, 0)}: was it logged before the filter? Then the lag of a filter "
-                "that is not there is taken off the machine's; leave the filter out and compare"
+                "that is not there is taken off the vehicle's; leave the filter out and compare"
             )
             said.append(Finding("filters.not-passed", "doubt", words, there, "power", (name,)))
     return tuple(said)

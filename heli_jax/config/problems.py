@@ -328,12 +328,12 @@ def _shipped_value(experiment: Experiment, name: str) -> str:
     if not (isinstance(model, LinearConfig) and is_shipped(model.linear)):
         return ""
     value = float(getattr(experiment.vehicle.params, name))
-    return f" ({value:.4g} is that of the machine that the model was taken from)"
+    return f" ({value:.4g} is that of the vehicle that the model was taken from)"
 
 
 def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:
     """Starts that are left out, from the vehicle file."""
-    # The numbers of a linear model that ships are those of some other machine.
+    # The numbers of a linear model that ships are those of some other vehicle.
     model = experiment.config.model
     if isinstance(model, LinearConfig) and is_shipped(model.linear):
         return free

@@ -204,7 +204,7 @@ class NuisanceConfig(Section):
     """whether a factor of each input is"""
     input_offset: bool | list[str] | None = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
-    the sticks of a machine in free flight"""
+    the sticks of a vehicle in free flight"""
 
 
 class IntervalsConfig(Section):
@@ -285,10 +285,8 @@ class FitConfig(Section):
     """what is estimated beside"""
     shooting: ShootingConfig | None = None
     """windows with initial states of their own"""
-    # Unless given, the number depends on what is free: the misfit has a valley for each period by
-    # which a delay is wrong, and one start finds the nearest.
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """points to start from; one unless given, five where a delay is free"""
+    """points to start from; default one, and restarts where a fit explains little"""
     seed: Annotated[int, Field(ge=0)] = 0
     """of random starts, bootstrap and NUTS"""
     max_steps: Annotated[int, Field(ge=1)] = 200
@@ -326,7 +324,7 @@ class RLSConfig(Section):
     # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
     """of the discrete transfer function"""
-    # One forgets nothing: all samples count alike, as for a machine that does not change in a
+    # One forgets nothing: all samples count alike, as for a vehicle that does not change in a
     # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
     """factor by which each sample counts less than the next"""

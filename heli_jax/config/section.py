@@ -10,7 +10,7 @@ class Section(BaseModel):
     """The base of all sections."""
 
     # An unknown key is an error: a misspelt `lower` would leave a parameter without a bound, a
-    # misspelt device its lag to the machine.
+    # misspelt device its lag to the vehicle.
     # What stands below a field is its meaning, in the JSON schema and for `heli-jax keys`.
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 

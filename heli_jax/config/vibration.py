@@ -32,14 +32,14 @@ _LEFT = 0.5
 _NAMED = 3
 """lines that are told of an output"""
 _FASTEST_ROTOR = 500.0
-"""rad/s, or 4800 rpm: the smallest machines stay below"""
+"""rad/s, or 4800 rpm: the smallest vehicles stay below"""
 
 
 def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Flight:
     """The flight without some frequencies, in its inputs and outputs alike.
 
-    A linear machine answers notched sticks with notched motion, so nothing is biased; notched on
-    one side alone, the notch's lag would be taken for the machine's. An output that was sampled too
+    A linear vehicle answers notched sticks with notched motion, so nothing is biased; notched on
+    one side alone, the notch's lag would be taken for the vehicle's. An output that was sampled too
     slowly to have a frequency stays as it is there: of what it does have the notch takes nothing,
     and each lag is at most 3 % of its own step.
 
@@ -85,7 +85,7 @@ def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[Finding, ..
             at = ", ".join(f"{folded(hz, rate):.3g}" for hz in above)
             words = (
                 f"{name} at about {rate:.4g} Hz is not notched at {listed} Hz: what it may have of "
-                f"that is folded to {at} Hz, where a notch would take the machine's motion too"
+                f"that is folded to {at} Hz, where a notch would take the vehicle's motion too"
             )
             notes.append(note("notches.too-slow", words, name, value=rate))
     return tuple(notes)

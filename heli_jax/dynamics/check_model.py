@@ -181,7 +181,7 @@ def _check_record(model: _Parts, role: str) -> None:
             f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields "
             f"cannot be told ({type(e).__name__}: {said})"
         ) from e
-    # A machine without inputs may fall; one without states has nothing to integrate.
+    # A vehicle without inputs may fall; one without states has nothing to integrate.
     if not names and role != "Inputs":
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
     if _is_leaf(record, names):
@@ -259,7 +259,7 @@ class _Function:
         if array.shape != ():
             self.refuse(
                 f"expected one number for {name!r}, got an array of shape {array.shape}; a model "
-                "is written for one machine, jax.vmap makes many"
+                "is written for one vehicle, jax.vmap makes many"
             )
         if not (
             jnp.issubdtype(array.dtype, jnp.floating)
@@ -488,7 +488,7 @@ def starting_at(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | None = None) -> str:
-    """Why a model cannot begin at its initial state, with the remedy; empty where it can.
+    """Reason why a model cannot begin at its initial state, with the remedy; empty if it can.
 
     Rates and outputs have to be finite there, and their derivatives by the states.
 

@@ -53,7 +53,7 @@ from heli_jax.vehicle import Helicopter
 _BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power")
 _OWN_MOTOR = ("collective", "governor")
 # Dynamic inflow has a variant of its own: eqs 8-10 have inflow in equilibrium, and a state more
-# makes a record harder to fit. A bar and a measured rotor speed a machine has or has not.
+# makes a record harder to fit. A bar and a measured rotor speed a vehicle has or has not.
 _CHOICES = ("dynamic_inflow", "measured_speed", "flybarless")
 _FULL = Corrections(*[True] * len(Corrections._fields))._replace(**dict.fromkeys(_CHOICES, False))
 _VARIANTS = {

@@ -36,7 +36,7 @@ def jacobians(
     """The model's A, B, C, D at a state and inputs.
 
     Args:
-        model: of one machine, with n states, m inputs and p outputs.
+        model: of one vehicle, with n states, m inputs and p outputs.
         state: where to differentiate; the model's initial state unless given.
         inputs: likewise; zero unless given.
 

@@ -21,7 +21,7 @@ _LINEAR = 1e-6
 
 
 class Axis(NamedTuple):
-    """An axis that a machine turns about, by the names of what a model has of it."""
+    """An axis that a vehicle turns about, by the names of what a model has of it."""
 
     name: str
     """such as 'roll'"""
@@ -34,7 +34,7 @@ class Axis(NamedTuple):
     added_inertia: str | None = None
     """the parameter that is known and added to it, kg m^2"""
     stick: str | None = None
-    """the input that turns the machine about this axis"""
+    """the input that turns the vehicle about this axis"""
     flybar: tuple[str, ...] = ()
     """the states of the flybar that belong to it"""
     tilt: tuple[str, ...] = ()
@@ -80,7 +80,7 @@ class SteadyFlight(NamedTuple):
 
 
 class Model(eqx.Module):
-    r"""Pure dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one machine, with named parts.
+    r"""Pure dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one vehicle, with named parts.
 
     `Params`, `State`, `Inputs` and `Outputs` are classes built by keyword with one scalar a field
     (an `eqx.Module` or a `NamedTuple`; see `heli_jax.naming` for units). `vector_field` returns a
@@ -123,7 +123,7 @@ class Model(eqx.Module):
     steady_flight: SteadyFlight | None = eqx.field(static=True, default=None)
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
-    """of a machine on a stand, the same machine in free flight"""
+    """of a vehicle on a stand, the same vehicle in free flight"""
     within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
     """of a model with sensors that show derivatives (`with_motion_sensors`), the model within, and
     what puts its devices around another one"""

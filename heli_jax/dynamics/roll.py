@@ -156,7 +156,7 @@ def on_stand(model: Model) -> Model:
 
     $$\ddot\phi \mathrel{-}= (\kappa\phi + \zeta\dot\phi)\,I_{xx}/(I_{xx} + I_{xx,added})$$
 
-    `kappa` [1/s^2] and `zeta` [1/s] belong to the machine without added inertia, so that the
+    `kappa` [1/s^2] and `zeta` [1/s] belong to the vehicle without added inertia, so that the
     stand's stiffness kappa Ixx [N m/rad] and damping zeta Ixx are the same in all runs.
 
     Raises:
@@ -173,7 +173,7 @@ def on_stand(model: Model) -> Model:
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)
-            # kappa and zeta are per unit of the machine's own inertia: the stand is a spring, and a
+            # kappa and zeta are per unit of the vehicle's own inertia: the stand is a spring, and a
             # known inertia that is bolted on slows it. So runs with and without it share them,
             # which is what tells a from Ixx.
             pull = p.kappa * getattr(s, str(axis.angle)) + p.zeta * getattr(s, axis.rate)
@@ -210,7 +210,7 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
     k1 = flapping_rate_gain(p)
     # The moment is linear in the cyclic pitch: k2 is that of a bracket (L3 x + L2 L4 beta) of one.
     k2 = cyclic_moment(p, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
-    # The stand's constants are per unit of the machine's own inertia, as in `on_stand`.
+    # The stand's constants are per unit of the vehicle's own inertia, as in `on_stand`.
     share = p.Ixx / roll_inertia(p)
     c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
     # Zeros and ones made of k1 have its type and its batch axis.

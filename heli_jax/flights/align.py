@@ -31,7 +31,7 @@ _STEPS = 30
 
 
 class Lag(NamedTuple):
-    """What has to be added to the second clock, and how surely that is known."""
+    """Correction of the second clock, with its standard deviation."""
 
     lag: float
     """[s]"""
@@ -43,11 +43,11 @@ class Lag(NamedTuple):
 
 
 class NotAligned(ValueError):
-    """Why no lag can be told, in words."""
+    """Reason why no lag can be found."""
 
 
 def lag_between(a: Timed, b: Timed) -> Lag:
-    """What has to be added to the stamps of `b`, so that it is the same motion as `a`.
+    """Return the correction of the stamps of `b` that aligns its motion with that of `a`.
 
     Args:
         a: a signal on its clock; the unit may be another than that of `b`.
@@ -89,7 +89,7 @@ def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:
 
 
 def _low_passed(x: np.ndarray) -> np.ndarray:
-    """What of even samples (N,) is below `BAND` of their rate; NaN where they are."""
+    """Low-pass even samples (N,) below `BAND` of their rate; NaN where they are NaN."""
     from scipy.signal import firwin
 
     taps = np.asarray(firwin(31, 2.0 * BAND, window="hamming"))
@@ -195,12 +195,7 @@ class _Smooth:
 def _refined(
     t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
 ) -> tuple[float, float]:
-    """The lag of least squares from a near one, and its standard deviation, both [s].
-
-    Args:
-        t: times (n,) of `x` (n,), by the first clock.
-        x: the first signal, NaN where missing.
-    """
+    """The lag of least squares from a near one, and its standard deviation, both [s]."""
     begun = lag
     for _ in range(_STEPS):
         slope, bend, left = _linearised(t, x, y, lag)

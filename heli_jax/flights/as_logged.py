@@ -1,4 +1,4 @@
-"""What is set right and noted of signals before anything is made of them: marks, and turns.
+"""First corrections of logged signals: marks for missing values, and turns of angles.
 
 Both would be spread over their neighbours by any filter or straight line: a -9999 that stands for
 no value, and the jump of an angle from 180 deg to -180 deg.
@@ -52,21 +52,15 @@ class AsLogged:
     notes: tuple[Finding, ...]
 
     def source(self, source: Source, begin: float, end: float) -> Source:
-        """Of a flight from `begin` to `end` [s] on the signals' clocks, with what they were."""
+        """Return the source of a flight from `begin` to `end` [s] on the signals' clocks, with
+        their facts."""
         facts = {key: f.within(begin, end) for key, f in self.facts.items()}
         return replace(source, facts=facts)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # differences of huge values
 def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
-    """The signals without marks and turns, and what they were.
-
-    Args:
-        signals: by key, in SI, each on its own clock.
-
-    Raises:
-        InputError: an input has marks; it acts all the time, so that none of it may be missing.
-    """
+    """The signals without marks and turns, and what they were."""
     made, odd, notes = {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
@@ -106,7 +100,7 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
 
 
 def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log the configuration says to stand for no value."""
+    """Return a mask of the numbers (N,) that the configuration states to stand for no value."""
     at = np.zeros(numbers.shape, bool)
     for value in signal.missing:
         # Numbers have been through their unit and back.
@@ -157,7 +151,7 @@ def without_marks_and_turns(name: str, numbers: np.ndarray) -> tuple[np.ndarray,
 
 
 def is_wrapped(values: np.ndarray, turn: float) -> bool:
-    """Whether an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
+    """True if an angle (N,) jumps by a turn at the ends of its range, and never leaves it."""
     y = values[np.isfinite(values)]
     if y.size < FEWEST or not np.ptp(y) <= _TURN * turn:
         return False
@@ -168,11 +162,7 @@ def is_wrapped(values: np.ndarray, turn: float) -> bool:
 
 
 def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, Finding]:
-    """An angle (N,) without its jumps of a turn, and what was done.
-
-    Args:
-        values: NaN where one is missing.
-    """
+    """An angle (N,) without its jumps of a turn, and what was done."""
     seen = np.isfinite(values)
     before = values[seen]
     after = np.unwrap(before, period=turn)

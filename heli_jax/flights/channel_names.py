@@ -1,4 +1,4 @@
-"""What a channel's name and unit say that it measures, and so what it cannot be."""
+"""Quantities that a channel's name and unit imply, and inputs that it therefore cannot be."""
 
 import re
 
@@ -105,7 +105,8 @@ def kind_of_unit(unit: str) -> str:
 
 
 def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
-    """What a channel measures, `an angular rate`, where that is no input of a kind; else empty.
+    """Return the quantity that a channel measures, such as `an angular rate`, if it cannot be an
+    input; else an empty text.
 
     Args:
         unit: that the log or the name states, empty without one.
@@ -126,7 +127,7 @@ def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
 
 
 def names_a_stick(name: str) -> bool:
-    """Whether a word of a name stands for a stick, a servo or a command."""
+    """True if a word of a name stands for a stick, a servo or a command."""
     words = set(words_in(name))
     return bool(_STICKS & words) and "gps" not in words
 
@@ -139,7 +140,7 @@ def words_in(name: str) -> tuple[str, ...]:
 
 
 def _is_of(unit: str, si: str) -> bool:
-    """Whether a unit is of the same kind as an SI unit, an angle being one of its own."""
+    """True if a unit is of the kind of an SI unit; angles are a kind of their own."""
     try:
         return units.base_of(unit) == units.base_of(si)
     except ValueError:

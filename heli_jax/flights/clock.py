@@ -88,9 +88,6 @@ def table_clock(
     Args:
         time: the column of time stamps, where it is stated.
         rate: samples a second [Hz], of rows or of what `time` counts.
-
-    Raises:
-        InputError: there is no such column, or the unit or the rate is none.
     """
     said = ""
     if rate is not None:
@@ -219,11 +216,7 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
-    """A column of times as a user names it.
-
-    Raises:
-        InputError: there is none, or its unit is none of time.
-    """
+    """A column of times as a user names it."""
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
     if all(s.values is None for s in surveys if s.name == signal.name):
@@ -244,7 +237,7 @@ def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signa
 
 
 def clock_scale(table: Table, time: Signal) -> float:
-    """Of the unit of a clock, or of its counts [s]."""
+    """Return the size of a clock's unit or count [s]."""
     if time.scale != 1.0:
         return time.scale
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
@@ -266,11 +259,7 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
 
 
 def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
-    """Refuse a clock of which a stamp is not later than the one before it.
-
-    Raises:
-        InputError: with what to do about it.
-    """
+    """Refuse a clock of which a stamp is not later than the one before it."""
     back = not_increasing(stamps)
     if back is None:
         return
@@ -312,7 +301,7 @@ def stated_rate(surveys: Sequence[Survey]) -> tuple[float, str] | None:
     if len(rates) != 1:
         return None
     rate, words = next(iter(rates.items()))
-    # 1/0.02 is 50 in numbers of the machine, 1/0.033 is what it is.
+    # 1/0.02 is 50 in numbers of the vehicle, 1/0.033 is what it is.
     near = round(rate, 6)
     return (near if math.isclose(rate, near, rel_tol=1e-9) else rate), words
 

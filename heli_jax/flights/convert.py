@@ -1,5 +1,6 @@
 """From a log of any format to one table of a uniform clock: CSV, Parquet or NetCDF."""
 
+import fnmatch
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,17 +19,13 @@ from heli_jax.flights.derived import (
 )
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.holds import decide
-from heli_jax.flights.joined import (
-    matching,
-    one_topic,
-    without_joins,
-)
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import at_marks, counted, mark_words
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.preset import NamedBy
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
+from heli_jax.flights.read_table import guessed_log, without_joins
 from heli_jax.flights.request import require_rate_and_window
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
 from heli_jax.flights.table import listed, require_few_columns, shown, wrong
@@ -46,7 +43,7 @@ _LONGEST = 3 * 10**8
 
 @dataclass(frozen=True)
 class Selection:
-    """What is taken of a log.
+    """Signals, rate and window that are converted.
 
     Attributes:
         signals: names of channels, in which * stands for anything, and of derived ones; all
@@ -106,10 +103,10 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         if isinstance(log.table, ArrayTable) and stated == (None, None, None):
             channels = by_clocks(log.table)
         if channels is None:
-            channels = one_topic(log.table, *stated, notes)
+            channels = guessed_log(log.table, *stated)
         # Without a rate the rows are copied as they are, empty cells and all.
-        rate = selection.rate
-        channels = channels if rate is None else without_joins(channels, notes)
+        if selection.rate is not None:
+            channels = without_joins(channels)
         log = with_derived(channels, selection.swashplate)
         assert isinstance(log, DerivedLog)
     elif selection.time or selection.time_unit or selection.time_rate:
@@ -161,7 +158,8 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
     else:
         names = []
         for pattern in patterns:
-            matches = matching(log.names, pattern)
+            # The brackets of gyroADC[0] are meant as they stand.
+            matches = fnmatch.filter(log.names, pattern.replace("[", "[[]"))
             if not matches and log.is_derived(pattern):
                 matches = [pattern]
             if not matches:
@@ -191,10 +189,9 @@ def _clocks(
     """
     clocks, problems = {}, []
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
-        # All channels of a topic share its stamps, so any one of them tells the clock.
-        times, _ = log.channel(next(iter(topic.columns)))
+        log.channel(next(iter(topic.columns)))  # refuses rows without times
         try:
-            clocks[topic.name] = topic_clock(log, topic.name, times, window)
+            clocks[topic.name] = topic_clock(log, topic, window)
         except InputError as e:
             # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
             # there is.
@@ -304,11 +301,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def require_output(out: Path, log: str | Path) -> None:
-    """Refuse a name that no format that is written ends with, and a file that is there already.
-
-    Raises:
-        InputError: naming the endings.
-    """
+    """Refuse a name that no format that is written ends with, and a file that is there already."""
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
     # By the file and not by the name: a link to the log, or another spelling of its path, would

@@ -26,7 +26,7 @@ _MOST_CONDITION = 100.0
 
 @dataclass(frozen=True)
 class Swashplate:
-    r"""Where a swashplate's servos lift it, and what their channels mean.
+    r"""Geometry of a swashplate's servos, and the scale of their channels.
 
     Servo i, seen from above at the angle $\psi_i$ clockwise from the nose and at the radius $r_i$,
     lifts the plate by $s_i = (\text{channel}_i - \text{offset}_i)\,\text{scale}_i$, with the other
@@ -118,7 +118,7 @@ _LONGEST_NAME = 400
 
 @dataclass(frozen=True)
 class Derivation:
-    """How a channel is computed.
+    """Computation of a derived channel.
 
     Attributes:
         groups: the channels it is computed from. The last group has the clock of the result, and
@@ -135,10 +135,7 @@ class Derivation:
 def derivation(
     name: str, known: Collection[str], swashplate: Swashplate | None = None
 ) -> Derivation | None:
-    """How a channel of this name is computed; None where the name is that of a plain channel.
-
-    Args:
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
+    """Return the computation of a channel of this name; None for a plain channel.
 
     Raises:
         ValueError: it looks like a derived channel and is none.
@@ -252,18 +249,14 @@ class DerivedLog(ChannelLog):
     swashplate: Swashplate | None = None
 
     def is_derived(self, name: str) -> bool:
-        """Whether a name is that of a derived channel, well formed or not."""
+        """True if a name is that of a derived channel, well formed or not."""
         try:
             return derivation(name, frozenset(self.names), self.swashplate) is not None
         except ValueError:
             return True
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel; of a derived one that whose clock it has.
-
-        Raises:
-            InputError: there is no such channel, or those it is computed from have several clocks.
-        """
+        """The topic that holds a channel; of a derived one that whose clock it has."""
         # Of all topics, as `names` would have it, but without a tuple of thousands at every call.
         if any(name in topic.columns for topic in self.topics):
             return super().topic_of(name)
@@ -317,11 +310,7 @@ class DerivedTable(TableView):
         self.swashplate = swashplate
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty.
-
-        Raises:
-            InputError: a column is missing, or a name is none of a derived one.
-        """
+        """The columns as float64 (N,), NaN where a cell is empty."""
         derived = {name: d for name in names if (d := self._derivation(name)) is not None}
         plain = [name for name in names if name not in derived]
         plain += [n for d in derived.values() for group in d.groups for n in group]
@@ -338,7 +327,7 @@ class DerivedTable(TableView):
             raise wrong(self.path, str(e), f"column {shown(name)}") from e
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell; of a derived column the number."""
+        """Text of a cell; of a derived column the number."""
         if self._derivation(name) is None:
             return super().cell_text(name, row)
         return f"{self.numbers([name])[name][row]:g}"
@@ -347,12 +336,7 @@ class DerivedTable(TableView):
 def with_derived(
     log: Table | ChannelLog, swashplate: Swashplate | None = None
 ) -> DerivedTable | DerivedLog:
-    """A log whose derived channels can be asked for by name.
-
-    Args:
-        log: as `open_log` gives it.
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
-    """
+    """A log whose derived channels can be asked for by name."""
     if not isinstance(log, ChannelLog):
         return DerivedTable(log, swashplate)
     fields = {field.name: getattr(log, field.name) for field in dataclasses.fields(ChannelLog)}

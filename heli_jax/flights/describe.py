@@ -1,4 +1,4 @@
-"""What a log holds, before anybody asks for anything."""
+"""Description of a log's content, before a configuration exists."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -114,6 +114,11 @@ class TimeInfo:
     runs: int = 1
     numbering: str = ""
 
+    @property
+    def signal(self) -> Signal:
+        """The clock as a signal of the log."""
+        return Signal(self.column, self.unit, "s", scale=1.0 / (self.counted or 1.0))
+
 
 @dataclass(frozen=True)
 class TopicInfo:
@@ -127,7 +132,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What a log, or one flight of it, holds.
+    """Content of a log, or of one of its flights.
 
     `time` is None where no column looks like a clock; an autopilot's log has `topics` with clocks
     of their own, whose channels are `columns` too, and `duration` [s] from the first sample to the
@@ -238,9 +243,6 @@ def describe_table(
     Args:
         rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
             clock, or a column that counts them, unless `time` names one.
-
-    Raises:
-        InputError: it has no such column.
     """
     surveys = table.survey()
     signal, guessed, said = table_clock(table, surveys, time, unit, rate)
@@ -342,7 +344,7 @@ def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed:
 def _describe_stamps(
     name: str, unit: str, stamps: np.ndarray, scale: float | None = None
 ) -> TimeInfo:
-    """What stamps (N,) in a unit of time, or of `scale` [s], are as a clock."""
+    """Describe stamps (N,), in a unit of time or of `scale` [s], as a clock."""
     if scale is None:
         scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""What a flight is, whichever log it came from."""
+"""Flight: uniformly sampled inputs and outputs, from any log."""
 
 import functools
 import math
@@ -71,7 +71,7 @@ class Signal:
         return numbers * self._factor
 
     def from_si(self, values: np.ndarray) -> np.ndarray:
-        """What would stand in the log (N,) for values in SI: the inverse of `to_si`."""
+        """Return the log's numbers (N,) for values in SI: the inverse of `to_si`."""
         return values / self._factor + self.offset
 
     @property
@@ -82,7 +82,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did.
+    """Origin of a flight: the file, its fingerprint, and the reader's assumptions and corrections.
 
     Attributes:
         path: of the file.
@@ -233,18 +233,13 @@ class Flight:
         return self.dt * (self.n_samples - 1)
 
     def logged_step(self, name: str, kind: str) -> float:
-        """Usual time between a signal's samples as they were logged [s]; `dt` where none is known.
-
-        Args:
-            name: the model's.
-            kind: `input` or `output`.
-        """
+        """Usual time between a signal's samples as logged [s]; `dt` where none is known."""
         facts = self.source.facts.get((name, kind)) if self.source else None
         return facts.usual if facts is not None and facts.usual > 0 else self.dt
 
     @functools.cached_property
     def facts(self) -> dict[tuple[str, str], SignalFacts]:
-        """What each signal is like, by name and kind: as it was logged, where that is known."""
+        """Facts of each signal by name and kind, as it was logged if that is known."""
         known = self.source.facts if self.source else {}
         signals = {(n, "input"): u for n, u in self.inputs.items()}
         signals |= {(n, "output"): y for n, y in self.outputs.items()}
@@ -304,7 +299,7 @@ def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[st
 
 
 def own_said(names: Sequence[str]) -> str:
-    """What is to be said of them."""
+    """Return the notes about signals with a clock of their own."""
     return (
         f"instrument of {', '.join(names)}: it is the input itself, which knows gusts as far as a "
         "loop is closed; expected the excitation alone, before pilot or autopilot add to it"

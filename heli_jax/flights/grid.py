@@ -1,4 +1,4 @@
-"""Whether a log's time stamps are a uniform grid, and which one."""
+"""Uniform grid of a log's time stamps, if they form one."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Grid:
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """What a reader of the results should know of it."""
+        """Notes for readers of the results."""
         if self.jitter <= _JITTER_NOTED:
             return ()
         words = (
@@ -39,7 +39,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Uneven:
-    """Why stamps are no uniform grid: the sample after the worst step, and the sizes [s].
+    """Reason why stamps are no uniform grid: the sample after the worst step, and the sizes [s].
 
     `drift` is how far the stamps leave a straight line, in steps, where that is the reason.
     """
@@ -66,7 +66,7 @@ _MANY = 0.1
 
 
 def shared_stamps(stamps: np.ndarray) -> str:
-    """Why many of the stamps (N,) stand still, in words; empty where few do."""
+    """Reason why many of the stamps (N,) stand still; empty if few do."""
     still = int(np.count_nonzero(stamps[1:] == stamps[:-1]))
     if still <= _MANY * stamps.size:
         return ""
@@ -162,7 +162,7 @@ def _plain(dt: float, tolerance: float) -> float:
 
 
 def rounding_of(stamps: np.ndarray) -> float:
-    """How coarsely stamps (N,), N >= 2 and strictly increasing, are rounded, in their unit.
+    """Return the rounding of stamps (N,), N >= 2 and strictly increasing, in their unit.
 
     Read from the stamps themselves: the largest power of ten, up to a step, that all are multiples
     of; or what float32 resolves; where nothing is evident, what float64 does. Significant digits
@@ -187,7 +187,7 @@ def rounding_of(stamps: np.ndarray) -> float:
 
 
 def _single_precision(size: np.ndarray) -> float:
-    """What float32 resolves where the stamps are all float32, otherwise 0."""
+    """Return the resolution of float32 if all stamps are float32, otherwise 0."""
     # A logger that counts seconds in float32 since boot steps by 1 ms after some hours.
     with np.errstate(over="ignore", under="ignore"):
         single = size.astype(np.float32)

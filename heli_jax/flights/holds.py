@@ -1,4 +1,4 @@
-"""What an input did between the samples of a log: what the record itself shows of it.
+"""Motion of an input between the samples of a log, as the record itself shows it.
 
 An input that stays for several samples and jumps was commanded in steps, and each sample holds
 until the next. One that moves at nearly every sample was sampled on its way: a straight line from
@@ -86,7 +86,8 @@ def without_jumps(flight: Flight) -> Flight:
 
 
 def low_passed(outputs: Iterable[str]) -> Decision:
-    """Of an input that was commanded in steps and went through the filter of these outputs."""
+    """Return the decision for an input that was commanded in steps and went through these
+    outputs' filter."""
     return Decision("linear", f"was low-passed as {', '.join(outputs)}")
 
 

@@ -1,18 +1,17 @@
 """A log as channels, whatever the file's format: each topic of an autopilot has a clock of its own.
 
-A text file of columns is a `Table` (`heli_jax/flights/table.py`), whose one clock is a column that
-the user names. Here times are known from the format, in seconds.
+A table of rows becomes a log of one topic (`heli_jax/flights/read_table.py`).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.table import Table, shown, wrong
 
 _APART = 1.0
 """s before and after the others' samples that a topic on their clock may have some"""
@@ -35,16 +34,25 @@ class Channel(NamedTuple):
     values: np.ndarray
 
 
+class TableRows(NamedTuple):
+    """The rows of a table that are a topic, with their stamps (N,), `scale` seconds each."""
+
+    table: Table
+    stamps: np.ndarray
+    scale: float
+
+
 @dataclass(frozen=True, eq=False)
 class Topic:
     """Channels that were written together.
 
     Attributes:
         name: what the autopilot calls them.
-        times: of the samples (N,) float64 [s], in the log's own count.
+        times: of the samples (N,) float64 [s], from the log's `origin`.
         columns: the samples (N,) by the channel's full name, in the log's own type.
         units: by the channel's full name, where the log states one.
         clock: which field the times are, in words; empty where the rows have only an order.
+        rows: of a table, by which errors name their line.
     """
 
     name: str
@@ -52,24 +60,22 @@ class Topic:
     columns: Mapping[str, np.ndarray]
     units: Mapping[str, str] = field(default_factory=dict)
     clock: str = ""
+    rows: TableRows | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelLog:
-    """One flight of a file.
+    """One flight of a file of `size` [bytes].
 
     Attributes:
-        path: of the file.
-        format: its name, as `info` shows it.
-        size: of the file [bytes].
-        sha256: of the whole file.
         topics: those that hold samples.
         firmware: which wrote it, in its own words.
         parameters: the firmware's settings, by name.
         notes: what was lost or assumed when it was read.
         flight: which flight of the file it is, from 1, and of how many.
         cautions: what speaks against its times, which every fit repeats.
-        start: when the logger began [s], in the log's own count, where the log says so.
+        start: when the logger began [s], where the log says so.
+        origin: from which times count [s], in the log's own count.
     """
 
     path: str
@@ -83,6 +89,12 @@ class ChannelLog:
     flight: tuple[int, int] = (1, 1)
     start: float | None = None
     cautions: tuple[Finding, ...] = ()
+    origin: float = 0.0
+
+    @classmethod
+    def of_table(cls, table: Table, topics: tuple[Topic, ...], **more: Any) -> "ChannelLog":
+        """Return the log of topics that were made of a table; `more` are other fields."""
+        return cls(table.path, table.format, table.size, table.sha256, topics, **more)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,12 +113,13 @@ class ChannelLog:
         longest = [times for times in clocks if times.size > 1]
         return min((float(times[0]) for times in longest), default=earliest)
 
-    def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel.
+    @property
+    def begin(self) -> float:
+        """The time from which windows count [s], in the log's own count."""
+        return self.origin + self.first_time
 
-        Raises:
-            InputError: there is no such channel; with the nearest name there is.
-        """
+    def topic_of(self, name: str) -> Topic:
+        """The topic that holds a channel."""
         # A search and no index: a log has some hundred topics, and names are asked for a few times.
         for topic in self.topics:
             if name in topic.columns:
@@ -116,11 +129,7 @@ class ChannelLog:
         raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
 
     def channel(self, name: str) -> Channel:
-        """Times and samples of one channel.
-
-        Raises:
-            InputError: there is no such channel, or its rows have no times.
-        """
+        """Times and samples of one channel."""
         topic = self.topic_of(name)
         # `info` shows such rows; only who asks for times has to be told that there are none.
         if not topic.clock:
@@ -132,12 +141,7 @@ class ChannelLog:
 def sharing_clocks(
     clocks: Mapping[str, np.ndarray], shared: tuple[float, float]
 ) -> tuple[str, ...]:
-    """The columns of times of one topic that are on the other topics' clock, the nearest first.
-
-    Args:
-        clocks: times (N,) [s] by column.
-        shared: first and last time [s] of the others.
-    """
+    """The columns of times of one topic that are on the other topics' clock, the nearest first."""
     first, last = shared
     within = {
         name: float(np.mean((times >= first - _APART) & (times <= last + _APART)))
@@ -155,10 +159,6 @@ def as_floats(values: np.ndarray) -> np.ndarray:
 
 
 def require_samples(path: str, topics: Sequence[Topic]) -> None:
-    """Refuse a log without any samples.
-
-    Raises:
-        InputError: naming the file.
-    """
+    """Refuse a log without any samples."""
     if not any(topic.times.size for topic in topics):
         raise wrong(path, "holds no samples, expected a flight")

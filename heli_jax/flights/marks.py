@@ -41,8 +41,9 @@ Counts = tuple[tuple[float, int], ...]
 
 
 def at_marks(numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log surely stand for no value: known marks far outside of all
-    others or of a sign that no other number has, and numbers that nothing measures."""
+    """Return a mask of the numbers (N,) of a log that surely stand for no value. These are known
+    marks far outside of all others or of a sign that no other number has, and numbers that
+    nothing measures."""
     absurd, known = is_absurd(numbers), _is_one_of(_KNOWN, numbers)
     none = np.zeros(numbers.shape, bool)
     if not (absurd.any() or known.any()):
@@ -62,19 +63,19 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
 
 
 def infinite(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Which values (N,) of an output are infinite where the log's numbers (N,) are no marks, `inf`
-    being one as 1e10 is."""
+    """Return a mask of the values (N,) of an output that are infinite where the log's numbers
+    (N,) are no marks; `inf` is a mark as 1e10 is."""
     return np.isinf(values) & ~at_marks(numbers)
 
 
 def is_absurd(numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log nothing measures, whatever their unit."""
+    """Return a mask of the numbers (N,) of a log that nothing measures, in any unit."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) > _ABSURD
 
 
 def _is_mark(numbers: np.ndarray, absurd: np.ndarray) -> bool:
-    """Whether absurd numbers are few, or nearly always the same."""
+    """True if absurd numbers are few, or nearly always the same."""
     count = np.count_nonzero(absurd)
     if count <= _MOST * np.count_nonzero(np.isfinite(numbers) | absurd):
         return True
@@ -179,7 +180,7 @@ class Strays:
     why: str
 
     def within(self, begin: float, end: float) -> "Strays":
-        """Those from `begin` to `end` [s], with times from `begin`."""
+        """Return the stray samples from `begin` to `end` [s], with times from `begin`."""
         at = (self.times >= begin) & (self.times <= end)
         return Strays(self.times[at] - begin, self.values[at], self.why)
 
@@ -187,11 +188,6 @@ class Strays:
 def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays, ...]:
     """Samples that may well be none and are not sure to be: single ones to which no motion leads,
     and many that are larger than any measurement.
-
-    Args:
-        seconds: stamps (N,) [s].
-        numbers: (N,), as the log has them, NaN where there is none or a mark stood.
-        kind: `input` or `output`.
     """
     alone, far = _unreached(seconds, numbers, kind)
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
@@ -213,8 +209,8 @@ def stray_words(strays: Strays) -> str:
 
 
 def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.ndarray, float]:
-    """Which of the numbers (N,) stand alone, so far outside of all others that no motion leads
-    there and back, and how many times their range that is."""
+    """Return a mask of the numbers (N,) that stand alone, so far outside of all others that no
+    motion leads there and back, and their distance in ranges."""
     seen, none = np.flatnonzero(np.isfinite(numbers)), np.zeros(numbers.shape, bool)
     x = numbers[seen]
     if x.size < _MOTION or _is_within(x):
@@ -235,8 +231,8 @@ def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.
 
 
 def _lonely(y: np.ndarray, far: float, most: int) -> tuple[np.ndarray, float]:
-    """Which of the samples (N,) lie `far` times the range of all others off, at `most` so many in a
-    row; and how many times that is."""
+    """Return a mask of the samples (N,) that lie `far` times the range of all others off, at
+    most `most` in a row, and their distance in ranges."""
     low, high = _range(y, far)
     out = _beyond(y, low, high, far)
     # Where it stays, or begins or ends, it moved; what is near to that is reached too.
@@ -251,7 +247,7 @@ def _lonely(y: np.ndarray, far: float, most: int) -> tuple[np.ndarray, float]:
 
 
 def _is_within(x: np.ndarray) -> bool:
-    """Whether all samples (N,) are surely near to most: nearly always so, and soon told."""
+    """True if all samples (N,) are surely near to most of them, by a quick test."""
     some = x[:: max(1, x.size // _SOME)]
     low, high = np.quantile(some, [2 * _MOST_STRAYS, 1 - 2 * _MOST_STRAYS])
     return bool(max(x.max() - high, low - x.min()) <= _FAR * (high - low))
@@ -280,7 +276,8 @@ def _first(at: np.ndarray) -> int:
 
 
 def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
-    """Which of the samples that are `out` (N,) stand between others, at most `most` in a row."""
+    """Return a mask of the samples that are `out` (N,) and stand between others, at most `most`
+    in a row."""
     edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(int)))
     at = np.zeros(out.shape, bool)
     middle = float(np.median(y))

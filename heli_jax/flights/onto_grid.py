@@ -1,4 +1,4 @@
-"""What tables of rows and topics with clocks of their own share on the way to a `Flight`.
+"""Common steps from tables of rows, and topics with clocks of their own, to a `Flight`.
 
 Sentences about a wrong log are not among it: they name rows of a table, and seconds of a topic.
 """
@@ -61,13 +61,7 @@ def long_gap(seconds: np.ndarray) -> LongGap | None:
 def window_note(
     window: tuple[float, float] | None, end: float, step: float = 0.0
 ) -> tuple[Finding, ...]:
-    """A note where a window reaches beyond the log, else none.
-
-    Args:
-        window: first and last time [s] from the log's beginning.
-        end: of the log [s].
-        step: the usual one [s], by which a window may be longer.
-    """
+    """A note where a window reaches beyond the log, else none."""
     if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
         return ()
     words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
@@ -75,8 +69,8 @@ def window_note(
 
 
 def even_expected(seconds: np.ndarray, usual: float) -> str:
-    """What to do about stamps (N,) [s] that are no uniform grid, in words; `usual` is the step
-    [s] of most."""
+    """Return the remedy for stamps (N,) [s] that are no uniform grid; `usual` is the step [s] of
+    most."""
     # Where a gap is too long to be bridged, a rate would only lead to the next error.
     bridged = long_gap(seconds) is None
     remedy = f"`rate: {1 / usual:.4g}` to resample, or " if bridged else ""
@@ -86,7 +80,7 @@ def even_expected(seconds: np.ndarray, usual: float) -> str:
 
 
 def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
-    """What each input does between samples: as stated, or by what its own samples (N,) show."""
+    """Decide the hold of each input: as stated, or by its own samples (N,)."""
     holds = {}
     for (key, kind), signal in request.signals.items():
         if kind == "input":
@@ -110,7 +104,7 @@ def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[Finding
 
 
 def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
-    """Where samples are missing: their times [s] and, of all samples (N,), which they are."""
+    """Describe the missing samples: their times [s] and their indices of all samples (N,)."""
     first, last = f"{seconds[0]:.6g} s", f"{seconds[-1]:.6g} s"
     if seconds.size == 1:
         return f"at {first}"
@@ -156,9 +150,9 @@ def at_times(
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
-    # A linear machine answers a filtered stick with the filtered motion. The mean of each step,
+    # A linear vehicle answers a filtered stick with the filtered motion. The mean of each step,
     # beside an output that is filtered alone, leaves the ringing of the output's jumps to be
-    # explained by the machine.
+    # explained by the vehicle.
     low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
@@ -212,7 +206,7 @@ def at_times(
 def _between(
     request: Request, signals: Mapping[Key, Timed], name: str, times: np.ndarray
 ) -> list[Finding]:
-    """What to say of a held input that moves between the samples of outputs that jump with it."""
+    """Note held inputs that move between the samples of outputs that jump with them."""
     signal = signals[name, "input"]
     jump = [o for (i, o), at_once in request.options.follows.items() if i == name and at_once]
     # What is low-passed is no longer here, and a slower one has its samples where they were.
@@ -281,14 +275,7 @@ def flight_of(
     holds: Mapping[str, Decision],
     source: Source,
 ) -> Flight:
-    """The flight of samples (N,) on one grid.
-
-    Args:
-        samples: by key, SI.
-        dt: step of the grid [s].
-        t0: time in the log of the first sample [s].
-        source: where the samples came from.
-    """
+    """The flight of samples (N,) on one grid."""
     options = request.options
     return Flight(
         dt=dt,

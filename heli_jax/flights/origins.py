@@ -1,4 +1,4 @@
-"""What a flight's signals are in its log: scales, constants, and the words for them."""
+"""Scales and constants of a flight's signals in its log, and their description."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from heli_jax.numbers import number
 
 
 def scale_problem(signal: Signal) -> str:
-    """What is wrong with the scale or the offset of a signal, in words; empty where nothing is."""
+    """Reason why the scale or the offset of a signal is wrong; empty if neither is."""
     # A scale of zero would make a constant of the signal, and one of 1e300 overflows.
     if not 1e-12 <= abs(signal.scale) <= 1e12:
         return f"scale is {signal.scale:g}, expected a number other than 0 from 1e-12 to 1e12"
@@ -39,10 +39,6 @@ def with_origins(
 ) -> Flight:
     """The flight with its constant inputs, and with what its signals are in the log.
 
-    Args:
-        flight: as it was read, without the constants.
-        inputs: all, in the order in which the flight shall have them.
-
     Raises:
         ValueError: a constant is no finite number.
     """
@@ -62,7 +58,7 @@ def with_origins(
 
 
 def in_words(signal: Signal) -> str:
-    """What a signal is in the log: `'RCIN.C1', (number - 1500) x 0.002 in 1, inverted`."""
+    """Describe a signal in the log: `'RCIN.C1', (number - 1500) x 0.002 in 1, inverted`."""
     if signal.constant is not None:
         words = f"{number(signal.constant, 6)} {_unit(signal)}".rstrip() + ", a constant"
     else:

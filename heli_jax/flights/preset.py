@@ -80,7 +80,7 @@ class Preset:
 
 @dataclass(frozen=True)
 class ModelSignal:
-    """Which signal a model's input is: what the autopilot commands, or the pilot's stick."""
+    """Source of a model's input: the autopilot's command, or the pilot's stick."""
 
     command: str
     stick: str
@@ -89,7 +89,7 @@ class ModelSignal:
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a signal is: its SI unit, and axes and sign in words."""
+    """Meaning of a signal: its SI unit, and axes and sign in words."""
 
     unit: str
     meaning: str
@@ -141,7 +141,7 @@ def preset(name: str) -> Preset:
 
 @functools.cache
 def meanings() -> Mapping[str, Meaning]:
-    """What the signals mean, by name."""
+    """Return the meanings of the signals by name."""
     return {name: Meaning(**m) for name, m in _content(_SIGNALS)["signals"].items()}
 
 

@@ -1,4 +1,4 @@
-"""How far the reading of a file is, as a stage of the work."""
+"""Progress of reading a file, as a stage of the work."""
 
 import contextlib
 import functools
@@ -51,11 +51,7 @@ class Digest:
         _ = self._made
 
     def hex(self) -> str:
-        """The fingerprint, once it is there.
-
-        Raises:
-            OSError: the file could not be read to its end.
-        """
+        """The fingerprint, once it is there."""
         return self._made.result()
 
 

@@ -28,7 +28,7 @@ from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
 _SHORTEST = 0.05
-"""s: no machine answers a stick sooner"""
+"""s: no vehicle answers a stick sooner"""
 _STILL = 1e-100
 """SI: an output that moves by no more does not move"""
 
@@ -147,7 +147,7 @@ def read_parts(
 
 
 def _moves(signal: Timed, start: float, end: float) -> bool:
-    """Whether a signal moves from `start` to `end` [s]."""
+    """True if a signal moves from `start` to `end` [s]."""
     values = signal.values[(signal.seconds >= start) & (signal.seconds <= end)]
     return values.size > 1 and bool(np.ptp(values) > 0)
 
@@ -229,11 +229,7 @@ def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
 
 
 def require_some_time(flight: Flight) -> None:
-    """Refuse a flight in which no machine can have moved.
-
-    Raises:
-        InputError: with its length, and where to look.
-    """
+    """Refuse a flight in which no vehicle can have moved."""
     if flight.duration >= _SHORTEST:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
@@ -242,11 +238,7 @@ def require_some_time(flight: Flight) -> None:
 
 
 def require_moving_outputs(flight: Flight) -> None:
-    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise.
-
-    Raises:
-        InputError: naming the outputs and the values they keep.
-    """
+    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise."""
     seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
     still = {n: y[0] for n, y in seen.items() if y.size and np.ptp(y) <= _STILL}
     if not still or len(still) < len(seen):

@@ -5,18 +5,26 @@ are times.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from heli_jax.errors import InputError
-from heli_jax.finding import Finding
+from heli_jax.finding import Finding, note
 from heli_jax.flights.as_logged import as_logged
-from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.flight import Flight, Source
+from heli_jax.flights.grid import (
+    LATEST,
+    SHORTEST_STEP,
+    Grid,
+    Uneven,
+    not_increasing,
+    rounding_of,
+    uniform_grid,
+)
 from heli_jax.flights.holds import Decision
-from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.marks import infinite
 from heli_jax.flights.onto_grid import (
     FEWEST,
@@ -34,7 +42,7 @@ from heli_jax.flights.onto_grid import (
 )
 from heli_jax.flights.request import Request, other_units
 from heli_jax.flights.resample import Timed, is_slower, new_clock
-from heli_jax.flights.table import sample_count, shown, wrong
+from heli_jax.flights.table import column, sample_count, shown, wrong
 
 _ALIKE = 1e-3
 """by which the rate of a grid and that of an output differ at most where both are one"""
@@ -50,23 +58,16 @@ class TopicClock:
     """The times of one topic inside the window.
 
     Attributes:
-        topic: its name.
+        name: of the topic.
         seconds: (N,) [s] from the log's beginning.
         rows: of the topic that they are.
-        begin: the first of them, in the log's own count [s].
-        rounding: how coarsely they are rounded [s].
-        places: where the i-th of them stands: `line 12, column 't'`; of an autopilot's log
-            the topic.
-        of_table: True for the rows of a table, whose stamps are rounded in text.
+        topic: itself.
     """
 
-    topic: str
+    name: str
     seconds: np.ndarray
     rows: slice
-    begin: float
-    rounding: float
-    places: Callable[[int], tuple[str, ...]]
-    of_table: bool = False
+    topic: Topic
 
     @property
     def usual(self) -> float:
@@ -75,7 +76,26 @@ class TopicClock:
 
     @property
     def words(self) -> str:
-        return f"{self.topic} at about {1 / self.usual:.4g} Hz"
+        return f"{self.name} at about {1 / self.usual:.4g} Hz"
+
+    @property
+    def rounding(self) -> float:
+        """How coarsely the stamps are rounded [s]."""
+        if self.topic.rows is None:
+            return rounding_of(self.seconds)
+        return rounding_of(self.topic.rows.stamps[self.rows]) * self.topic.rows.scale
+
+    def part(self, rows: slice) -> "TopicClock":
+        """Return the clock at some of its own rows."""
+        first = self.rows.start
+        of_topic = slice(first + rows.start, first + rows.stop)
+        return replace(self, seconds=self.seconds[rows], rows=of_topic)
+
+    def places(self, i: int) -> tuple[str, ...]:
+        """Where the i-th time stands: `line 12, column 't'`; of an autopilot's log the topic."""
+        if self.topic.rows is None:
+            return (f"topic {shown(self.name)}",)
+        return self.topic.rows.table.place(self.rows.start + i), column(self.topic.clock)
 
     def wrong(self, path: str, problem: str, i: int) -> InputError:
         """The error at the i-th of the times."""
@@ -98,11 +118,7 @@ class ClockedSignal:
 def rows_in_window(
     path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
 ) -> slice:
-    """The rows of a clock (N,) [s] inside the window.
-
-    Raises:
-        InputError: they are too few.
-    """
+    """The rows of a clock (N,) [s] inside the window."""
     first, last = 0, elapsed.size
     where = ""
     if window is not None and elapsed.size > 1:
@@ -119,97 +135,105 @@ def rows_in_window(
     return slice(first, last)
 
 
-def topic_clock(
-    log: ChannelLog, topic: str, times: np.ndarray, window: tuple[float, float] | None
-) -> TopicClock:
-    """The times of a topic inside the window, finite and increasing.
-
-    Args:
-        times: its stamps (N,) [s], in the log's own count.
-        window: first and last [s] from the log's beginning.
-
-    Raises:
-        InputError: they are no clock, or too few.
-    """
-    place, elapsed = f"topic {shown(topic)}", times - log.first_time
+def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | None) -> TopicClock:
+    """Return the times of a topic inside the window [s], finite and increasing."""
+    place = () if topic.rows else (f"topic {shown(topic.name)}",)
+    elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
-        raise wrong(log.path, "got times that are no finite numbers, expected a clock", place)
-    # Of stamps that go back those outside of the window do no harm.
+        raise wrong(log.path, "got times that are no finite numbers, expected a clock", *place)
+    # What lies outside of the window may be as wrong as it likes: stamps that go back there do no
+    # harm.
     if window is not None and np.any(np.diff(elapsed) <= 0):
         inside = np.flatnonzero((elapsed >= window[0]) & (elapsed <= window[1]))
         rows = slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
-        rows_in_window(log.path, elapsed[rows], None, place)
+        rows_in_window(log.path, elapsed[rows], None, *place)
     else:
-        rows = rows_in_window(log.path, elapsed, window, place)
-    seconds = elapsed[rows]
-    steps = np.diff(seconds)
-    back = np.flatnonzero(steps <= 0)
-    if back.size:
-        fault = "stands still" if steps[back[0]] == 0 else "runs backwards"
-        problem = f"the time {fault} after {seconds[back[0]]:.6g} s, expected increasing times"
-        raise wrong(log.path, f"{problem}; give a window without it", place)
-    require_steps(log.path, seconds, place)
-    begin = float(times[rows.start])
-    return TopicClock(topic, seconds, rows, begin, rounding_of(seconds), lambda i: (place,))
-
-
-def require_steps(path: str, seconds: np.ndarray, *place: str) -> None:
-    """Refuse steps that no clock resolves: the time's unit is wrong."""
+        rows = rows_in_window(log.path, elapsed, window, *place)
+    clock = TopicClock(topic.name, elapsed[rows], rows, topic)
+    back = not_increasing(clock.seconds)
+    if back is not None:
+        row, fault = back
+        problem = (
+            f"the time {fault} after {clock.seconds[row - 1]:.6g} s, expected increasing times"
+        )
+        raise wrong(log.path, f"{problem}; give a window without it", *place)
     # The median and not the mean, which one long gap would lift above any limit.
-    if np.median(np.diff(seconds)) < SHORTEST_STEP:
-        problem = "the usual step is shorter than 1 ns, expected a clock"
-        raise wrong(path, f"{problem}; look at the time's unit", *place)
+    if clock.usual < SHORTEST_STEP:
+        problem = "the usual step is shorter than 1 ns, expected a clock; look at the time's unit"
+        raise wrong(log.path, problem, *clock.places(0))
+    return clock
 
 
-def in_si(
-    signal: Signal, kind: str, numbers: np.ndarray, refuse: Callable[[int, str], InputError]
-) -> np.ndarray:
-    """The numbers (N,) of a log in SI.
+def signals_of(
+    log: ChannelLog, request: Request
+) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
+    """Return the signals in SI inside the window, each on the clock of its topic, and notes."""
+    clocks: dict[str, TopicClock] = {}
+    numbers: dict[Key, np.ndarray] = {}
+    topics: dict[str, list[Key]] = {}
+    for key, signal in request.signals.items():
+        topic = log.topic_of(signal.name)
+        numbers[key] = log.channel(signal.name).values
+        if topic.name not in clocks:
+            clocks[topic.name] = topic_clock(log, topic, request.options.window)
+        topics.setdefault(topic.name, []).append(key)
+    notes: tuple[Finding, ...] = ()
+    for name, keys in topics.items():
+        inputs = {request.signals[k].name: numbers[k] for k in keys if k[1] == "input"}
+        clocks[name], said = _of_known_inputs(clocks[name], inputs)
+        notes += said
+    of_key = {key: clocks[name] for name, keys in topics.items() for key in keys}
+    signals = {key: _in_si(log, request, key, numbers[key], of_key[key]) for key in request.signals}
+    return signals, notes
 
-    Args:
-        kind: `input` or `output`, which may be missing here and there.
-        refuse: makes the error of a row of them, of what is to be said behind it.
 
-    Raises:
-        InputError: one is not finite.
-    """
+def _in_si(
+    log: ChannelLog, request: Request, key: Key, numbers: np.ndarray, clock: TopicClock
+) -> ClockedSignal:
+    signal, kind, numbers = request.signals[key], key[1], numbers[clock.rows]
     with np.errstate(over="ignore"):  # what overflows is refused below
         values = signal.to_si(numbers)
+    # An output may be missing here and there.
     bad = infinite(values, numbers) if kind == "output" else ~np.isfinite(values)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise refuse(row, _AN_INPUT if kind == "input" and np.isnan(numbers[row]) else "")
-    return values
+    if not bad.any():
+        return ClockedSignal(clock, values)
+    i = int(np.argmax(bad))
+    more = _AN_INPUT if kind == "input" and np.isnan(numbers[i]) else ""
+    if clock.topic.rows is None:
+        problem = f"got {numbers[i]} at {clock.seconds[i]:.6g} s, expected a finite number{more}"
+        raise wrong(log.path, problem, f"channel {shown(signal.name)}")
+    table, row = clock.topic.rows.table, clock.rows.start + i
+    problem = f"got {table.cell_text(signal.name, row)}, expected a finite number{more}"
+    raise wrong(log.path, problem, table.place(row), column(signal.name))
 
 
-def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
-    """The signals in SI inside the window, each on the clock of its topic.
+def _of_known_inputs(
+    clock: TopicClock, inputs: Mapping[str, np.ndarray]
+) -> tuple[TopicClock, tuple[Finding, ...]]:
+    """Leave out the rows before an input's first value or behind its last, with a note.
 
-    Raises:
-        InputError: a channel is missing or holds no numbers, or a clock is none.
+    An input is somewhere all the time, and where it was before its first value nobody knows: a
+    table whose cells are filled with the last value begins so, with the topic that came first.
     """
-    clocks: dict[str, TopicClock] = {}
-    signals = {}
-    for (key, kind), signal in request.signals.items():
-        topic = log.topic_of(signal.name).name
-        times, values = log.channel(signal.name)
-        if topic not in clocks:
-            clocks[topic] = topic_clock(log, topic, times, request.options.window)
-        clock = clocks[topic]
-        numbers = values[clock.rows]
-
-        def refuse(row: int, more: str) -> InputError:
-            problem = f"got {numbers[row]} at {clock.seconds[row]:.6g} s"  # noqa: B023
-            at = f"channel {shown(signal.name)}"  # noqa: B023
-            return wrong(log.path, f"{problem}, expected a finite number{more}", at)
-
-        values = in_si(signal, kind, numbers, refuse)
-        signals[key, kind] = ClockedSignal(clock, values)
-    return signals
+    count = clock.seconds.size
+    first, stop, cut = 0, count, []
+    for name, numbers in inputs.items():
+        known = np.flatnonzero(~np.isnan(numbers[clock.rows]))
+        # Of a column without any value the first row is told.
+        if known.size and known[-1] - known[0] + 1 < count:
+            first, stop = max(first, int(known[0])), min(stop, int(known[-1]) + 1)
+            cut.append(name)
+    if not cut or stop - first < FEWEST:
+        return clock, ()
+    where = f"from {clock.seconds[first]:.6g} s to {clock.seconds[stop - 1]:.6g} s"
+    left = count - (stop - first)
+    words = f"{', '.join(map(shown, cut))}: no value before or behind, {left} rows are left out"
+    said = note("windows.inputs-known", f"the flight is {where}: {words}", *cut, value=left)
+    return clock.part(slice(first, stop)), (said,)
 
 
 def channel_window_note(log: ChannelLog, request: Request) -> tuple[Finding, ...]:
-    """A note where the window reaches beyond the topics that are asked for."""
+    """Return a note where the window reaches beyond the topics that are asked for."""
     times = [log.topic_of(signal.name).times for signal in request.signals.values()]
     # The one that ends first is where the flight does.
     last = min((t for t in times if t.size > 1), key=lambda t: t[-1], default=None)
@@ -227,16 +251,9 @@ def flight_of_signals(
     Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
     their hold, outputs on straight lines where they are as fast as it; what is slower is missing
     between its samples.
-
-    Args:
-        signals: by key, in SI inside the window.
-        source: where they came from, with notes on it so far.
-
-    Raises:
-        InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
     clocks, rate = clocks_of(signals.values()), request.options.rate
-    is_one = len(clocks) == 1 and (rate is None or clocks[0].of_table)
+    is_one = len(clocks) == 1 and (rate is None or clocks[0].topic.rows is not None)
     if is_one:
         # Before the samples are looked at: a wrong unit makes anything of their steps.
         grid = uniform_grid(clocks[0].seconds, clocks[0].rounding)
@@ -250,24 +267,25 @@ def flight_of_signals(
     timed = {key: Timed(signals[key].clock.seconds, x) for key, x in values.items()}
     said = sample_notes(request, timed)
     if is_one:
-        start, t0, end = float(clocks[0].seconds[0]), clocks[0].begin, clocks[0].seconds[-1]
+        start, end = float(clocks[0].seconds[0]), float(clocks[0].seconds[-1])
         dt, (samples, holds, notes) = _of_one_clock(
             source.path, request, clocks[0], grid, timed, holds
         )
     else:
         signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
         start, dt, (samples, holds, notes) = _of_several(source.path, request, signals, holds)
-        t0 = source.first_time + start
         end = start + dt * (next(iter(samples.values())).size - 1)
     notes = (*source.notes, *other_units(request), *logged.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates)
-    return flight_of(request, samples, dt, t0, holds, logged.source(source, start, end))
+    return flight_of(
+        request, samples, dt, source.first_time + start, holds, logged.source(source, start, end)
+    )
 
 
 def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
     """One for each topic, since signals of the same topic share their stamps."""
-    return list({s.clock.topic: s.clock for s in signals}.values())
+    return list({s.clock.name: s.clock for s in signals}.values())
 
 
 def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
@@ -326,7 +344,7 @@ def _of_several(
         problem = f"the signals have {len(clocks)} clocks ({words}), expected a rate to which"
         raise wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
     clocks = on_all_the_time(signals, rate)
-    notes = [n.of(c.topic) for c in clocks for n in new_clock(c.seconds, rate).notes]
+    notes = [n.of(c.name) for c in clocks for n in new_clock(c.seconds, rate).notes]
     for clock in clocks:
         _require_no_gap(path, clock)
     outputs = (s.clock for (_, kind), s in signals.items() if kind == "output")
@@ -379,9 +397,6 @@ def common_times(
         rate: of the times [Hz].
         on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid
             stay as they are; a mean of two neighbours has less noise, and that is not white.
-
-    Raises:
-        InputError: there are too few, or absurdly many.
     """
     # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
     # knows.

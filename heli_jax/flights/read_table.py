@@ -1,15 +1,21 @@
-"""From a table of rows, one column of which is the time, to signals on its clock."""
+"""Tables of rows as logs of topics, once their clock is known.
 
-import contextlib
+A table is a log of one topic. Rows that hold the values of one topic each and leave other cells
+empty (an outer join, as PlotJuggler, MAVExplorer and pandas write it) are several: the columns that
+are filled in the same rows are a topic, whose clock is that of these rows. A join that was filled
+forward is told by its repeated values (`repeats.carried_on`).
+"""
+
+import itertools
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.errors import InputError
-from heli_jax.finding import Finding, note, sentences
+from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.clock import (
     ROWS,
     clock_scale,
@@ -20,183 +26,79 @@ from heli_jax.flights.clock import (
     with_runs,
 )
 from heli_jax.flights.derived import DerivedTable
+from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
-from heli_jax.flights.grid import LATEST, rounding_of, without_overflow
-from heli_jax.flights.joined import joined_log
-from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.onto_grid import FEWEST, Key, window_note
-from heli_jax.flights.read_channels import (
-    ClockedSignal,
-    TopicClock,
-    in_si,
-    require_steps,
-    rows_in_window,
-)
+from heli_jax.flights.grid import LATEST, without_overflow
+from heli_jax.flights.log import ChannelLog, TableRows, Topic, as_floats
 from heli_jax.flights.request import Request
-from heli_jax.flights.table import Table, column, shown, wrong
+from heli_jax.flights.resample import SLOWER, usual_step
+from heli_jax.flights.table import Table, column, listed, shown, wrong
 from heli_jax.flights.time_units import require_likely
 
-
-@dataclass(frozen=True, eq=False)
-class LoadedTable:
-    """A table with the columns (N,) that are asked for, and its clock: `stamps` (N,) in the log's
-    unit, which is `scale` seconds."""
-
-    table: Table
-    numbers: Mapping[str, np.ndarray]
-    stamps: np.ndarray
-    scale: float
-    said: tuple[Finding, ...] = ()
-    """where the file or a name says another unit of the clock"""
-    cautions: tuple[Finding, ...] = ()
-    """what speaks against the times"""
-
-    @property
-    def first_time(self) -> float:
-        """Of the first stamp [s], from which windows count."""
-        return float(self.stamps[0] * self.scale)
-
-    @property
-    def elapsed(self) -> np.ndarray:
-        """(N,) [s], from 0; subtracted first, so that a calendar's digits do not cost any."""
-        return (self.stamps - self.stamps[0]) * self.scale
-
-    @contextlib.contextmanager
-    def hinting(self) -> Iterator[None]:
-        """What is said of the unit behind errors that a wrong one makes."""
-        try:
-            yield
-        except InputError as e:
-            if not self.said:
-                raise
-            raise InputError("; ".join([str(e), *sentences(self.said)])) from e
+_SHARED = 0.1
+"""of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
+_FEWEST = 8
+"""rows of a topic"""
+_NAMED = 2
+"""columns by which a topic is called"""
 
 
-def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
-    """The columns that are asked for, and the clock; as topics where rows hold one topic each.
-
-    Raises:
-        InputError: a column is missing or holds no numbers, or the time is none.
-    """
-    if request.time is None:
+def load_table(table: Table, request: Request) -> ChannelLog:
+    """Return the columns that are asked for, with their clock."""
+    time, runs = request.time, request.options.runs
+    if time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
-    file = _below(table)
+    derived = table if isinstance(table, DerivedTable) else None
+    file = derived.table if derived else table
     of_stack = isinstance(file, ArrayTable) and SEGMENT in file.names
-    if of_stack and request.time.name == ROWS and not request.options.runs:
+    if of_stack and time.name == ROWS and not runs:
         problem = f"its rows are of several runs, which {SEGMENT!r} numbers"
         remedy = f"expected time: {{rate: HZ, runs: {SEGMENT}}}, which makes a flight of each"
         raise wrong(table.path, f"{problem}; {remedy}")
-    if request.time.name == ROWS:
-        table = _over(table, counted(file))
+
+    def over(view: Table) -> Table:
+        return DerivedTable(view, derived.swashplate) if derived else view
+
+    if time.name == ROWS:
+        file = counted(file)
+        table = over(file)
     numbers = table.numbers(request.columns)
     if request.options.split:
-        table, numbers = _with_runs(table, request, numbers)
-    joined = joined_log(table, request, numbers)
-    if joined is not None:
-        return joined
-    return _with_clock(table, numbers, request.time)
+        parted = with_runs(file, time.name, numbers, clock_scale(table, time), runs)
+        if parted is not file:
+            table = over(parted)
+            numbers = table.numbers(request.columns)
+    stamps = numbers[time.name]
+    signals = {s.name: numbers[s.name] for s in request.signals.values()}
+    inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
+    # Stamps that are no clock are refused below, with their line.
+    is_clock = stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0)
+    if is_clock and is_joined(stamps * clock_scale(table, time), signals, inputs):
+        return without_joins(_with_clock(table, numbers, time), joined=True)
+    said, cautions = _checked(table, time, stamps)
+    log = _with_clock(table, numbers, time)
+    return replace(log, notes=(*log.notes, *said), cautions=cautions)
 
 
-def _with_runs(
-    table: Table, request: Request, numbers: dict[str, np.ndarray]
-) -> tuple[Table, dict[str, np.ndarray]]:
-    """The table with its runs one after another, and its columns (N,)."""
-    assert request.time is not None  # or `load_table` would have refused it
-    clock, runs = request.time, request.options.runs
-    parted = with_runs(_below(table), clock.name, numbers, clock_scale(table, clock), runs)
-    if parted is _below(table):
-        return table, numbers
-    whole = _over(table, parted)
-    return whole, whole.numbers(request.columns)
+def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -> ChannelLog:
+    """Return the columns (N,) as one topic, whose times count from the first row."""
+    scale, stamps = clock_scale(table, time), without_overflow(numbers[time.name])
+    columns = {n: x for n, x in numbers.items() if n != time.name}
+    stated = {n: table.units[n] for n in columns if table.units.get(n)}
+    rows = TableRows(table, stamps, scale)
+    # Subtracted first, so that a calendar's digits do not cost any.
+    times = (stamps - stamps[0]) * scale
+    topic = Topic(Path(table.path).name, times, columns, stated, time.name, rows)
+    origin = float(stamps[0] * scale)
+    return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=origin)
 
 
-def _below(table: Table) -> Table:
-    """The file's own columns."""
-    return table.table if isinstance(table, DerivedTable) else table
-
-
-def _over(table: Table, other: Table) -> Table:
-    """Another view of the file's columns with those derived that a table has."""
-    return DerivedTable(other, table.swashplate) if isinstance(table, DerivedTable) else other
-
-
-def clocked_table(
-    loaded: LoadedTable, request: Request
-) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    """The signals inside the window as those of one topic, in seconds from the first stamp, and
-    notes.
-
-    Raises:
-        InputError: the window lies outside the table, or a cell is no finite number.
-    """
-    table, elapsed = loaded.table, loaded.elapsed
-    assert request.time is not None  # or `load_table` would have refused it
-    # The window before anything else is asked of the samples: what lies outside of it may be as
-    # wrong as it likes.
-    rows = rows_in_window(table.path, elapsed, request.options.window)
-    rows, notes = _of_known_inputs(request, loaded.numbers, elapsed, rows)
-
-    def places(i: int) -> tuple[str, ...]:
-        assert request.time is not None
-        return table.place(rows.start + i), column(request.time.name)
-
-    seconds, stamps = elapsed[rows], loaded.stamps[rows]
-    # Before the rounding is looked for, which steps of a wrong unit would make meaningless.
-    require_steps(table.path, seconds, *places(0))
-    begin, rounding = float(stamps[0] * loaded.scale), rounding_of(stamps) * loaded.scale
-    topic = TopicClock(Path(table.path).name, seconds, rows, begin, rounding, places, of_table=True)
-    signals = {}
-    for (key, kind), signal in request.signals.items():
-
-        def refuse(i: int, more: str) -> InputError:
-            row, name = rows.start + i, signal.name  # noqa: B023
-            problem = f"got {table.cell_text(name, row)}, expected a finite number"
-            return wrong(table.path, problem + more, table.place(row), column(name))
-
-        values = in_si(signal, kind, loaded.numbers[signal.name][rows], refuse)
-        signals[key, kind] = ClockedSignal(topic, values)
-    return signals, notes
-
-
-def table_window_note(loaded: LoadedTable, request: Request) -> tuple[Finding, ...]:
-    """A note where the window reaches beyond the table."""
-    elapsed = loaded.elapsed
-    step = float(np.median(np.diff(elapsed))) if elapsed.size > 1 else 0.0
-    return window_note(request.options.window, float(elapsed[-1]), step)
-
-
-def _of_known_inputs(
-    request: Request, numbers: Mapping[str, np.ndarray], seconds: np.ndarray, rows: slice
-) -> tuple[slice, tuple[Finding, ...]]:
-    """The rows without those before an input's first value or behind its last, and a note of it.
-
-    An input is somewhere all the time, and where it was before its first value nobody knows: a
-    table whose cells are filled with the last value begins so, with the topic that came first.
-    """
-    first, stop, cut = rows.start, rows.stop, []
-    inputs = (s.name for (_, kind), s in request.signals.items() if kind == "input")
-    for name in dict.fromkeys(inputs):
-        known = np.flatnonzero(~np.isnan(numbers[name][rows]))
-        # Of a column without any value the first row is told.
-        if not known.size or known[-1] - known[0] + 1 == rows.stop - rows.start:
-            continue
-        first = max(first, rows.start + int(known[0]))
-        stop = min(stop, rows.start + int(known[-1]) + 1)
-        cut.append(name)
-    if not cut or stop - first < FEWEST:
-        return rows, ()
-    where = f"from {seconds[first]:.6g} s to {seconds[stop - 1]:.6g} s"
-    count = (rows.stop - rows.start) - (stop - first)
-    words = f"{', '.join(map(shown, cut))}: no value before or behind, {count} rows are left out"
-    left_out = note("windows.inputs-known", f"the flight is {where}: {words}", *cut, value=count)
-    return slice(first, stop), (left_out,)
-
-
-def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -> LoadedTable:
-    """The columns with their clock, whose stamps are finite and increase."""
-    place, stamps = column(time.name), numbers[time.name]
+def _checked(
+    table: Table, time: Signal, stamps: np.ndarray
+) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+    """Refuse stamps (N,) that are no clock; return notes on their unit, and cautions."""
     stated, scale = table.time_unit(time.name), clock_scale(table, time)
     # A type is unmistakable; only words may be meant for something else.
     is_sure = time.scale != 1.0 or (stated and not table.units.get(time.name))
@@ -206,11 +108,166 @@ def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -
     if bad.size:
         row = int(bad[0])
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
-        raise wrong(table.path, problem, table.place(row), place)
+        raise wrong(table.path, problem, table.place(row), column(time.name))
     stamps = without_overflow(stamps)
     require_increasing(table, time.name, stamps)
     step = float(np.median(np.diff(stamps))) * scale if stamps.size > 1 else math.inf
     cautions = contradicted_rate(table, time.name, 1.0 / step)
     if not stated and time.scale == 1.0:
         cautions += require_likely(table.path, time.name, time.unit, stamps, time.assumed)
-    return LoadedTable(table, numbers, stamps, scale, said, cautions)
+    return said, cautions
+
+
+# Without a request: the clock is guessed, and all columns are taken.
+
+
+def in_runs(table: Table, clock: TimeInfo) -> Table:
+    """Return a table with its runs one after another, where its clock begins anew."""
+    if clock.runs < 2:
+        return table
+    return with_runs(
+        table, clock.column, table.numbers([clock.column]), clock_scale(table, clock.signal)
+    )
+
+
+def rate_note(clock: TimeInfo) -> Finding:
+    """Return a note on a clock whose rate the file states."""
+    what = "rows" if clock.column == ROWS else shown(clock.column)
+    words = f"{what} are taken as samples at {clock.counted:g} Hz, as the file says: {clock.said}"
+    return note("clock.rate-of-file", words, value=clock.counted)
+
+
+def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | None) -> ChannelLog:
+    """Return all columns of numbers as one topic; the notes say what was assumed and left out.
+
+    Args:
+        time: the clock, where it is named; else guessed.
+        rate: samples a second [Hz] of a table without times.
+    """
+    info = describe_table(table, time, unit, rate)
+    clock, notes = info.time, []
+    texts = [c for c in info.columns if c.kind == "text"]
+    if clock is None or clock.problem:
+        why = clock.problem if clock else "no column looks like a clock"
+        remedy = "expected --time NAME, a column of increasing times, or "
+        remedy += "a file without the rows that go back" if clock else "--time-rate HZ"
+        if not clock and texts:
+            why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
+        raise wrong(table.path, f"{why}, {remedy}")
+    if clock.said:
+        notes.append(rate_note(clock))
+    elif clock.guessed:
+        words = f"column {shown(clock.column)} is taken for a clock in {clock.unit}"
+        notes.append(note("clock.guessed", words, clock.column))
+    rows = next((c.count for c in info.columns if c.name == clock.column), info.n_rows)
+    # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
+    whole = not isinstance(table, ArrayTable)
+    numeric = [c for c in info.columns if c.kind == "number"]
+    names = [c.name for c in numeric if whole or c.count == rows]
+    if others := [c.name for c in numeric if c.name not in names]:
+        words = f"{listed(map(shown, others))}, not of {rows} samples as the clock"
+        notes.append(note(LEFT_OUT, f"left out: {words}", *others))
+    if texts:
+        words = listed(f"{shown(c.name)}{f' ({c.strays})' if c.strays else ''}" for c in texts)
+        notes.append(note(LEFT_OUT, f"left out: text in {words}", *(c.name for c in texts)))
+    # The columns are keyed by name from here on, and one of the two would be lost without a word.
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
+    table = counted(table) if clock.column == ROWS else in_runs(table, clock)
+    numbers = table.numbers(list(dict.fromkeys([*names, clock.column])))
+    log = _with_clock(table, numbers, clock.signal)
+    return replace(log, notes=(*notes, *log.notes))
+
+
+# Rows that hold the values of one topic each.
+
+
+class RowGroup(NamedTuple):
+    """Columns that are filled in the same rows (N,)."""
+
+    names: tuple[str, ...]
+    rows: np.ndarray
+
+
+def row_groups(columns: Mapping[str, np.ndarray]) -> list[RowGroup]:
+    """Group columns (N,), NaN where a cell is empty, by the rows in which they are filled."""
+    groups: dict[bytes, RowGroup] = {}
+    for name, values in columns.items():
+        rows = ~np.isnan(values)
+        key = np.packbits(rows).tobytes()
+        names = groups[key].names if key in groups else ()
+        groups[key] = RowGroup((*names, name), rows)
+    return list(groups.values())
+
+
+def takes_turns(groups: Sequence[RowGroup]) -> bool:
+    """True if two of the groups hardly share a row."""
+    counts = [int(np.count_nonzero(g.rows)) for g in groups]
+    some = [(g.rows, n) for g, n in zip(groups, counts, strict=True) if n >= _FEWEST]
+    return any(
+        np.count_nonzero(a & b) <= _SHARED * min(m, n)
+        for (a, m), (b, n) in itertools.combinations(some, 2)
+    )
+
+
+def is_joined(
+    seconds: np.ndarray, columns: Mapping[str, np.ndarray], needed: Collection[str]
+) -> bool:
+    """True if the rows of a table, at `seconds` (N,), are those of several topics.
+
+    Args:
+        columns: that are asked for (N,), NaN where a cell is empty.
+        needed: those of them that no sample may be missing of, such as inputs.
+    """
+    # Before a column's first value, and behind its last, there is nothing to fill forward with.
+    seen = [rows for x in columns.values() if (rows := np.flatnonzero(~np.isnan(x))).size]
+    begin = max((int(rows[0]) for rows in seen), default=0)
+    end = min((int(rows[-1]) + 1 for rows in seen), default=0)
+    inside = slice(begin, end) if end - begin >= _FEWEST else slice(None)
+    seconds, columns = seconds[inside], {n: x[inside] for n, x in columns.items()}
+    lacking = [name for name in needed if np.isnan(columns[name]).any()]
+    if not lacking:
+        return False
+    groups = row_groups(columns)
+    some = np.any([g.rows for g in groups], axis=0)
+    # A row that holds nothing of what is asked for is one of another topic.
+    if all(np.array_equal(~np.isnan(columns[name]), some) for name in lacking):
+        return True
+    step = usual_step(seconds)
+    slower = any(usual_step(seconds[~np.isnan(columns[n])]) > SLOWER * step for n in lacking)
+    return slower or takes_turns(groups)
+
+
+def without_joins(log: ChannelLog, joined: bool = False) -> ChannelLog:
+    """Return the log with topics of their own where the rows of a table hold one topic each.
+
+    Args:
+        joined: True if they are known to do so.
+    """
+    topics: list[Topic] = []
+    notes = []
+    for topic in log.topics:
+        columns = {name: as_floats(values) for name, values in topic.columns.items()}
+        groups = row_groups(columns)
+        if not joined and not takes_turns(groups):
+            topics.append(topic)
+            continue
+        parts = []
+        for group in groups:
+            own = {name: columns[name][group.rows] for name in group.names}
+            units = {name: topic.units[name] for name in own if name in topic.units}
+            few = ", ".join(map(shown, group.names[:_NAMED]))
+            more = f" and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
+            called = f"rows of {few}{more}"
+            parts.append(Topic(called, topic.times[group.rows], own, units, topic.clock))
+        known = (t for t in parts if t.times.size > 1)
+        rates = listed(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known)
+        words = (
+            f"its rows hold one topic each and leave other cells empty: each column is taken at "
+            f"the rows that hold it ({rates})"
+        )
+        notes.append(note("channels.joined", words, value=len(parts)))
+        topics += parts
+    start = log.first_time if notes else log.start
+    return replace(log, topics=tuple(topics), notes=(*log.notes, *notes), start=start)

@@ -39,11 +39,12 @@ _RECUR = 0.5
 _LATE = 0.25
 """of the time between two measurements, by which one of a regular clock is off"""
 _MOVES = 0.5
-"""part of its samples at which another output moves, which shows that the machine did"""
+"""part of its samples at which another output moves, which shows that the vehicle did"""
 
 
 def usual_run(values: np.ndarray) -> int | None:
-    """How many samples each value of an output (N,) is repeated for; None unless unmistakable."""
+    """Return the number of samples for which each value of an output (N,) is repeated; None
+    unless unmistakable."""
     lengths, jumps = _runs(values)
     if lengths.size < _RUNS:
         return None
@@ -62,15 +63,11 @@ def usual_run(values: np.ndarray) -> int | None:
 
 
 def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
-    """Whether rows between the measurements of an output carry the last one on, beyond doubt.
+    """True if rows between the measurements of an output surely repeat the last one.
 
     So a forward-filled join does it, whose rows lie anywhere between: its runs are of any length.
     What tells is the resolution. A signal that moves by many of its steps before a value and after
     it does not measure the same value twice in a row; and new values come at a clock of their own.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), NaN where one is missing.
     """
     lengths, jumps = _runs(values)
     if lengths.size < _SURE:
@@ -95,7 +92,7 @@ def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
 
 
 def _is_exact(values: np.ndarray, usual: int) -> bool:
-    """Whether hardly any run has another length than the usual one, or a multiple of it."""
+    """True if hardly any run has another length than the usual one, or a multiple of it."""
     lengths, _ = _runs(values)
     return lengths.size >= _SURE and bool(np.mean(lengths % usual == 0) >= _EXACT)
 
@@ -155,7 +152,7 @@ def repeats_removed(
         elif usual is None:
             continue
         elif not (moving or sure):
-            # Nothing else shows that the machine moved while this signal stood still.
+            # Nothing else shows that the vehicle moved while this signal stood still.
             words = (
                 f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
                 "`repeats: missing`"

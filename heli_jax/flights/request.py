@@ -77,11 +77,7 @@ class ReadOptions:
 def require_rate_and_window(
     path: str, rate: float | None, window: tuple[float, float] | None
 ) -> None:
-    """Refuse a rate or a window of which a log has no part.
-
-    Raises:
-        InputError: with what was expected.
-    """
+    """Refuse a rate or a window of which a log has no part."""
     # NaN passes no comparison, so each bound is written as what has to hold.
     if rate is not None and not (rate > 0 and math.isfinite(rate)):
         raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
@@ -93,11 +89,7 @@ def require_rate_and_window(
 
 
 class Request:
-    """The signals, the rate and the window that a user wants from a log.
-
-    Raises:
-        InputError: a column has two uses, a unit does not fit, a number makes no sense.
-    """
+    """The signals, the rate and the window that a user wants from a log."""
 
     def __init__(
         self,
@@ -199,51 +191,35 @@ def _problem(use: str, signal: Signal) -> str:
 # configured one.
 
 
-def with_file_units(log: ChannelLog | Table, request: Request) -> Request:
-    """The request with the units that the file has where none was asked for, and with those that
+def with_file_units(log: ChannelLog, request: Request) -> Request:
+    """Return the request with the file's units where none was asked for, and with those that
     contradict what was.
-
-    Raises:
-        InputError: the file's unit is of another kind than what is asked for.
     """
     made = copy.copy(request)
     made.signals = {
-        key: (_of_file(log, signal, key[0]) if signal.assumed else _compared(log, signal))
-        for key, signal in request.signals.items()
+        key: _with_file_unit(log, signal, key[0]) for key, signal in request.signals.items()
     }
     return made
 
 
-def _of_file(log: ChannelLog | Table, signal: Signal, name: str) -> Signal:
+def _with_file_unit(log: ChannelLog, signal: Signal, name: str) -> Signal:
+    stated = log.topic_of(signal.name).units.get(signal.name, "").strip()
     # Who states a scale has made of the numbers what they are.
-    if signal.scale != 1.0 or signal.offset:
+    if signal.scale != 1.0 or (signal.assumed and signal.offset) or stated in ("", "-", "1"):
         return signal
-    stated = unit_in_file(log, signal.name)
-    if stated in ("", "-", "1") or not units.is_unit(stated):
-        return signal
+    known = units.is_unit(stated)
     try:
-        same = math.isclose(units.factor(stated, signal.si), 1.0)
-    except ValueError as e:
-        problem = f"{name} has no unit stated, and the file's is another: {e}"
-        remedy = "state unit, with scale and offset where numbers have to be converted"
-        raise wrong(log.path, f"{problem}; {remedy}", column(signal.name)) from e
-    return signal if same else dataclasses.replace(signal, unit=stated)
-
-
-def _compared(log: ChannelLog | Table, signal: Signal) -> Signal:
-    """With the file's unit where it is another than the one that was asked for."""
-    # Who states a scale has made of the numbers what they are.
-    if signal.scale != 1.0 or signal.constant is not None:
-        return signal
-    stated = unit_in_file(log, signal.name)
-    if stated in ("", "-", "1"):
-        return signal
-    try:
-        same = math.isclose(units.factor(stated, signal.unit), 1.0)
+        same = math.isclose(units.factor(stated, signal.si if signal.assumed else signal.unit), 1.0)
     # The file's own words need be no unit that is known here.
-    except ValueError:
-        same = not units.is_unit(stated)
-    return signal if same else dataclasses.replace(signal, contradicted=stated)
+    except ValueError as e:
+        same = not known
+        if signal.assumed and known:
+            problem = f"{name} has no unit stated, and the file's is another: {e}"
+            remedy = "state unit, with scale and offset where numbers have to be converted"
+            raise wrong(log.path, f"{problem}; {remedy}", column(signal.name)) from e
+    if same:
+        return signal
+    return dataclasses.replace(signal, **{"unit" if signal.assumed else "contradicted": stated})
 
 
 def other_units(request: Request) -> list[Finding]:
@@ -258,12 +234,6 @@ def other_units(request: Request) -> list[Finding]:
         for (name, _), signal in request.signals.items()
         if signal.contradicted
     ]
-
-
-def unit_in_file(log: ChannelLog | Table, name: str) -> str:
-    """What a file says of a channel's unit, empty where it says nothing."""
-    held = log.topic_of(name).units if isinstance(log, ChannelLog) else log.units
-    return held.get(name, "").strip()
 
 
 def taken_note(name: str, signal: Signal) -> Finding | None:

@@ -1,4 +1,4 @@
-"""What a signal was as it was logged: ends at which it was cut off, its steps, where it stuck.
+"""Facts of a signal as it was logged: clipped ends, steps, stuck parts.
 
 Taken before any resampling: a low-pass filter rounds off a flat top and fills the steps of a coarse
 log, and what then looks smooth is none the better for it.
@@ -70,7 +70,7 @@ class Stuck:
 
 @dataclass(frozen=True, eq=False)
 class SignalFacts:
-    """Of one signal as it was logged, in SI; times count from the flight's first sample.
+    """Facts of one signal as it was logged, in SI; times count from the flight's first sample.
 
     Attributes:
         size: samples that there are.
@@ -103,12 +103,12 @@ class SignalFacts:
 
     @property
     def dropped(self) -> float:
-        """Of the samples that are dropouts, the part."""
+        """Share of the samples that are dropouts."""
         return 0.0 if self.dropouts is None else self.dropouts.times.size / max(self.size, 1)
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Of the samples at the lower and at the upper rail."""
+        """Shares of the samples at the lower and at the upper rail."""
         n = max(self.size, 1)
         return self.low.times.size / n, self.high.times.size / n
 
@@ -124,8 +124,8 @@ class SignalFacts:
         return self.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
 
     def within(self, begin: float, end: float) -> "SignalFacts":
-        """Of the part from `begin` to `end` [s], whose times count from `begin`; levels and steps
-        stay those of the whole."""
+        """Return the facts of the part from `begin` to `end` [s], with times from `begin`;
+        levels and steps stay those of the whole."""
 
         def cut(rail: Rail) -> Rail:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
@@ -152,12 +152,7 @@ class SignalFacts:
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
-    """The facts of one signal by itself.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        x: samples (N,), NaN where one is missing.
-    """
+    """The facts of one signal by itself."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     if not y.size:
@@ -180,17 +175,13 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 def facts_of_all[K: Hashable](
     signals: Mapping[K, tuple[np.ndarray, np.ndarray]], outputs: frozenset[K]
 ) -> dict[K, SignalFacts]:
-    """The facts of signals that were logged together, stuck outputs among them.
-
-    Args:
-        signals: stamps (N,) [s] and samples (N,) by key.
-    """
+    """The facts of signals that were logged together, stuck outputs among them."""
     # Differences of huge values overflow, and no more is known of such signals then.
     with np.errstate(over="ignore", invalid="ignore"):
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
         for key in outputs:
             others = [one for other, one in signals.items() if other != key]
-            # A machine that stands on the ground holds everything still, and no sensor is stuck.
+            # A vehicle that stands on the ground holds everything still, and no sensor is stuck.
             found = [
                 one
                 for one in _stretches(*signals[key], facts[key])
@@ -319,7 +310,8 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
 
 
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which samples (N,) are at the lower and at the upper rail; none where there is no rail."""
+    """Return masks of the samples (N,) at the lower and at the upper rail; none if there is no
+    rail."""
     finite = x[np.isfinite(x)]
     return _at_rails(x, finite, *np.unique(finite, return_counts=True))
 
@@ -334,11 +326,7 @@ def _at_rails(
 
 
 def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The samples at the largest value, where that is a rail.
-
-    Args:
-        x: samples (N,), NaN where one is missing.
-    """
+    """The samples at the largest value, where that is a rail."""
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
@@ -349,7 +337,7 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
 
 
 def _comes_and_goes(at: np.ndarray) -> bool:
-    """Whether samples at an end of a range are visits to it, and not where a signal rests."""
+    """True if samples at an end of a range are visits, and not a signal at rest."""
     if at[0] and at[-1]:
         return False
     edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))

@@ -1,4 +1,4 @@
-"""What a flight is read from: a log, and others of the same flight with clocks of their own."""
+"""Sources of a flight: a log, and others of the same flight with clocks of their own."""
 
 import copy
 import dataclasses
@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from heli_jax.finding import Finding, note
+from heli_jax.errors import InputError
+from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import DerivedTable, with_derived
@@ -23,12 +24,7 @@ from heli_jax.flights.read_channels import (
     rows_in_window,
     signals_of,
 )
-from heli_jax.flights.read_table import (
-    LoadedTable,
-    clocked_table,
-    load_table,
-    table_window_note,
-)
+from heli_jax.flights.read_table import load_table
 from heli_jax.flights.request import Also, ReadOptions, Request, with_file_units
 from heli_jax.flights.table import Table, shown, wrong
 
@@ -45,9 +41,9 @@ class Beside(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """What is read for one flight."""
+    """Logs that are read for one flight."""
 
-    log: ChannelLog | LoadedTable
+    log: ChannelLog
     keys: frozenset[Key]
     """the signals that the first log holds"""
     beside: tuple[Beside, ...]
@@ -56,12 +52,9 @@ class Opened(NamedTuple):
 def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Opened, Request]:
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
-
-    Raises:
-        InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
-    request = with_file_units(first if isinstance(first, ChannelLog) else first.table, request)
+    request = with_file_units(first, request)
     keys, everything, beside = frozenset(request.signals), copy.copy(request), []
     for also in request.options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
@@ -79,52 +72,42 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
 def clocked(logs: Opened, request: Request) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
     """The signals inside the window, each on its clock, in seconds from the first log's
     beginning, and notes."""
-    signals, notes = _clocked(logs.log, _only(request, logs.keys))
+    signals, notes = signals_of(logs.log, _only(request, logs.keys))
     for one in logs.beside:
         signals |= {key: _within(s, request) for key, s in one.signals.items()}
     return signals, notes
 
 
 def flight_from(logs: Opened, request: Request) -> Flight:
-    """The flight inside the window.
-
-    Raises:
-        InputError: one sentence on what is wrong with a log, the window or the rate.
-    """
+    """The flight inside the window."""
     log, alongside = logs.log, tuple(one.note for one in logs.beside)
-    notes = (*beyond(logs, request), *alongside)
-    if isinstance(log, ChannelLog):
+    notes = (*log.notes, *beyond(logs, request), *alongside)
+    try:
+        signals, more = clocked(logs, request)
         source = Source(
             log.path,
             log.sha256,
-            (*log.notes, *notes),
+            (*notes, *more),
             log.firmware,
             log.parameters,
             cautions=log.cautions,
-            first_time=log.first_time,
-        )
-        return flight_of_signals(clocked(logs, request)[0], request, source)
-    with log.hinting():
-        signals, more = clocked(logs, request)
-        source = Source(
-            log.table.path,
-            log.table.sha256,
-            (*log.table.notes, *log.said, *notes, *more),
-            cautions=log.cautions,
-            first_time=log.first_time,
+            first_time=log.begin,
         )
         return flight_of_signals(signals, request, source)
+    except InputError as e:
+        # A wrong unit of the clock makes errors of other kinds.
+        said = [n for n in log.notes if n.code == "units.contradicted"]
+        if not said:
+            raise
+        raise InputError("; ".join([str(e), *sentences(said)])) from e
 
 
 def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
     """A note where the window reaches beyond the first log."""
-    log, asked = logs.log, _only(request, logs.keys)
-    if isinstance(log, ChannelLog):
-        return channel_window_note(log, asked)
-    return table_window_note(log, asked)
+    return channel_window_note(logs.log, _only(request, logs.keys))
 
 
-def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:
+def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
     log = log or _of_file(request)
     if request.time is None and not isinstance(log, ChannelLog):
         log = _by_clocks(log)
@@ -148,14 +131,6 @@ def _by_clocks(log: Table) -> ChannelLog | Table:
     return log if with_clocks is None else with_derived(with_clocks, swashplate)
 
 
-def _clocked(
-    log: ChannelLog | LoadedTable, request: Request
-) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    if isinstance(log, ChannelLog):
-        return signals_of(log, request), ()
-    return clocked_table(log, request)
-
-
 def _only(request: Request, keys: frozenset[Key]) -> Request:
     part = copy.copy(request)
     part.signals = {key: s for key, s in request.signals.items() if key in keys}
@@ -169,32 +144,32 @@ def _whole(request: Request) -> Request:
     return request
 
 
-def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tuple[Beside, Request]:
+def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Request]:
     """The signals of a further log, its clock shifted to that of the first, and the request for
     them with the units that they have."""
     options = ReadOptions(number=also.number)
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already may be large.
     file = also.log or _of_file(asked)
-    asked = with_file_units(file, asked)
     other = _open(asked, file)
-    signals, _ = _clocked(other, asked)
+    asked = with_file_units(other, asked)
+    signals, _ = signals_of(other, asked)
     name = Path(also.path).name
     stated = f"{name} (sha256 {file.sha256[:12]})"
     if also.same:
         lag, said = _aligned(log, request, also, file, stated)
     else:
-        lag = float(other.first_time - log.first_time)
-        theirs = _span(signals, other.first_time)
-        ours = _span(_clocked(log, _whole(request))[0], log.first_time)
+        lag = float(other.begin - log.begin)
+        theirs = _span(signals, other.begin)
+        ours = _span(signals_of(log, _whole(request))[0], log.begin)
         said = _as_one(request, also, ours, theirs, stated)
     return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, said), asked
 
 
 def _aligned(
-    log: ChannelLog | LoadedTable, request: Request, also: Also, file: ChannelLog | Table, name: str
+    log: ChannelLog, request: Request, also: Also, file: ChannelLog | Table, name: str
 ) -> tuple[float, Finding]:
-    """What has to be added to the times of a further log [s], by a motion that both hold."""
+    """Return the correction of a further log's times [s], by a motion that both logs hold."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
@@ -203,8 +178,8 @@ def _aligned(
     # Apart from the others, since it may well be one of them.
     options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    reference = _clocked(log, _only(_whole(request), frozenset({key})))[0][key].timed
-    (twin,) = _clocked(_open(alone, file), alone)[0].values()
+    reference = signals_of(log, _only(_whole(request), frozenset({key})))[0][key].timed
+    (twin,) = signals_of(_open(alone, file), alone)[0].values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
     motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
@@ -223,11 +198,7 @@ def _as_one(
     theirs: tuple[float, float],
     name: str,
 ) -> Finding:
-    """A note that the times of two logs, from first to last [s], count alike.
-
-    Raises:
-        InputError: they hardly overlap, so that they have no clock in common.
-    """
+    """A note that the times of two logs, from first to last [s], count alike."""
     first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
     if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(
@@ -266,8 +237,9 @@ def _note(name: str, also: Also, lag: Lag) -> Finding:
 
 def _shifted(signal: ClockedSignal, lag: float, name: str) -> ClockedSignal:
     # Two files may well have topics of the same name.
-    topic = signal.clock.topic if signal.clock.topic == name else f"{name}, {signal.clock.topic}"
-    clock = dataclasses.replace(signal.clock, topic=topic, seconds=signal.clock.seconds + lag)
+    clock = signal.clock
+    called = clock.name if clock.name == name else f"{name}, {clock.name}"
+    clock = dataclasses.replace(clock, name=called, seconds=clock.seconds + lag)
     return dataclasses.replace(signal, clock=clock)
 
 
@@ -276,6 +248,5 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     if request.options.window is None:
         return signal
     clock = signal.clock
-    rows = rows_in_window(request.path, clock.seconds, request.options.window, clock.topic)
-    clock = dataclasses.replace(clock, seconds=clock.seconds[rows], rows=rows)
-    return dataclasses.replace(signal, clock=clock, values=signal.values[rows])
+    rows = rows_in_window(request.path, clock.seconds, request.options.window, clock.name)
+    return dataclasses.replace(signal, clock=clock.part(rows), values=signal.values[rows])

@@ -26,7 +26,7 @@ class Survey:
 
 
 class Table(Protocol):
-    """What a reader of one format offers. Rows count from 0, places are for people."""
+    """Interface of a reader of tables. Rows count from 0, places are for people."""
 
     # A protocol and no base class: a reader is chosen by the file's ending in `open_log` alone, and
     # the next format is one more module there.
@@ -42,7 +42,7 @@ class Table(Protocol):
 
     @property
     def sha256(self) -> str:
-        """Of the whole file; of a large one it is waited for."""
+        """Fingerprint of the whole file; waits for that of a large one."""
         ...
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -54,11 +54,11 @@ class Table(Protocol):
         ...
 
     def place(self, row: int) -> str:
-        """Where a row stands: `line 12` of a text file, `row 3` (from 1) of another."""
+        """Place of a row: `line 12` of a text file, `row 3` (from 1) of another."""
         ...
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         ...
 
     def time_unit(self, name: str) -> str | None:
@@ -104,11 +104,7 @@ MOST_COLUMNS = 10_000
 
 
 def require_few_columns(path: str, count: int, *place: str) -> None:
-    """Refuse more columns than any log has.
-
-    Raises:
-        InputError: naming the number.
-    """
+    """Refuse more columns than any log has."""
     if count > MOST_COLUMNS:
         raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
 
@@ -132,11 +128,7 @@ class Budget:
         """bytes"""
 
     def take(self, count: int) -> None:
-        """Count bytes that are to be filled.
-
-        Raises:
-            InputError: they and those before are more than the file may take.
-        """
+        """Count bytes that are to be filled."""
         self._taken += count
         self.require(self._taken)
 
@@ -162,11 +154,7 @@ _LONGEST_NAME = 1000
 
 
 def require_short_names(path: str, names: Sequence[str]) -> None:
-    """Refuse a column's name that is no name.
-
-    Raises:
-        InputError: naming the length.
-    """
+    """Refuse a column's name that is no name."""
     longest = max(map(len, names), default=0)
     if longest > _LONGEST_NAME:
         problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
@@ -174,11 +162,7 @@ def require_short_names(path: str, names: Sequence[str]) -> None:
 
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
-    """Refuse a column that is missing or stands in the file twice.
-
-    Raises:
-        InputError: with the nearest name there is.
-    """
+    """Refuse a column that is missing or stands in the file twice."""
     for name in needed:
         count = have.count(name)
         # Which of the two is meant cannot be known, and pyarrow would return either.
@@ -219,7 +203,7 @@ class TableView:
 
     @property
     def sha256(self) -> str:
-        """Of the file."""
+        """Fingerprint of the file."""
         return self.table.sha256
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -244,11 +228,11 @@ class TableView:
         return made
 
     def place(self, row: int) -> str:
-        """Where a row stands in the file."""
+        """Place of a row in the file."""
         return self.table.place(row if self._rows is None else int(self._rows[row]))
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         if name not in self.table.names:
             return str(row)
         return self.table.cell_text(name, row if self._rows is None else int(self._rows[row]))

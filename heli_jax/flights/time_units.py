@@ -85,12 +85,6 @@ def require_likely(
 ) -> tuple[Finding, ...]:
     """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
     that one or nobody stated seconds; a caution where somebody did.
-
-    Args:
-        stamps: (N,)
-
-    Raises:
-        InputError: with what to state.
     """
     named, likely = split_unit(name)[1], likely_unit(stamps)
     if unit != "s" or likely == "s":
@@ -198,7 +192,7 @@ type _Read = Callable[[str], datetime.datetime | float]
 
 
 def _reader(cell: str) -> _Read | None:
-    """What reads cells such as this one; None where it is no time."""
+    """Return the reader of cells such as this one; None if it is no time."""
     read = next((read for form, read in _FORMS if form.fullmatch(cell)), None)
     if read is None and (match := _COUNT.fullmatch(cell)):
         # 3D is what a receiver calls its fix, and no three days.

@@ -18,7 +18,7 @@ _SURROUNDINGS = 15
 SMALLEST = 0.01
 """share of the variance below which a line biases nothing"""
 _SLOWEST = 4.0
-"""Hz: below are the machine's own motion and the sticks', whose doublets have lines too"""
+"""Hz: below are the vehicle's own motion and the sticks', whose doublets have lines too"""
 _HIGHEST = 12
 """harmonics of the rotor that are looked for"""
 _HIGHEST_FOLDED = 4
@@ -38,7 +38,7 @@ class Line(NamedTuple):
 
     @property
     def aliased(self) -> bool:
-        """Whether it is above half the rate and was folded down."""
+        """True if the line is above half the rate and was folded down."""
         return self.harmonic > 0 and abs(self.of_hz - self.hz) > 0.1 * self.of_hz
 
 
@@ -79,11 +79,7 @@ def lines(
 
 
 def line_words(line: Line, rotor_hz: float | None) -> str:
-    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`.
-
-    Args:
-        rotor_hz: turns per second of the rotor, where they are known.
-    """
+    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
     share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
     if line.aliased:
         return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
@@ -118,14 +114,15 @@ def _welch(x: np.ndarray, dt: float, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _running_median(x: np.ndarray, to_either_side: int) -> np.ndarray:
-    """Of the neighbours of each value; the ends are repeated."""
+    """Return the running median of the neighbours of each value; the ends are repeated."""
     padded = np.pad(x, to_either_side, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * to_either_side + 1)
     return np.median(windows, axis=1)
 
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
-    """Which harmonic of the rotor a line is, and this harmonic's own frequency; zeros for none."""
+    """Return the harmonic of the rotor that a line is, and this harmonic's frequency; zeros for
+    none."""
     if rotor_hz is None:
         return 0, 0.0
     for k in range(1, _HIGHEST + 1):
@@ -138,23 +135,19 @@ def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> t
 
 
 def folded(hz: float, rate: float) -> float:
-    """Where a frequency [Hz] appears in samples taken at a rate [Hz]."""
+    """Return the frequency [Hz] at which a frequency appears in samples taken at a rate [Hz]."""
     return abs(hz - rate * round(hz / rate))
 
 
 def settling(frequencies: Sequence[float], q: float) -> float:
-    """How long notches take to forget how they began, to 5 % [s].
-
-    Args:
-        frequencies: centres of the notches [Hz].
-    """
+    """Return the settling time of notches to 5 % [s]."""
     # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
     return 3.0 * q / (np.pi * min(frequencies))
 
 
 def slow_step(x: np.ndarray) -> int:
-    """Of samples (N,) of a sensor that is slower than the grid, of which most are missing, the
-    usual step between them in steps of the grid; 1 where it is not slower."""
+    """Return the usual step, in steps of the grid, between samples (N,) of a sensor that is
+    slower than the grid; 1 if it is not slower."""
     steps = np.diff(np.flatnonzero(np.isfinite(x)))
     return round(float(np.median(steps))) if steps.size else 1
 
@@ -162,11 +155,6 @@ def slow_step(x: np.ndarray) -> int:
 def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """As `notched`, of a sensor that is slower than the grid: by its own samples, and without the
     frequencies that it has no more; they are folded, and stay where they are.
-
-    Args:
-        x: samples (N,), NaN between those that were taken.
-        dt: of the grid [s].
-        frequencies: centres of the notches [Hz].
     """
     step = slow_step(x)
     own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
@@ -253,7 +241,8 @@ class RotorLines(NamedTuple):
 
 
 def rotor_lines(log: ChannelLog) -> RotorLines | None:
-    """Of the rates and specific forces of a log; None where it has none, or no rotor speed."""
+    """Find the rotor's lines in the rates and specific forces of a log; None if it has none, or
+    no rotor speed."""
     with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
         for name in fitting_presets(log.format, log.names):
             by_preset = _by_preset(log, preset(name))

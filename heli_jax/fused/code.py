@@ -192,7 +192,7 @@ class Code:
         return self.operation(name, a, b)._replace(dtype=np.dtype(bool))
 
     def intrinsic(self, name: str, *values: Value) -> Value:
-        """A function that LLVM knows, such as `sqrt`; of vectors it makes the machine's own, or
+        """A function that LLVM knows, such as `sqrt`; of vectors it makes the processor's own, or
         calls the C library's for each vehicle."""
         shared = all(v.shared for v in values)
         kind = self.typed(values[0].dtype, shared)

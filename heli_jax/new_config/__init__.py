@@ -49,7 +49,7 @@ def write_config(
     flight: int | None = None,
     time_rate: float | None = None,
 ) -> Written:
-    """Write a configuration, and for models of a machine's geometry a vehicle file to fill in.
+    """Write a configuration, and for models of a vehicle's geometry a vehicle file to fill in.
 
     Args:
         out: the configuration's place; what stands there is not replaced.
@@ -257,7 +257,7 @@ def _free(
 
 
 def _held(chosen: text.Chosen, free: Mapping[str, Any]) -> dict[str, float]:
-    """The parameters of a linear model that stay at another machine's values, but for those of what
+    """The parameters of a linear model that stay at another vehicle's values, but for those of what
     is left out, which are zero."""
     if not chosen.linear:
         return {}

@@ -19,9 +19,9 @@ from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
 _UNSET = {"kappa": "a stand that does not spring", "zeta": "a stand that does not damp"}
-"""what a constant's default says where it is not zero for every machine"""
+"""what a constant's default says where it is not zero for every vehicle"""
 _GUSTS = (
-    "  # With a disturbance, since gusts move real machines too; where none do, output-error",
+    "  # With a disturbance, since gusts move real vehicles too; where none do, output-error",
     "  # and no section disturbance.",
 )
 _NO_AXIS = (
@@ -163,7 +163,7 @@ def configuration(
         else f"    {name}: {{start: {_number(start)}}}"
         for name, start in free.items()
     ]
-    stays = "# stays at this, another machine's; found without the first #"
+    stays = "# stays at this, another vehicle's; found without the first #"
     lines += [f"    # {n}: {{start: {_number(v)}}}".ljust(33) + stays for n, v in held.items()]
     guess, sure = late
     why = f"GUESS: {_comment(guess)}" if guess else "where the stick was logged late or early"
@@ -177,7 +177,7 @@ def configuration(
 
 def vehicle(model: Any, means: Mapping[str, tuple[str, float]]) -> str:
     """A vehicle file to fill in."""
-    lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
+    lines = ["# Of your vehicle, measured or from its drawings; a source helps whoever reads it."]
     defaults, known = naming.defaults(model.Params), naming.names(model.Params)
     # Any number stands for one that has to be there: it only shows what the model reads.
     params = model.Params(**{n: defaults.get(n, 1.0) for n in known})

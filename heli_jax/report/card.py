@@ -140,7 +140,7 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
 
 
 def _of_verdicts(fit: Fit) -> list[Gate]:
-    """What the first line says: the reason for its `no` need not show in any number of the card."""
+    """Gates of the first line: the reason for its `no` need not show in any number of the card."""
     determined = "determined" if fit.verdict.identifiable else "not determined"
     shares = {n: s for n, s in fit.verdict.prior_share.items() if s > _RESTS}
     if fit.verdict.identifiable and shares:
@@ -230,7 +230,8 @@ def _of_agreement(
 
 
 def _mean_is_fitted(fit: Fit) -> str:
-    """What makes the mean of every simulated output the measured one; empty where nothing does."""
+    """Reason why the mean of every simulated output is the measured one; empty if it need not
+    be."""
     layout = fit.reached.layout
     # Of each flight by itself, those held out included.
     if layout.bias:
@@ -245,7 +246,7 @@ def _not_asked(line: Gate, why: str) -> Gate:
 
 
 def _of_held_out(fit: Fit) -> list[Gate]:
-    """What flights held out say in frequency, where their simulation is asked nothing."""
+    """Gates of held-out flights in frequency, which need no simulation."""
     lines, held = [], fit.held_out_frequency
     for f in held.flights if held is not None else ():
         of = f"{f.flight}, held out"
@@ -311,7 +312,7 @@ def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
         remark = f"not asked: the model puts {share} of this output down to this input"
     elif coherence.expected < COHERENCE:
         # A simulation has no noise: what it lacks is the segments' doing (leakage, a memory longer
-        # than one of them, a nonlinear machine), and no measurement could have more.
+        # than one of them, a nonlinear vehicle), and no measurement could have more.
         remark = f"not asked: in the simulation it is {coherence.expected:.2g} too"
     else:
         return _least(what, of, coherence.value, "", COHERENCE, remark + band)

@@ -1,5 +1,5 @@
-"""What a figure of lines shows: one record, from which the page draws it (uPlot), Matplotlib draws
-the file, and words are made for who does not see it.
+"""Content of a line figure. From one record the page draws it (uPlot), Matplotlib draws the file,
+and the text alternative is written.
 
 A page holds each array once, in two or four bytes a number, as base64.
 """
@@ -92,8 +92,8 @@ def limits_of(series: Sequence[Series], margin: float = 0.05) -> tuple[float, fl
 
 
 def samples(label: str, x: np.ndarray, y: np.ndarray, color: str, width: float) -> Series:
-    """What was measured, NaN where it is missing: a line, or where few samples have neighbours a
-    dot for each, of which a line would show nothing."""
+    """Return the series of a measurement, NaN where it is missing. It is a line, or dots if few
+    samples have neighbours, because a line would show nothing."""
     seen = ~np.isnan(y)
     beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
     if seen.any() and beside.mean() < 0.5:
@@ -108,7 +108,7 @@ def bars(label: str, x: np.ndarray, y: np.ndarray, reach: Any, color: str) -> Se
 
 
 def band(x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, label: str = "") -> Series:
-    """What lies between two lines."""
+    """Return the band between two lines."""
     return Series(label, x, low, color, "band", low, high, width=0.0)
 
 
@@ -172,12 +172,11 @@ _LEAST = 2000
 """points that a line keeps in any case"""
 _MISSING = 65535
 _STEPS = 65534
-"""parts of an array's range that are told apart: far below a pixel, and below a hundredth of a
-percent"""
+"""resolution of an array's range: far below a pixel, and below a hundredth of a percent"""
 
 
 class Logged(NamedTuple):
-    """How a log has a signal: SI times a factor, and an offset on top."""
+    """Scale of a signal in the log: SI times a factor, plus an offset."""
 
     unit: str
     """or the column's name, where the log's numbers have no unit"""

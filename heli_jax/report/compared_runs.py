@@ -251,7 +251,7 @@ def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
 
 
 def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
-    """The shortest ends of paths that tell them apart."""
+    """Return the shortest unique ends of paths."""
     paths = [d.absolute().parts for d in directories]
     for depth in range(1, max(map(len, paths)) + 1):
         labels = ["/".join(p[-depth:]) for p in paths]
@@ -289,7 +289,7 @@ _NUMBERS = ("value", "sd", "lower95", "upper95")
 
 # Any: what fit.json holds.
 def _stated(run: SavedFit) -> dict[str, dict[str, Any]]:
-    """What the fit itself says that the data determine; nothing of one without an optimum."""
+    """Return the combinations that a fit states to be determined; nothing without an optimum."""
     every = run.content.get("determined_combinations") or ()
     known = (c for c in every if all(c.get(key) is not None for key in _NUMBERS))
     return {c["name"]: c for c in known if _arrived(run)}
@@ -345,7 +345,7 @@ def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str])
 
 
 def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
-    """Whether both were fitted to the same samples of a log, or some of them."""
+    """True if both runs were fitted to the same samples of a log, or to some of them."""
     ours, others = (
         [f for f in run.content["data"] if f.get("sha256") and not f.get("hold_out")]
         for run in (first, second)
@@ -358,8 +358,7 @@ def _share_a_log(first: SavedFit, second: SavedFit) -> bool:
 
 
 def _overlap(a: list[float] | None, b: list[float] | None) -> bool:
-    """Whether two windows of a log have more than an end in common; where one was not written
-    they may."""
+    """True if two windows of a log overlap, or if one of them was not stored."""
     return a is None or b is None or min(a[1], b[1]) > max(a[0], b[0])
 
 

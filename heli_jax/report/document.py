@@ -64,7 +64,7 @@ ABSENT = object()
 
 
 class VerdictContent(TypedDict):
-    """What the data determine, with all that it was read off."""
+    """Identifiability: verdict, rank, singular values and correlations."""
 
     text: str
     """in a sentence"""
@@ -107,7 +107,7 @@ class AdequacyAgainst(TypedDict):
 
 
 class AdequacyContent(TypedDict):
-    """Whether the model explains the record."""
+    """Adequacy of the model for the record."""
 
     summary: Annotated[str, "adequate_in_words"]
     """the answer in a few words, as the first line has it"""
@@ -129,7 +129,7 @@ class Fixed(TypedDict):
 
 
 class Residuals(TypedDict):
-    """What is left of the measurements."""
+    """Residuals of the measurements."""
 
     white: bool
     overconfident: bool
@@ -190,7 +190,7 @@ class MethodsCompared(TypedDict):
 
 
 class Nuts(TypedDict):
-    """Whether the draws may be believed."""
+    """Convergence of the chains of NUTS."""
 
     rhat: float
     """the largest"""
@@ -209,13 +209,13 @@ class IntervalsContent(TypedDict, total=False):
     profiles: dict[str, Profile]
     sentences: list[str]
     bootstrap_failures: Annotated[int, lambda i: i.bootstrap.failures if i.bootstrap else ABSENT]
-    """of a bootstrap: refits that did not arrive"""
+    """refits of the bootstrap that did not converge"""
     nuts: Annotated[Nuts, lambda i: i.posterior or ABSENT]
     """of NUTS"""
 
 
 class Compatibility(TypedDict):
-    """Of `heli-jax compatibility`."""
+    """Result of `heli-jax compatibility`."""
 
     compatible: bool
     verdict: str
@@ -263,7 +263,7 @@ class QualityToo(TypedDict):
 
 
 class Qualities(TypedDict, total=False):
-    """What a response says, of the model or of the data."""
+    """Handling qualities of a response, of the model or of the data."""
 
     numbers: dict[str, Number | None]
     """by name; null is not determined"""
@@ -313,7 +313,7 @@ class FrequencyErrorContent(TypedDict):
 
 
 class SignalSource(TypedDict, total=False):
-    """Where a signal of the model came from."""
+    """Source of a model's signal."""
 
     signal: str
     """the channel of the log; without one a constant stands there"""
@@ -334,7 +334,7 @@ class SignalSources(TypedDict):
 
 
 class FlightSource(TypedDict, total=False):
-    """Where a flight came from; one that was given in memory has no path and no signals."""
+    """Source of a flight; one that was given in memory has no path and no signals."""
 
     path: str | None
     sha256: str | None
@@ -355,7 +355,7 @@ class FlightSource(TypedDict, total=False):
 
 
 class HoldContent(TypedDict):
-    """What an input does between samples."""
+    """Hold of an input between samples."""
 
     hold: Literal["zero-order", "linear", "mixed"]
     reason: str
@@ -524,7 +524,7 @@ def _constants(fit: Fit, problem: Problem) -> dict[str, float]:
 
 
 def _starts(fit: Fit) -> list[StartRow]:
-    """Where each start led; None for what is not determined."""
+    """Return the end of each start; None for numbers that are not determined."""
     shown = _shown(fit.estimates, fit.status)
     open_ones: dict[str, Any] = {n: None for n, e in shown.items() if e.value is None}
     return [

@@ -19,7 +19,7 @@ from heli_jax.report.fitted_responses import FittedResponses
 
 
 class SensorAgreement(NamedTuple):
-    """Whether a log's sensors agree: what `heli-jax compatibility` asked of the fit."""
+    """Agreement of a log's sensors, of `heli-jax compatibility`."""
 
     compatible: bool
     verdict: str
@@ -31,7 +31,7 @@ class SensorAgreement(NamedTuple):
 
 
 class SupplementaryAnalyses(NamedTuple):
-    """What belongs to a fit: model selection, intervals by other methods, responses."""
+    """Supplementary analyses of a fit: model selection, intervals by other methods, responses."""
 
     choice: Choice | None = None
     intervals: Intervals | None = None
@@ -64,7 +64,7 @@ def fit_json(
 
 
 def check_json(check: Check) -> dict[str, Any]:
-    """What `heli-jax check` found as plain data; what is not a finite number is null."""
+    """Return the result of `heli-jax check` as plain data; a number that is not finite is null."""
     verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
     # Of a parameter that is not determined the number would be no expectation.
     lacking = {*verdict.undetermined, *verdict.without_effect}

@@ -207,8 +207,8 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
 
 
 def _drawn(hold_out: list[bool]) -> list[int]:
-    """Which flights get figures: where there are too many, not only the fitted ones, which come
-    first, but half of them held out."""
+    """Return the indices of the flights that get figures. If there are too many, half of them
+    are held-out flights, although the fitted ones come first."""
     held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
     fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
     rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
@@ -216,7 +216,7 @@ def _drawn(hold_out: list[bool]) -> list[int]:
 
 
 def _parts(flights: list[str]) -> list[str]:
-    """What tells the flights' file names apart; nothing where there is one flight."""
+    """Return the parts that tell the flights' file names apart; nothing for one flight."""
     if len(flights) == 1:
         return [""]
     # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
@@ -251,7 +251,7 @@ def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
 
 
 def as_logged(signal: Signal) -> Logged | None:
-    """How the log has a signal; None where it is constant, or logged in SI."""
+    """Return the scale of a signal in the log; None if it is constant, or logged in SI."""
     if signal.constant is not None:
         return None
     if signal.scale == 1.0 and not signal.offset and not signal.invert:
@@ -276,7 +276,7 @@ def logged_outputs(analysis: Analysis) -> dict[str, tuple[str, float]]:
 
 
 def from_si(signal: Signal) -> float:
-    """What a number in SI is times to be in the unit that the configuration states for it."""
+    """Return the factor from SI to the unit that the configuration states for a signal."""
     try:
         return 1.0 / units.factor(signal.unit, signal.si)
     except ValueError:  # of no known unit: it was never converted
@@ -284,13 +284,13 @@ def from_si(signal: Signal) -> float:
 
 
 def caption(picture: Picture) -> str:
-    """What a figure shows, and the name of its files."""
+    """Caption of a figure, with the name of its files."""
     [words] = [words for begins, words in GROUPS.items() if picture.name.startswith(begins)]
     return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
 def alt_text(picture: Picture, analysis: Analysis) -> str:
-    """What a figure of the report shows, for who does not see it."""
+    """Text alternative of a figure."""
     fit, intervals = analysis.fit, analysis.supplementary.intervals
     if picture.name == "pairs_posterior" and intervals and intervals.posterior:
         return f"{picture.title}. {_pairs(intervals.posterior.draws, fit)}."
@@ -303,7 +303,7 @@ def alt_text(picture: Picture, analysis: Analysis) -> str:
 
 
 def _pairs(samples: Mapping[str, np.ndarray], fit: Fit) -> str:
-    """What samples show, pair by pair."""
+    """Describe pairs of samples in words."""
     names, each = list(samples)[:MOST], []
     for name in names:
         mean, sd = measured(float(np.std(samples[name])), float(np.mean(samples[name])))
@@ -349,23 +349,29 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
     if fit.adequate:
-        shares = {n: m.vaf for n, m in fit.metrics.items() if math.isfinite(m.vaf)}
-        told = "Nothing in the record speaks against the model."
-        if shares:
-            worst = min(shares, key=lambda n: shares[n])
-            told = f"{told[:-1]}; simulated, VAF of {worst} {vaf_percent(shares[worst])}."
-        adequate = Line("good", "Adequate", told)
+        told = ["Nothing in the record speaks against the model"]
+        for agreement, how in (
+            (fit.metrics, "simulated"),
+            (fit.one_step, "one step ahead"),
+            (fit.validation, "held out"),
+        ):
+            shares = {n: m.vaf for n, m in agreement.items() if math.isfinite(m.vaf)}
+            if shares:
+                worst = min(shares, key=lambda n: shares[n])
+                told.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
+        adequate = Line("good", "Adequate", f"{'; '.join(told)}.")
     return Line("good", "Converged", reached), determined, adequate
 
 
 def model_remark(problem: Problem) -> str:
-    """Why an inertia found here is a number of the paper's model; empty for other models."""
+    """Remark that an inertia found with the paper's model is a number of that model; empty for
+    other models."""
     # A model with parameters of its own need not have the paper's equations 14 and 15.
     if not of_helicopter(problem.model.Params):
         return ""
     factor = float(np.asarray(problem.vehicle.cyclic_moment))
     return (
-        "Ixx and If are numbers of the paper's model, not of the machine: eqs 14-15 have the "
+        "Ixx and If are numbers of the paper's model, not of the vehicle: eqs 14-15 have the "
         f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
         "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
         "Compare an estimate with a weighed or swung inertia only with that in mind."

@@ -1,7 +1,7 @@
 """Responses of a fitted model beside those of the flights that it was fitted to, both with errors.
 
-The measured ones are conditioned: sticks that move together are told apart, and flights count
-together (`heli_jax.analysis.flight_responses`).
+The measured ones are conditioned: inputs that move together are separated, and all flights count
+(`heli_jax.analysis.flight_responses`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ class FittedPair(NamedTuple):
     """of its real and of its imaginary part"""
     coherence: np.ndarray
     model: Point
-    """of the machine in continuous time"""
+    """of the vehicle in continuous time"""
     half95: float = _Z95
     """half of a 95 % interval of what was measured, in sd"""
 
@@ -190,7 +190,8 @@ def _coherent(responses: FlightResponses) -> dict[tuple[str, str], float]:
 def _pairs(
     responses: FlightResponses, curves: _Curves, coherent: Mapping[tuple[str, str], float]
 ) -> list[FittedPair]:
-    """Those of input and output that are coherent anywhere, by the sum of their coherence there."""
+    """Return the pairs of input and output that are coherent anywhere, by the sum of their
+    coherence."""
     ranked = []
     for (input, name), total in coherent.items():
         if not total:

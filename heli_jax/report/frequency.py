@@ -75,7 +75,8 @@ def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
 
 
 def at_record(flight: FittedFlight) -> OperatingPoint:
-    """Where the model is linearised for a record, with the gains that were estimated."""
+    """Return the operating point of a record at which the model is linearised, with the
+    estimated gains."""
     signals = flight.signals
     # What acts is gain times what was logged: the mean of the log would be another point.
     estimates = {n: flight.fit.nuisance.get(f"gain {n}") for n in signals.inputs}
@@ -164,7 +165,7 @@ def _needed(dt: float, memory: float) -> int:
 
 
 class Segments(NamedTuple):
-    """How a record is cut into half-overlapping segments."""
+    """Half-overlapping segments of a record."""
 
     length: int
     """samples of each"""
@@ -183,7 +184,7 @@ def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -
 
     Args:
         dt: between two of them [s].
-        memory: how long the machine remembers its input [s].
+        memory: how long the vehicle remembers its input [s].
     """
     most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
     length, lowest = max(_needed(dt, memory), most), 0.0
@@ -228,7 +229,7 @@ class Coherence(NamedTuple):
 
     @property
     def asked(self) -> bool:
-        """Whether the model lets expect that the output follows this input coherently."""
+        """True if the model predicts a coherent response of the output to this input."""
         return self.share >= SIZEABLE
 
 
@@ -287,7 +288,7 @@ def _spectra(
 
 
 def _coherence(spectra: Spectra, lowest: float, j: int, H: np.ndarray) -> Coherence:
-    """Of input j, whose expected response is H (k,)."""
+    """Return the coherence of input j, whose expected response is H (k,)."""
     inputs, measured, simulated = spectra.X[..., :-2], spectra.X[..., -2], spectra.X[..., -1]
     others = np.delete(inputs, j, axis=2)
     alone = without(others, inputs[:, :, j])

@@ -1,4 +1,4 @@
-"""What made a page: the command, when, and the configuration; and the files beside the page."""
+"""Origin of a page: command, date, configuration, and the files beside it."""
 
 import contextlib
 import shlex
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Origin(NamedTuple):
-    """Where a page came from."""
+    """Origin of a page."""
 
     command: str
     date: str
@@ -30,7 +30,7 @@ _asker: ContextVar[tuple[str, str] | None] = ContextVar("heli_jax_asker", defaul
 
 @contextlib.contextmanager
 def made_for(command: str, point: str) -> Iterator[None]:
-    """What is made meanwhile was asked for by another process."""
+    """Attribute what is made in this context to another process's command."""
     token = _asker.set((command, point))
     try:
         yield
@@ -39,19 +39,19 @@ def made_for(command: str, point: str) -> Iterator[None]:
 
 
 def command() -> str:
-    """What was typed to start this process, as a shell would take it."""
+    """Return the command line of this process, as a shell would take it."""
     return _command(sys.argv)
 
 
 def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
-    """Of a page that this process makes now."""
+    """Return the origin of a page that this process makes now."""
     now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     typed, point = _asker.get() or (command(), "")
     return Origin(typed, now, config, files, point)
 
 
 def _command(words: list[str]) -> str:
-    """What was typed, as a shell would take it."""
+    """Quote a command line as a shell would take it."""
     # The program by its name alone: where it is installed is nobody's business.
     program = Path(words[0] if words else "")
     if program.name.startswith(("ipykernel", "colab_kernel")):

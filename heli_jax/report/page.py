@@ -55,8 +55,8 @@ def _asset(name: str) -> markupsafe.Markup:
 
 @functools.cache
 def _policy() -> str:
-    """What a browser may do with a page: run the scripts of this package and no other, load
-    nothing."""
+    """Return the content security policy of a page: only this package's scripts, and nothing
+    loaded."""
     # The escaping alone keeps a log's text from being run; this is the second lock.
     digests = (hashlib.sha256(_asset(n).encode()).digest() for n in _SCRIPTS)
     hashes = " ".join(f"'sha256-{as_base64(d)}'" for d in digests)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
@@ -14,7 +15,6 @@ from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table
-from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
 from heli_jax.report.charts import Chart, Numbers
@@ -103,7 +103,7 @@ def write_responses(
 
 
 def _averages(responses: FlightResponses, request: Wanted) -> str:
-    """Of the response that a transfer function is fitted to, as text."""
+    """Describe the averages of the response that a transfer function is fitted to."""
     output = responses.outputs.get(request.output)
     return NOTHING if output is None else number(output.averages, 3)
 
@@ -212,7 +212,7 @@ def _number(c: Coefficient) -> dict[str, float]:
 
 
 def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
-    """What is to be heeded of a transfer function."""
+    """Return the cautions about a transfer function."""
     if isinstance(fit, str):
         return [f"not fitted: {fit}"]
     if not fit.determined:
@@ -223,7 +223,7 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     if fit.chi_squared > _TOO_LARGE:
         said.append(
             f"squared errors are {number(fit.chi_squared, 2)} times what the random errors let "
-            "expect: the order is too low, the machine is not linear, or a window of "
+            "expect: the order is too low, the vehicle is not linear, or a window of "
             f"{window:.3g} s does not resolve it"
         )
     if not forgets(fit, window):
@@ -241,12 +241,12 @@ def fit_sentences(fit: TransferFit | str, window: float) -> list[str]:
     if known and (growing := [p.real for p in fit.poles if p.real > 0.0]):
         said.append(
             f"it is unstable (a pole with the real part +{number(max(growing), 3)} rad/s): where "
-            "the machine is not, a stick logged late, feedback or a wrong order makes it so"
+            "the vehicle is not, a stick logged late, feedback or a wrong order makes it so"
         )
     if known and all(c.determined for c in fit.numerator) and (beside := _cancelled(fit)):
         said.append(
             f"beside {_root_words(beside)} lie zeros, within a tenth, that all but cancel them: "
-            "they may be no modes of the machine, and a lower order may say as much "
+            "they may be no modes of the vehicle, and a lower order may say as much "
             "(see whether chi² stays)"
         )
     return said
@@ -316,6 +316,22 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
     if not c.determined:
         return "not determined"
     return with_sd(c.value * factor, c.sd * factor)
+
+
+def longest_band(
+    hz: Float[np.ndarray, " k"], good: Bool[np.ndarray, " k"]
+) -> tuple[float, float] | None:
+    """Return the widest band (in octaves) without a hole; None where nothing is good.
+
+    Args:
+        hz: rising, any unit.
+    """
+    edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    if not begins.size:
+        return None
+    widest = int(np.argmax(hz[ends] / hz[begins]))
+    return float(hz[begins[widest]]), float(hz[ends[widest]])
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:

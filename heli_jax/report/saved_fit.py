@@ -24,7 +24,7 @@ _LIMIT_BYTES = 1_000_000_000
 
 
 class SavedFit(NamedTuple):
-    """What fit.json and signals.csv hold; the names are those of `Fit`."""
+    """Content of fit.json and signals.csv; the names are those of `Fit`."""
 
     directory: Path
     model: str
@@ -63,7 +63,7 @@ class SavedFit(NamedTuple):
 
     @property
     def overconfident(self) -> bool:
-        """Whether the intervals are too narrow, since residuals are not white."""
+        """True if the intervals are too narrow because residuals are not white."""
         return bool((self.content.get("residuals") or {}).get("overconfident", False))
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":

@@ -230,7 +230,7 @@ def in_style() -> Iterator[None]:
     import matplotlib
 
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        # A name of a log in letters that this machine's font lacks; the reader's may have them.
+        # A name of a log in letters that this vehicle's font lacks; the reader's may have them.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
 

@@ -136,7 +136,7 @@ class Column:
 
 
 class Table:
-    """What is drawn of a sweep, read once: all of it, or of a large one a lot."""
+    """Results of a sweep to draw, read once: all of them, or a random part of many."""
 
     def __init__(self, ds: xr.Dataset, named: Iterable[np.ndarray] = ()) -> None:
         """`named` are elements that are drawn in any case."""
@@ -179,7 +179,7 @@ class Table:
 
     @property
     def nothing(self) -> str:
-        """Why there is no number to draw."""
+        """Reason why there is no number to draw."""
         return "no finite value" if self.n_ok else "no element is ok"
 
 
@@ -434,7 +434,7 @@ def _density(ax: Axes, x: Column, y: Column, k: int) -> None:
 
 
 def worst_elements(table: Table, by_result: Mapping[str, np.ndarray]) -> Figure | None:
-    """Where the worst elements of each result lie: upright axes side by side, a line for each.
+    """Draw the worst elements of each result over parallel axes, a line for each.
 
     `by_result` has those of each result, worst first. None where it has none.
     """

@@ -157,7 +157,7 @@ def parameters(fit: Fit) -> Table:
 
 
 def prior_note(problem: Problem, fit: Fit) -> str:
-    """Where the prior share of parameters without a prior comes from; empty where there is none."""
+    """Explain the prior share of parameters without a prior; empty if none has one."""
     # A prior share without a prior would look like a mistake of the table.
     names = [
         n
@@ -209,7 +209,7 @@ class Nuisances(NamedTuple):
 
 
 def nuisances(fit: Fit) -> Nuisances:
-    """What was estimated beside the parameters."""
+    """Return the table of nuisance parameters."""
     head = ("unknown", "estimate", "sd", "95 % interval", "unit")
     rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
     # With windows there is one for each window and state, which would bury the gains and biases.
@@ -226,7 +226,7 @@ def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
 
 
 def combinations(fit: Fit) -> Table:
-    """What the data do determine where they do not determine every parameter."""
+    """Return the table of combinations that the data determine."""
     # Where no optimum was reached nothing is determined.
     every = () if fit.status == "not-converged" else fit.verdict.combinations
     rows = [(c.name, *_cells(c)) for c in every]
@@ -257,7 +257,8 @@ def intervals(comparison: Intervals, fit: Fit) -> Table:
 
 
 def sampling(posterior: Posterior) -> Table:
-    """Whether the chains of NUTS agree: R-hat and effective draws by parameter, divergent steps."""
+    """Return the table of NUTS convergence: R-hat and effective draws by parameter, divergent
+    steps."""
     rows = [
         (name, f"{c.rhat:.3f}", f"{c.effective:.0f}", NOTHING)
         for name, c in posterior.convergence.items()
@@ -300,7 +301,7 @@ def verdict(fit: Fit) -> Table:
 
 
 def starts(fit: Fit) -> Table:
-    """Where every start led."""
+    """Return the table of starts."""
     names = list(fit.starts[0].start) if fit.starts else []
     missing = {*fit.verdict.undetermined, *fit.verdict.without_effect}
     rows = [
@@ -532,7 +533,7 @@ def combination(
 
 
 def baseline_facts(b: Baseline) -> Table:
-    """What the recursive least squares found, in full."""
+    """Return the facts of the recursive least squares."""
     # The slowest first, and conjugates side by side.
     poles = [_complex(p) for p in sorted(b.poles, key=lambda p: (-abs(p), p.imag))]
     rows = [
@@ -569,12 +570,12 @@ type Start = EquationErrorStart | FrequencyErrorStart
 
 
 def start_method(start: Start) -> str:
-    """What found the starts, in words."""
+    """Name the method that found the start values."""
     return "equation error" if isinstance(start, EquationErrorStart) else "frequency error"
 
 
 def first_guess(start: Start) -> Table:
-    """Where each free parameter begins, and by what."""
+    """Return the table of start values, with the method that found each."""
     rows = []
     for name, v in start.values.items():
         shown = with_sd(v.value, v.sd) if v.sd else number(v.value, 4)
@@ -688,7 +689,7 @@ def _shown(n: Number, times: float) -> str:
 
 
 def handling_sentences(entries: Sequence[Handling]) -> list[str]:
-    """Why numbers are missing, and what is to be heeded."""
+    """Explain missing numbers of handling qualities, and give cautions."""
     said = []
     for entry in entries:
         for source in _sources(entries):
@@ -715,7 +716,7 @@ def handling_lines(entries: Sequence[Handling]) -> list[str]:
 
 
 class Origin(NamedTuple):
-    """Where one flight came from."""
+    """Origin of one flight."""
 
     flight: str
     facts: Table

@@ -20,7 +20,7 @@ from heli_jax.report.page import MOST_FLIGHTS, Picture, filled, picture
 from heli_jax.simulation.trajectory import Trajectory
 
 _HUGE = 1e9
-"""what no state of a machine reaches, and no figure can draw"""
+"""what no state of a vehicle reaches, and no figure can draw"""
 
 
 # Parameters of a model are a class of the user's own: they are annotated Any.
@@ -34,7 +34,7 @@ class Shown(NamedTuple):
     scene: int | None
     """the flight in 3D, of a whole helicopter: its number among the page's scenes"""
     size: float
-    """how many times its size the machine is drawn there"""
+    """how many times its size the vehicle is drawn there"""
 
 
 def write_view(
@@ -79,7 +79,7 @@ def write_view(
 
 
 def _good(run: Trajectory) -> np.ndarray:
-    """Which samples can be drawn."""
+    """Return a mask of the samples that can be drawn."""
     leaves = jax.tree.leaves((run.states, run.outputs))
     return np.all([np.abs(np.asarray(v)) < _HUGE for v in leaves], axis=0)
 
@@ -98,13 +98,13 @@ def _pictures(run: Trajectory, model: Model, numbers: Numbers) -> list[Picture]:
     return [p for p in made if p is not None]
 
 
-# The path, the attitude, and the shape of a machine that flies along it: `assets/flight.js` draws
+# The path, the attitude, and the shape of a vehicle that flies along it: `assets/flight.js` draws
 # them. States and parameters are records of a model, a class of the user's own: annotated Any.
 
 MOST_MOMENTS = 3000
 """of a flight, between which the page interpolates"""
 _SMALLEST = 0.1
-"""rotor diameter over the length of the path: a smaller machine is drawn larger"""
+"""rotor diameter over the length of the path: a smaller vehicle is drawn larger"""
 _AROUND = 16
 """corners of what is round"""
 _DIGITS = 4
@@ -114,13 +114,13 @@ type Points = Float[np.ndarray, "n 3"]
 
 
 def moments_of(n: int) -> np.ndarray:
-    """Which of n samples are kept: all, or at most `MOST_MOMENTS` evenly among them."""
+    """Return the indices of the samples kept: all of n, or at most `MOST_MOMENTS` evenly spaced."""
     # Rounded, not truncated: the first and the last sample are among them.
     return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_MOMENTS))).astype(int))
 
 
 def size_of(run: Trajectory, R: float) -> float:
-    """How many times its size the machine is drawn, so that it can be seen on a long path."""
+    """Return the magnification of the drawn vehicle, so that it is visible on a long path."""
     path = _path(run.states)
     # Whole numbers: the page says 'drawn 3 times its size'.
     length = float(np.max(np.ptp(path, axis=0)))
@@ -141,7 +141,7 @@ def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
         at: (3,) position of the body's origin in the figure [m].
     """
     # Forward, left and up are right-handed, as a viewer takes axes to be; forward, right and up
-    # are not, and the machine would be its mirror image.
+    # are not, and the vehicle would be its mirror image.
     return turn.apply(shape) * np.array([1.0, -1.0, -1.0]) + at
 
 

@@ -1,4 +1,4 @@
-"""Stick inputs to excite a machine with; each function gives (N,) samples of unit amplitude."""
+"""Stick inputs to excite a vehicle with; each function gives (N,) samples of unit amplitude."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def multistep_3211(
         unit: length of the shortest step [s].
         pause: of neutral between two of them [s].
     """
-    # In either direction, so that a machine without stability does not wander off to one side.
+    # In either direction, so that a vehicle without stability does not wander off to one side.
     u = np.zeros(n)
     # Whole samples, one at least: a unit below the sample time would leave steps of no length.
     step, rest = max(1, round(unit / dt)), max(1, round(pause / dt))

@@ -68,10 +68,10 @@ def simulate(
     options: SimulationOptions = DEFAULT,
     **keywords: Any,
 ) -> Trajectory:
-    """Simulate one machine; each input is held until the next sample, or linear between the two.
+    """Simulate one vehicle; each input is held until the next sample, or linear between the two.
 
     Args:
-        model: of one machine; `jax.vmap` over the other arguments simulates many.
+        model: of one vehicle; `jax.vmap` over the other arguments simulates many.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
         **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,
             `initial_state`, `delay`, `key`, `hold`, ...

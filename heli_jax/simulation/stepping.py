@@ -93,7 +93,7 @@ def start_state(
 
 
 def check_countable(samples: int, dtype: Any) -> None:
-    """Refuse a run of so many samples that their numbers are not told apart in its precision.
+    """Refuse a run whose sample numbers are not distinct in its precision.
 
     Raises:
         ValueError: float32 and more than 4 million samples.

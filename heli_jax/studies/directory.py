@@ -56,7 +56,7 @@ def require_same(out: Path, described: dict[str, Any]) -> dict[str, str]:
 
 
 def names(study: Study) -> list[str]:
-    """The directories of the fits: a number and what tells it apart from the others."""
+    """Return the directories of the fits: a number and the values that differ."""
     short = _short_keys(list(study.axes))
     width = len(str(study.size - 1))
     named = []
@@ -67,7 +67,7 @@ def names(study: Study) -> list[str]:
 
 
 def _short_keys(keys: list[str]) -> dict[str, str]:
-    """The shortest ends of keys that tell them apart; `Ixx` for its start."""
+    """Return the shortest unique ends of keys; `Ixx` for its start."""
     # Of `fit.free.Ixx.start` the last word says less than the one before.
     parts = {key: key.removesuffix(".start").split(".") for key in keys}
     for depth in range(1, max(len(p) for p in parts.values()) + 1):

@@ -46,7 +46,7 @@ class _Parts(NamedTuple):
 
 
 def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
-    """Why the job's runs cannot be one program each; None where they can."""
+    """Reason why the job's runs cannot be one program each; None if they can."""
     if devices[0].platform != "cpu":
         return "it is for CPUs alone"
     if not job.streamed or not job.simulated:

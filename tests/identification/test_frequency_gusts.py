@@ -89,7 +89,7 @@ def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
 
 
 def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
-    moved = {"Mm": Moved(0.0, 0.6), "Ll": Moved(2.0, 0.1), "Lp": Moved(0.0, 0.0)}
+    moved = {"Mm": Moved(0.6), "Ll": Moved(0.1, 0.2), "Lp": Moved(0.0)}
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
     assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
     assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
@@ -97,7 +97,7 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     [found] = trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
     assert (found.code, found.severity) == ("loop.no-instrument", "doubt")
     assert found.distrusts == ("Mm",)
-    [found] = trust({"Lp": Moved(0.0, 0.003)}, Loop(loops))
+    [found] = trust({"Lp": Moved(0.003)}, Loop(loops))
     assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]

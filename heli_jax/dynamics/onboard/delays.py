@@ -97,7 +97,7 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         name=f"{model.name}+delays",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
-        # What is said of free flight is said of the machine with its delay: without this, margins
+        # What is said of free flight is said of the vehicle with its delay: without this, margins
         # of a model on the stand would lose it.
         without_stand=None if bare is None else _with_input_delays(bare, parameters),
     )
@@ -181,7 +181,7 @@ class _LateOutputs(Device):
         )
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the machine had always been where it starts: the first coefficient is the mean.
+        # As if the vehicle had always been where it starts: the first coefficient is the mean.
         # At rest at zero instead, the line would show a step from zero to the first output, one
         # delay long, which no flight has.
         at_first = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
@@ -239,7 +239,8 @@ def line_states(name: str, order: int) -> tuple[str, ...]:
 
 
 def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
-    """What comes out of a delay line: the signal one delay ago, or as it is now for none.
+    """Return the output of a delay line: the signal one delay ago, or the current value without
+    delay.
 
     Args:
         delay: [s].

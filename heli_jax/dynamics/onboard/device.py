@@ -28,7 +28,7 @@ class Quantity(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a device adds to a model, by name."""
+    """Parameters, states and functions that a device adds to a model."""
 
     params: Mapping[str, Quantity]
     states: Mapping[str, Quantity]
@@ -83,14 +83,14 @@ class Device(abc.ABC):
         return self.model.State(**{n: getattr(s, n) for n in naming.names(self.model.State)})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """Of the model behind its device."""
+        """Derivatives of the model behind its device."""
         of_model = self.model.vector_field(p, self.inner(s), self.inputs(p, s, u))
         # The device's states stand behind the model's: matrices of the model keep their rows and
         # columns.
         return self.State(**naming.asdict(of_model), **self.rates(p, s, u))
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """What the log has."""
+        """Logged outputs."""
         return self.shown(p, s, u, self.measured(p, s, u))
 
     def measured(self, p: Record, s: Record, u: Record) -> Record:
@@ -111,7 +111,7 @@ class Device(abc.ABC):
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """Those of the model, with the inputs that reach it."""
+        """Limits of the model, with the inputs that reach it."""
         assert self.model.limits is not None
         return self.model.limits(p, self.inner(s), self.inputs(p, s, u))
 

@@ -75,7 +75,7 @@ class Filter(NamedTuple):
 
 
 def cutoff(filters: Sequence[Filter]) -> float:
-    """Where low-passes one behind the other are 3 dB down together [Hz]."""
+    """Return the frequency at which low-passes in series are 3 dB down together [Hz]."""
     # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
     # quality rises before it falls, so the last crossing counts.
     hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
@@ -84,7 +84,7 @@ def cutoff(filters: Sequence[Filter]) -> float:
 
 
 def gain(filters: Sequence[Filter], hz: np.ndarray) -> np.ndarray:
-    """What low-passes one behind the other leave of an amplitude (K,).
+    """Return the gain (K,) of low-passes in series.
 
     Args:
         hz: frequencies (K,) [Hz].
@@ -214,7 +214,7 @@ def _lowpasses(filters: Iterable[Filter]) -> list[Filter]:
 
 
 def _low_pass(name: str, filters: tuple[Filter, ...]) -> LowPass:
-    """Where white noise before an output's filters comes in, and how strong it has to be.
+    """Return the state at which white noise before an output's filters enters, and its intensity.
 
     A notch before the first low-pass is left out: white noise stays nearly that behind it.
     """
@@ -315,7 +315,7 @@ class _Filtered(Device):
         return value - (1.0 - section.left) * band
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the machine had always been where it starts: low-passes there, their rates at zero.
+        # As if the vehicle had always been where it starts: low-passes there, their rates at zero.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         for n, sections in self.sections.items():

@@ -22,7 +22,7 @@ _BODY = {"roll": "p", "pitch": "q", "yaw": "r"}
 
 
 class Law(NamedTuple):
-    """What a rate loop has."""
+    """Parts of a rate loop."""
 
     command: bool
     """whether the stick commands a rate; else it goes to the swashplate, less the feedback"""
@@ -134,7 +134,7 @@ def _measured_by_gyro(model: Model, axis: Axis) -> str:
 
 
 def _is_of_body(model: Model, rate: str) -> bool:
-    """Whether a rate is computed from the state, and is none of its fields."""
+    """True if a rate is computed from the state, and is none of its fields."""
     states = naming.names(model.State)
     return model.body_rates is not None and rate in _BODY.values() and rate not in states
 
@@ -223,7 +223,7 @@ class _RateLoop(Device):
         return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """What the loops ask of the machine in place of their sticks; other inputs pass."""
+        """Commands of the loops in place of their sticks; other inputs pass."""
         driven = {}
         for stick, rate in self.loops:
             # From the state and not from an output: an output may be delayed or filtered by the

@@ -105,7 +105,7 @@ class _LowPass(Device):
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
-        # As if the machine had always been where it starts.
+        # As if the vehicle had always been where it starts.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         # Zero in its place would show as a start-up transient of the filter, which a logger that
         # runs before the record begins has long behind it.
@@ -247,7 +247,7 @@ _BODY_RATES = (("p", "q", "r"), ("roll_rate", "pitch_rate", "yaw_rate"))
 
 
 class MotionKind(NamedTuple):
-    """How a model knows its velocities."""
+    """Form in which a model has its velocities."""
 
     kind: str
     """linear, body or ground"""
@@ -261,7 +261,7 @@ class MotionKind(NamedTuple):
 
 
 def motion_of(model: Model) -> MotionKind:
-    """How a model knows its velocities.
+    """Return the form in which a model has its velocities.
 
     Raises:
         ValueError: it knows none.
@@ -331,9 +331,8 @@ def airspeed(
 
 
 def rate_of(model: Model, letter: str) -> tuple[str, str] | None:
-    """Where a model has the rate p, q or r of the body: ('state', name) or ('output', name); None
-    where it has none.
-    """
+    """Return the place of the body rate p, q or r in a model: ('state', name), ('output', name),
+    or None if it has none."""
     states, outputs = naming.names(model.State), naming.names(model.Outputs)
     if letter in states:
         return "state", letter
@@ -472,7 +471,7 @@ def _norm(v: Vector) -> Any:
 
 
 def _lever(p: Record, omega: Vector, alpha: Vector) -> Vector:
-    """What the IMU feels beside the centre of gravity."""
+    """Return the acceleration at the IMU relative to the centre of gravity."""
     return _sum(_cross(alpha, _at(p)), _cross(omega, _cross(omega, _at(p))))
 
 

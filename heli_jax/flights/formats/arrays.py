@@ -88,11 +88,7 @@ class ArrayTable:
         require_few_columns(path, len(arrays))
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The arrays as float64 (N,).
-
-        Raises:
-            InputError: one is missing or they differ in length.
-        """
+        """The arrays as float64 (N,)."""
         require_columns(self.path, self.names, names)
         arrays = {name: np.asarray(self._arrays[name], np.float64) for name in names}
         # A summary of two numbers beside a log does no harm unless it is asked for.
@@ -115,7 +111,7 @@ class ArrayTable:
         return f"row {row + 1}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         return repr(self._arrays[name][row].item())[:40]
 
     def time_unit(self, name: str) -> str | None:
@@ -139,7 +135,7 @@ class DataSets:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the data sets."""
+        """Names of the data sets."""
         return tuple(self._stored)
 
     @property
@@ -228,7 +224,7 @@ def holds_numbers(kind: np.dtype, dimensions: int) -> bool:
 
 
 def guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
-    """What a library reads; whatever it raises over a damaged file is an error of that file."""
+    """Read with a library; any exception over a damaged file becomes an error of that file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -281,11 +277,7 @@ def _labelled(
 def _named_columns(
     path: str, array: np.ndarray, texts: Mapping[str, Sequence[str]]
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """The names and the units of a matrix's columns, each empty where nothing states them.
-
-    Args:
-        texts: lists of texts by path, as many as columns in the one that names them.
-    """
+    """The names and the units of a matrix's columns, each empty where nothing states them."""
     if array.dtype.kind not in "biuf" or array.ndim > 2 or array.size < 2:
         return (), ()
     count, own = 1 if array.ndim < 2 else min(array.shape), _LEVEL.split(path)
@@ -327,7 +319,7 @@ class Packing(ValueError):
 
 
 def unpack(stored: np.ndarray, attributes: Mapping[str, object]) -> tuple[np.ndarray, int]:
-    """What stored numbers stand for, NaN for fills and what is no valid value, and how many are
+    """Unpack stored numbers; return them with NaN for fills and invalid values, and the number
     missing.
 
     Raises:
@@ -519,7 +511,7 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
 
 
 def clock_notes(table: Table) -> tuple[Finding, ...]:
-    """That arrays have clocks of their own, where they have."""
+    """Note that arrays have clocks of their own."""
     log = by_clocks(table) if isinstance(table, ArrayTable) else None
     if log is None:
         return ()

@@ -51,12 +51,7 @@ class MainFrames:
 
 
 def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
-    """The flights of a blackbox file, without those that hold no frame.
-
-    Raises:
-        InputError: it is no blackbox file, or none of its flights can be read.
-        OSError: it cannot be read.
-    """
+    """The flights of a blackbox file, without those that hold no frame."""
     data = read_regular(path, "a blackbox log", _LARGEST)
     starts = _flight_starts(data)
     if not starts:
@@ -119,7 +114,7 @@ def _flight(
         sha256=sha256,
         topics=tuple(topics),
         firmware=head.settings.get("Firmware revision", head.settings.get("Firmware type", "")),
-        # The lines named Field say how the bytes are packed, which is no setting of the machine.
+        # The lines named Field say how the bytes are packed, which is no setting of the vehicle.
         parameters={k: v for k, v in head.settings.items() if not k.startswith("Field ")},
         notes=_losses(frames, main),
         flight=flight,
@@ -185,7 +180,7 @@ _LONGEST_JUMP = 10_000_000
 
 
 class Runs(NamedTuple):
-    """Where runs `begin` (R,), of `length` (R,), in frames of the file's order."""
+    """Runs of frames: `begin` (R,) and `length` (R,), in the file's order."""
 
     begin: np.ndarray
     length: np.ndarray
@@ -294,7 +289,7 @@ def _plausible(
 
 
 def _inside(runs: Runs, count: int) -> np.ndarray:
-    """Whether each of `count` frames is in a run."""
+    """Return a mask of the `count` frames that are in a run."""
     edges = np.zeros(count + 1, np.int8)
     edges[runs.begin] += 1
     np.subtract.at(edges, runs.begin + runs.length, 1)
@@ -306,7 +301,7 @@ def _goes_on(before: int, stamp: int) -> bool:
 
 
 def constant(predictor: int, head: Header) -> int:
-    """What a predictor expects that is one number for a whole flight; 0 for others."""
+    """Return the constant that a predictor expects for a whole flight; 0 for other predictors."""
     match predictor:
         case frames_of.MIN_THROTTLE:
             return head.integer("minthrottle", 1150)
@@ -358,7 +353,7 @@ def add_predictions(
 
 
 def _uses_motor(i: int, head: Header) -> bool:
-    """Whether the numbers of a field are differences from the first motor's."""
+    """True if the numbers of a field are differences from the first motor's."""
     return any(head.layouts[letter].predictors[i] == frames_of.MOTOR_0 for letter in "IP")
 
 

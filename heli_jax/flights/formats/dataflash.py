@@ -54,7 +54,8 @@ _LABELS = {"degheading": "deg", "deglatitude": "deg", "deglongitude": "deg", "sa
 
 @dataclass(frozen=True)
 class Format:
-    """What a message FMT says of another: its fields' kinds, one letter each, and their names."""
+    """Format of a message from its FMT message: kinds of the fields, one letter each, and their
+    names."""
 
     name: str
     kinds: str
@@ -62,12 +63,12 @@ class Format:
 
     @property
     def dtype(self) -> np.dtype:
-        """How the fields stand in the bytes."""
+        """NumPy type of the fields in the bytes."""
         return np.dtype([(c, FIELDS[k][0]) for c, k in zip(self.columns, self.kinds, strict=True)])
 
     @property
     def is_valid(self) -> bool:
-        """Whether the fields are known, each with a name of its own."""
+        """True if the fields are known, each with a name of its own."""
         return (
             len(self.kinds) == len(self.columns) == len(set(self.columns))
             and set(self.kinds) <= FIELDS.keys()
@@ -104,12 +105,7 @@ class _Table(NamedTuple):
 
 
 def open_dataflash(path: Path) -> ChannelLog:
-    """The flight of a binary DataFlash log.
-
-    Raises:
-        InputError: it is no DataFlash log, or holds no samples.
-        OSError: it cannot be read.
-    """
+    """The flight of a binary DataFlash log."""
     data = read_regular(path, "a DataFlash log", _LARGEST)
     if not data.startswith(MAGIC):
         raise wrong(str(path), "is no DataFlash log, expected one that begins with a format")
@@ -216,15 +212,7 @@ def _text(raw: bytes) -> str:
 def make_log(
     path: str, data: bytes, parts: Sequence[Part], damaged: int, scaled: bool = False
 ) -> ChannelLog:
-    """The log that messages make.
-
-    Args:
-        parts: the messages by description, those of one number in the file's order.
-        scaled: whether fields hold numbers that were multiplied already, as text does.
-
-    Raises:
-        InputError: no message holds a number.
-    """
+    """The log that messages make."""
     alone = {name: _joined([p for p in parts if p.form.name == name], scaled) for name in _OF_LOG}
     units = _units(parts, alone)
     tables = []
@@ -343,7 +331,7 @@ def _by_instance(table: _Table) -> dict[str, np.ndarray]:
     if instance is None or not _are_counts(table.rows[instance]):
         return {table.name: table.rows}
     counts = np.unique(table.rows[instance]).astype(np.int64)
-    # A machine with one sensor has instance 0 alone; a name without an index is what its user
+    # A vehicle with one sensor has instance 0 alone; a name without an index is what its user
     # expects.
     if len(counts) == 1 and not counts[0]:
         return {table.name: table.rows}
@@ -519,17 +507,12 @@ _TEXTS = "nNZ"
 
 
 def is_dataflash_text(head: bytes) -> bool:
-    """Whether the first bytes of a file hold the format of a message, as such logs begin."""
+    """True if the first bytes of a file hold the format of a message, as such logs begin."""
     return any(line.startswith(b"FMT,") for line in head.splitlines())
 
 
 def open_dataflash_text(path: Path) -> ChannelLog:
-    """The flight of a DataFlash log in text.
-
-    Raises:
-        InputError: it is no DataFlash log, or holds no samples.
-        OSError: it cannot be read.
-    """
+    """The flight of a DataFlash log in text."""
     data = read_regular(path, "a DataFlash log in text", _LARGEST_TEXT)
     formats: dict[str, _Described] = {}
     described: list[_Described] = []

@@ -29,12 +29,7 @@ _LONGEST_LIST = 16
 
 
 def open_json(path: Path) -> ArrayTable:
-    """A file of JSON, or of a record a line.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no columns of numbers.
-        OSError: it cannot be read.
-    """
+    """A file of JSON, or of a record a line."""
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
     sets = DataSets(Budget(where, len(data)))
@@ -126,7 +121,7 @@ def _of_rows(where: str, rows: list[Any], budget: Budget) -> dict[str, Any]:
 
 
 def _cells(record: Mapping[str, Any], path: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """What is in records within records, by path."""
+    """Yield the cells of nested records by path."""
     for key, value in record.items():
         name = f"{path}.{key}" if path else str(key)
         # Columns of pandas are no records: {"0": 0.1, "1": 0.2}.

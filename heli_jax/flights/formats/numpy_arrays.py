@@ -27,10 +27,6 @@ def open_numpy(path: Path) -> ArrayTable:
     """A file of NumPy: one array (.npy), or several by name (.npz).
 
     Without pickle, which would run what a file says: arrays of Python's objects are passed over.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no arrays of numbers.
-        OSError: it cannot be read.
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", LARGEST)
@@ -86,7 +82,7 @@ def _add(sets: DataSets, name: str, array: np.ndarray) -> None:
             ticks = array.astype(np.int64).astype(np.float64)
             sets.add(name, np.where(np.isnat(array), np.nan, ticks), {"units": unit})
     elif holds_numbers(array.dtype, array.ndim):
-        # In the machine's own order of bytes.
+        # In the vehicle's own order of bytes.
         sets.add(name, array.astype(array.dtype.newbyteorder("=")), {})
     else:
         sets.leave_out(name, array.dtype, array.shape)

@@ -303,12 +303,15 @@ def second_solutions(
     valley, solutions = Valley(problem, at, e), []
     for held in _exchanged_modes(problem, here):
         # Held until the others have followed, or the modes would change back; then all of them
-        # follow more than once, until they stay.
+        # follow more than once, until they stay or are back.
         before, point = here, valley.visit(held, {}, same=not optimum, priors=True)
         for _ in range(_VISITS):
-            if point is not None:
-                before = {n: point.values[n] for n in here}
-                point = valley.visit({}, before, same=not optimum, priors=True)
+            if point is None:
+                break
+            before = {n: point.values[n] for n in here}
+            point = valley.visit({}, before, same=not optimum, priors=True)
+            if point is not None and all(_alike(v, point.values[n]) for n, v in here.items()):
+                break
         # What the slopes expect to be within the interval is no other solution.
         if point is None or not (point.excess <= SAME and point.expected > _APART):
             continue

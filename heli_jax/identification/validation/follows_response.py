@@ -1,4 +1,4 @@
-"""Whether inputs follow the response: feedback, by a pilot or a controller.
+"""Feedback: do inputs follow the response, through a pilot or a controller?
 
 Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
 multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
@@ -31,13 +31,6 @@ from jaxtyping import Float
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
-from heli_jax.numbers import percent
-
-# How one signal is correlated with sums over past samples of another, and how surely.
-#
-# The variance of such a correlation between two autocorrelated signals is Bartlett's: the sum over
-# all lags of the product of both autocorrelations (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
-
 
 _NOTHING = 1e-7
 """of the root of what a sum's power is at least where its terms are unrelated, below which it is
@@ -183,7 +176,7 @@ _LONG_REST, _AT_REST = 20, 0.5
 such rests take in one whose input was programmed"""
 _STILL = 1e-4
 """of the range of an input, below which a difference is no motion"""
-SEEN = 0.8
+_SEEN = 0.8
 """part of the samples of an output that is used"""
 
 
@@ -214,32 +207,47 @@ class Feedback(NamedTuple):
 def feedback(
     flight: Flight, together: int = 1, earlier: Mapping[str, float] | None = None
 ) -> tuple[Feedback, ...]:
-    """By input that moves freely, whether it follows past innovations; nothing where the record is
-    too short to tell.
+    """Return for each input that moves freely the past innovations that it follows most surely;
+    nothing where the record is too short to tell.
 
     Args:
         flight: inputs and outputs as measured; no model is asked.
-        together: how many flights are tested side by side, for the p values.
+        together: number of flights that are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    tested = [tested_at(flight, earlier or {}, rate) for rate in rates_of(flight)]
-    each = [one for one in tested if isinstance(one, Tested)]
-    label, found = flight.name or "flight 1", {}
-    for one in each:
-        for name in dict.fromkeys(n for view in one.views for n in view.free):
-            made = _dependence(one, name, together * len(each))
-            late = one.steps.get(name, 0) * flight.dt
-            now = made._replace(flight=label, earlier=late)
-            found[name] = min(found.get(name, now), now, key=_sureness)
+    # Half of a record at most: a delay beyond is none that it could show.
+    most, dt = flight.n_samples // 2, flight.dt
+    steps = {n: min(math.ceil(s / dt - 1e-9), most) for n, s in (earlier or {}).items()}
+    by_rate = [views for rate in _rates_of(flight) if (views := _views(flight, steps, rate))]
+    found: dict[str, Feedback] = {}
+    for views in by_rate:
+        N = len(views[0].innovations)
+        blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
+        seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
+        for name in dict.fromkeys(n for view in views for n in view.free):
+            those = [view for view in views if name in view.free]
+            # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+            count = len(those) * those[0].inputs * len(those[0].outputs) * len(blocks)
+            for view in those:
+                each = correlations_with_sums(view.free[name], view.innovations, blocks)
+                for k, b in np.ndindex(each.p_value.shape):
+                    one = Feedback(
+                        flight.name or "flight 1",
+                        name,
+                        view.outputs[k],
+                        float(each.correlation[k, b]),
+                        seconds[b],
+                        min(1.0, together * len(by_rate) * count * float(each.p_value[k, b])),
+                        steps.get(name, 0) * dt,
+                    )
+                    # Of several that are sure beyond all numbers the correlation decides.
+                    found[name] = min(
+                        found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
+                    )
     return tuple(found.values())
 
 
-def _sureness(one: Feedback) -> tuple[float, float]:
-    # Of several that are sure beyond all numbers the correlation decides.
-    return one.p_value, one.correlation
-
-
-def rates_of(flight: Flight) -> tuple[float, ...]:
+def _rates_of(flight: Flight) -> tuple[float, ...]:
     """Samples a second at which a flight is looked at [Hz]."""
     # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
     # a sample, and how it moved there, is not known, and an output that answers to it would pass
@@ -255,76 +263,35 @@ def _frames(u: np.ndarray) -> float:
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
 
-def _dependence(tested: "Tested", name: str, together: int) -> Feedback:
-    """Of one input the past innovations that it follows most surely."""
-    views = [view for view in tested.views if name in view.free]
-    count = len(views[0].innovations)
-    blocks = lag_blocks(max(1, min(round(_LONGEST / tested.dt), count // 10)))
-    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-    tests = together * len(views) * len(tested.inputs) * len(tested.outputs) * len(blocks)
-    made = []
-    for view in views:
-        each = correlations_with_sums(view.free[name], view.innovations, blocks)
-        k, b = min(
-            np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
-        )
-        lag = (blocks[b][0] * tested.dt, blocks[b][1] * tested.dt)
-        p, correlation = min(1.0, tests * float(each.p_value[k, b])), float(each.correlation[k, b])
-        made.append(Feedback("", name, tested.outputs[k], correlation, lag, p))
-    return min(made, key=_sureness)
-
-
 class _View(NamedTuple):
-    """What is correlated: of the past, and of an input what is compared with it."""
+    """Signals of a flight at one rate, of which the past is compared with inputs."""
 
     free: dict[str, np.ndarray]
     """by input what its own past does not foretell (N,)"""
     innovations: Float[np.ndarray, "N p"]
-
-
-class Tested(NamedTuple):
-    """A flight at one rate."""
-
-    views: tuple[_View, ...]
-    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    steps: dict[str, int]
-    """by input by how many samples of the flight it was taken earlier"""
+    inputs: int
+    """how many inputs move"""
     dt: float
 
 
-class Untested(NamedTuple):
-    """Why nothing of a flight is correlated."""
-
-    reason: str
-    """in words"""
-
-
-def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
-    """Return the signals of a flight that are correlated, or the reason why none are.
+def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
+    """Two pairs of what is compared; none where all outputs stay or lack too much, the record is
+    too short, or no input moves freely.
 
     Args:
-        earlier: by input, how much earlier than logged it is to be taken [s].
+        steps: by how many samples an input is taken earlier than logged, where it is.
         rate: samples a second at most [Hz].
     """
-    # Half of a record at most: a delay beyond is none that it could show.
-    most = flight.n_samples // 2
-    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
-    inputs, outputs, parts, dt = decimated(flight, steps, rate)
-    if not outputs:
-        most = percent(1 - SEEN, 0)
-        return Untested(f"every output stays where it is or lacks more than {most} of its samples")
-    n = next(iter(outputs.values())).size
-    if n < _LEAST:
-        expected = f"expected {_LEAST * dt:.3g} s at least"
-        return Untested(f"the record is too short ({n * dt:.3g} s, {expected})")
+    inputs, outputs, parts, dt = _decimated(flight, steps, rate)
+    if not outputs or next(iter(outputs.values())).size < _LEAST:
+        return []
     # Steps are slopes at a lower rate.
-    quick = decimated(flight, steps, RATE).inputs
+    quick = _decimated(flight, steps, RATE).inputs
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        why = "inputs move as programmed ones do (in jumps, between rests, or as foreseen)"
-        return Untested(why)
+        return []
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
@@ -335,10 +302,9 @@ def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Test
     now = np.concatenate([now[1:], now[-1:]])
     given = arx_residuals(y, np.concatenate([y, now], axis=1))
     past = arx_residuals(y, np.concatenate([y, u], axis=1))
-    views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
-    if not views:
-        return Untested("too few samples stand in a row without a missing one")
-    return Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt)
+    names = tuple(outputs)
+    pairs = ((free, given), (finer, past))
+    return [_View(v, e, names, len(inputs), dt) for v, e in pairs if e is not None and v]
 
 
 def _unforeseen(
@@ -381,7 +347,7 @@ def _rests(u: Float[np.ndarray, " N"]) -> float:
     return float(np.sum(runs[runs >= _LONG_REST])) / u.size
 
 
-class Decimated(NamedTuple):
+class _Decimated(NamedTuple):
     """Signals at a moderate rate, by name."""
 
     inputs: dict[str, np.ndarray]
@@ -393,7 +359,7 @@ class Decimated(NamedTuple):
     dt: float
 
 
-def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decimated:
+def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Decimated:
     """A flight averaged down.
 
     Args:
@@ -423,12 +389,12 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
     inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
     outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
     # A record of less than one block leaves none.
-    return Decimated(
+    return _Decimated(
         {n: thinned(u) for n, u in inputs.items()},
         {
             n: y
             for n, y in outputs.items()
-            if y.size and np.mean(np.isfinite(y)) >= SEEN and np.nanstd(y) > 0
+            if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
         },
         {n: within(u) for n, u in inputs.items()},
         flight.dt * every,
@@ -436,19 +402,6 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
 
 
 # Whether the inputs of a problem's flights follow the response.
-
-
-def why_untested(problem: Problem) -> Untested | None:
-    """Why nothing was tested of any flight; None where something was."""
-    reasons = {
-        label: tested
-        for label, f in zip(labels(problem.training), problem.training, strict=True)
-        if isinstance(tested := tested_at(f, {}, rates_of(f)[0]), Untested)
-    }
-    kinds = list(dict.fromkeys(reasons.values()))
-    if len(kinds) < 2:
-        return kinds[0] if kinds else None
-    return Untested("; ".join(f"{label}: {one.reason}" for label, one in reasons.items()))
 
 
 def feedback_of(
@@ -491,14 +444,3 @@ def _delay(
         if sd is not None:
             delay, variance, estimated = delay + value, variance + sd**2, True
     return delay, math.sqrt(variance), estimated
-
-
-def untested(problem: Problem) -> dict[tuple[str, ...], list[str]]:
-    """By outputs of which feedback cannot be told, since too much is missing, the flights."""
-    lacking: dict[tuple[str, ...], list[str]] = {}
-    for label, flight in zip(labels(problem.training), problem.training, strict=True):
-        tested = decimated(flight, {}, RATE).outputs
-        gappy = [n for n, y in flight.outputs.items() if n not in tested and np.isnan(y).any()]
-        if gappy:
-            lacking.setdefault(tuple(gappy), []).append(label)
-    return lacking

@@ -42,9 +42,11 @@ _AT_LEAST = 14.0
 """gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
+_WILD = 5.0 / 0.6745
+"""times the median of whitened residuals' sizes, beyond which they are wild: 5 sd of normal ones"""
 _EULER = 0.5772156649015329
-_AT_ONCE = 16
-"""filters that are tried together"""
+_AT_ONCE = 8
+"""residuals that are multiplied with all columns together"""
 
 
 class Lines(NamedTuple):
@@ -123,6 +125,7 @@ def lines_of(
     # What jumps because samples are missing is no answer: the filter's order after a hole is as if
     # nothing had been measured.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
+    white[0] = bounded(white[0])
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
@@ -133,6 +136,13 @@ def lines_of(
     q = J.shape[1]
     angles = 2.0 * np.pi * np.arange(1, v.shape[1] + 1) / n
     return Lines(v[0], v[1 : 1 + q].T, v[1 + q :].T, angles, size)
+
+
+def bounded(e: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Bound whitened residuals at 5 robust standard deviations (Huber's psi; Huber, 1981): a few
+    wild samples have most of the power, and go with some drive by chance."""
+    most = _WILD * float(np.median(np.abs(e[e != 0.0]))) if np.any(e) else 0.0
+    return np.clip(e, -most, most)
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
@@ -170,8 +180,8 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     known = directions(rows, _SAME)
     white = _without(known, residual)
     freedom, squares = white.size - known.shape[1], float(np.sum(white**2))
-    trials, back = list(_trials(records, drives, X.T)), np.exp(-1j * angles)
-    gains = [each.gains(back, known, white)[:, :, 0] for each in trials]
+    trials, known_lines = list(_trials(records, drives, X.T, angles)), _complex(known).T
+    gains = [each.gains(known_lines, _complex(white).T)[:, :, 0] for each in trials]
     best = int(np.argmax([np.max(of) for of in gains]))
     one, of = trials[best], gains[best]
     of_filter, at = np.unravel_index(int(np.argmax(of)), of.shape)
@@ -188,78 +198,78 @@ def strongest(records: Sequence[Lines], drives: Sequence[Drive]) -> Strongest:
     anew = _real(_complex(white).astype(phases.dtype) * phases)
     anew = _without(known.astype(np.float32), anew)
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
-    of_chance = [each.gains(back, known, anew).max(axis=(0, 1)) for each in trials]
-    alone = one._replace(
-        filters=one.filters[[of_filter]], columns=one.columns[[*range(one.beside), one.beside + at]]
-    )
-    steps = _steps(rows, alone.through(back)[0].T, residual)
+    of_chance = [each.gains(known_lines, _complex(anew).T).max(axis=(0, 1)) for each in trials]
+    beside = len(one.columns) - 2 * len(one.drives)
+    through = one.columns[[*range(beside), beside + 2 * at, beside + 2 * at + 1]]
+    steps = _steps(rows, _real((one.response[of_filter] * through).T), residual)
     p_value = _by_chance(gain, np.max(of_chance, axis=0))
     return Strongest(drive, gain, p_value, damping, frequency, *steps)
 
 
 class _Trial(NamedTuple):
-    """Some filters, and the drives that are tried through them beside the same columns."""
+    """Filters, and the drives that are tried through them beside the same columns."""
 
+    response: Complex[np.ndarray, "f K"]
+    """of each filter at each line"""
     filters: Float[np.ndarray, "f 2"]
     """damping and frequency [rad a sample]; infinite damping is no filter"""
     drives: tuple[Drive, ...]
-    columns: Complex[np.ndarray, "c K"]
-    """those beside first, then the drives"""
-
-    @property
-    def beside(self) -> int:
-        """How many columns stand before the drives."""
-        return len(self.columns) - len(self.drives)
-
-    def through(self, back: Complex[np.ndarray, " K"]) -> Float[np.ndarray, "f c2 K2"]:
-        """The columns through each filter, each by itself and one sample later.
-
-        Args:
-            back: what a delay of one sample multiplies a line by.
-        """
-        both = np.stack([self.columns, self.columns * back], axis=1).reshape(-1, len(back))
-        damping, w = self.filters.T
-        none = ~np.isfinite(damping)
-        damping = np.where(none, 1.0, damping)
-        size = np.where(none, 0.0, np.exp(-damping * w))
-        twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
-        H = 1.0 / (1.0 - twice[:, None] * back + (size[:, None] * back) ** 2)
-        values = both * H[:, None, :]
-        return np.concatenate([np.real(values), np.imag(values)], axis=2)
+    columns: Complex[np.ndarray, "c2 K"]
+    """those beside first, then the drives, each by itself and one sample later"""
 
     def gains(
-        self,
-        back: Complex[np.ndarray, " K"],
-        known: Float[np.ndarray, "K2 q"],
-        residuals: Float[np.ndarray, "K2 r"],
+        self, known: Complex[np.ndarray, "q K"], residuals: Complex[np.ndarray, "r K"]
     ) -> Float[np.ndarray, "f d r"]:
-        """The part of each residual's squares that each drive explains beyond what is known, by
-        products of columns: a basis for each filter and drive would take ten times as long.
+        """The part of each residual's squares that each drive explains beyond what is known.
+
+        All is had from products of columns, which are sums over lines of what the filters have in
+        common: no column is filtered.
 
         Args:
             known: orthonormal; the residuals have nothing of it.
         """
-        rows, b, d = self.through(back), 2 * self.beside, len(self.drives)
-        of_known, answers = rows @ known, rows.astype(residuals.dtype) @ residuals
-        whole = rows @ _turned(rows[:, :b])
+        f, d, b = len(self.response), len(self.drives), len(self.columns) - 2 * len(self.drives)
+        columns = self.columns
+        power = np.real(self.response) ** 2 + np.imag(self.response) ** 2
+        whole = np.stack([power @ np.real(columns * np.conj(v)).T for v in columns[:b]], axis=2)
+        own = columns[b:].reshape(d, 2, -1)
+        square, across = np.abs(own[:, 0]) ** 2, np.real(own[:, 0] * np.conj(own[:, 1]))
+        own = (power @ np.concatenate([square, across, across, square]).T).reshape(f, 2, 2, d)
+        own = np.moveaxis(own, 3, 1)
+        of_known, answers = self._products(known), self._products(residuals)
+
         left = whole - of_known @ _turned(of_known[:, :b])
         taken = left[:, b:] @ _inverse(left[:, :b], whole[:, :b])
-        answers = (answers[:, b:] - taken @ answers[:, :b]).reshape(len(rows), d, 2, -1)
-        each, of_known, left, taken = (
-            v[:, -2 * d :].reshape(len(rows), d, 2, -1) for v in (rows, of_known, left, taken)
+        answers = answers[:, b:] - taken @ answers[:, :b]
+        answers, of_known, left, taken = (
+            v.reshape(f, d, 2, -1) for v in (answers, of_known[:, b:], left[:, b:], taken)
         )
-        own = each @ _turned(each)
         over = _inverse(own - of_known @ _turned(of_known) - taken @ _turned(left), own)
         return np.sum(answers * (over @ answers), axis=2)
 
+    def _products(self, others: Complex[np.ndarray, "n K"]) -> Float[np.ndarray, "f c2 n"]:
+        """The products of the columns through each filter with others."""
+        response = _real(self.response.astype(others.dtype).T)
+        columns = self.columns.astype(others.dtype)
+        out = np.zeros((len(self.response), len(columns), len(others)), response.dtype)
+        for k in range(0, len(others), _AT_ONCE):
+            each = np.conj(columns)[:, None] * others[None, k : k + _AT_ONCE]
+            values = response.T @ _real(each.reshape(-1, each.shape[2]).T)
+            out[:, :, k : k + _AT_ONCE] = values.reshape(len(out), len(columns), -1)
+        return out
+
 
 def _trials(
-    records: Sequence[Lines], drives: Sequence[Drive], X: Complex[np.ndarray, "d K"]
+    records: Sequence[Lines],
+    drives: Sequence[Drive],
+    X: Complex[np.ndarray, "d K"],
+    angles: Float[np.ndarray, " K"],
 ) -> Iterator[_Trial]:
     """The drives by filter and by what stands beside them; the filters from two swings over the
     longest record on."""
     low = 2.0 * min(float(record.angles[0]) for record in records)
     high = 0.9 * max(float(record.angles[-1]) for record in records)
+    back = np.exp(-1j * angles)
     # What the record's ends make of a filter's states has a column for each record.
     ends = np.repeat(np.eye(len(records)), [r.e.size for r in records], axis=1).astype(complex)
     for (bank, plain, beside), group in itertools.groupby(
@@ -267,6 +277,7 @@ def _trials(
     ):
         those = tuple(group)
         columns = np.concatenate([ends, X[[*beside]], X[[d.column for d in those]]])
+        columns = np.stack([columns, columns * back], axis=1).reshape(-1, len(back))
         filters = [(np.inf, 0.0)] if plain else []
         for damping, step in bank:
             w = low
@@ -274,9 +285,23 @@ def _trials(
                 filters.append((damping, w))
                 # No finer than lines lie.
                 w *= np.exp(max(step, 0.25 * low / w))
-        # A few at a time stay in the caches.
-        for k in range(0, len(filters), _AT_ONCE):
-            yield _Trial(np.array(filters[k : k + _AT_ONCE]), those, columns)
+        yield _Trial(_responses(np.array(filters), back), np.array(filters), those, columns)
+
+
+def _responses(
+    filters: Float[np.ndarray, "f 2"], back: Complex[np.ndarray, " K"]
+) -> Complex[np.ndarray, "f K"]:
+    """The answer of each filter at each line, of one without a filter 1.
+
+    Args:
+        back: what a delay of one sample multiplies a line by.
+    """
+    damping, w = filters.T
+    none = ~np.isfinite(damping)
+    damping = np.where(none, 1.0, damping)
+    size = np.where(none, 0.0, np.exp(-damping * w))
+    twice = 2.0 * size * np.cos(w * np.sqrt(np.maximum(1.0 - damping**2, 0.0)))
+    return 1.0 / (1.0 - np.outer(twice, back) + np.outer(size**2, back**2))
 
 
 def _lowest(records: Sequence[Lines]) -> list[Lines]:

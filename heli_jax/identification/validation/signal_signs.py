@@ -305,21 +305,15 @@ def _of_fuselage(model: Model, name: str) -> bool:
 
 
 def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
-    """Whether an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
+    """True if an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
     so it is in aerobatics, and where both are in degrees."""
     rate = next((a.rate for a in axes_of(model) if a.angle == name), None)
-    p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
-    if p is None or not np.isfinite(p).any() or size > _FLOWN_TURNS * 2 * np.pi:
+    p = flight.outputs.get(rate or "")
+    if p is None or not np.nanmax(np.abs(p), initial=0.0) <= _LARGEST["rad/s"]:
         return False
-    if np.nanmax(np.abs(p)) > _LARGEST["rad/s"]:
-        return False
-    seen, rated = np.isfinite(phi), np.isfinite(p)
-    # From one sample of the angle to its next, which a slower sensor has seconds later.
-    at = np.arange(p.size)
-    turned = integral(np.interp(at, at[rated], p[rated]), flight.dt)
-    moved, by_rate = np.diff(phi[seen]), np.diff(turned[seen])
-    power = float(np.sum(by_rate**2))
-    return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < _FLOWN
+    ratio = angle_over_rate(flight.outputs[name], p, flight.dt)
+    turns = size <= _FLOWN_TURNS * 2 * np.pi
+    return turns and ratio is not None and abs(ratio.factor - 1.0) < _FLOWN
 
 
 # A stick in per cent that is read as plain numbers fits as well as one read right, with its effect

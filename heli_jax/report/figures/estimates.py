@@ -198,7 +198,7 @@ def _histogram(ax: "Axes", values: np.ndarray, e: Estimate, color: str) -> None:
 
 
 def logarithmic(e: Estimate) -> bool:
-    """Whether an estimate's interval reaches by equal factors and not by equal amounts."""
+    """True if an estimate's interval reaches by equal factors and not by equal amounts."""
     if e.lower95 is None or e.upper95 is None or not min(e.lower95, e.upper95) * e.value > 0:
         return False
     if not max(e.lower95, e.upper95) * e.value > 0:

@@ -72,7 +72,7 @@ def _measured_and_simulated(signals: Signals, output: str) -> tuple[Series, Seri
 
 
 def time_label(log_start: float | None) -> str:
-    """Of an axis: time in the log where the flight has one, else from its first sample."""
+    """Label of a time axis: time in the log if the flight has one, else from its first sample."""
     return "time [s]" if log_start is None else "time in the log [s]"
 
 
@@ -200,7 +200,7 @@ _STILL = 0.05
 """span of an axis over the largest of its values, at least: what moves by less is nearly constant,
 and not drawn as if it were not"""
 _LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
-"""by unit the span of an axis at least: about what the sensors of such a machine tell apart"""
+"""by unit the span of an axis at least: about the resolution of such a vehicle's sensors"""
 # States and signals of a model are classes of the user's own, with arrays (N,): annotated Any.
 
 
