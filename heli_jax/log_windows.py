@@ -119,7 +119,7 @@ def _print_doubts(ranking: Ranking) -> None:
     for name in ranking.guessed:
         tell(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
-    if doubt := too_good(finite, bool(ranking.guessed)):
+    if ranking.guessed and (doubt := too_good(finite)):
         tell(f"! {doubt.sentence}")
     for found in ranking.notes:
         tell(f"! {found.sentence}")

@@ -16,13 +16,11 @@ from heli_jax.identification.equation_error.start import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import (
     WORST,
     measured,
     percent,
-    plain,
     plain_cell,
     plain_words,
     terse,
@@ -30,6 +28,7 @@ from heli_jax.numbers import (
 )
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.report.fit_page import lines
 from heli_jax.report.fitted_responses import NO_RESPONSES
 from heli_jax.report.tables import handling_lines
 from heli_jax.summaries import of_estimates
@@ -38,20 +37,33 @@ from heli_jax.workflow import FitRun
 
 
 def print_fit(run: FitRun, *, verbose: bool = False) -> None:
-    """Verdict, estimates, agreement and baseline on standard output."""
-    problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    # Did the optimiser arrive; what do the data determine; is the model adequate; doubts.
-    tell(": ".join(fit.outcome))
-    print_findings(fit.findings, verbose=verbose)
+    """Print the first screen of the report: three statements, estimates, the most severe findings;
+    with `verbose` the rest of it."""
+    fit = run.fit
+    for line in lines(fit):
+        tell(f"{line.word}: {line.text}")
     stopped = fit.status == "not-converged"
     head, rows = of_estimates({**fit.estimates, **_shown_nuisances(fit.nuisance)}, stopped=stopped)
-    _tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), list(rows)))
+    # Where no optimum was reached nothing is determined.
+    determined = [
+        (c.name, value, sd, f"{low} to {high}", "", "")
+        for c in (() if stopped else fit.verdict.combinations)
+        for value, low, high, sd in [measured(c.sd, c.value, c.lower95, c.upper95)]
+    ]
+    _tell_table(report_tables.Table((*head[:3], fit.interval, *head[4:]), [*rows, *determined]))
+    print_findings(fit.findings, verbose=verbose)
+    if verbose:
+        _print_details(run)
+    if run.directory is not None:
+        tell(f"report: {run.directory / 'report.html'}")
+
+
+def _print_details(run: FitRun) -> None:
+    """Agreement by output, responses, acceptance card, and what the configuration asks for beside
+    the fit."""
+    problem, fit, supplementary = run.problem, run.fit, run.supplementary
     if note := report_tables.prior_note(problem, fit):
         tell(f"! {note}")
-    # Where no optimum was reached nothing is determined.
-    for c in () if stopped else fit.verdict.combinations:
-        value, low, high, sd = map(plain, measured(c.sd, c.value, c.lower95, c.upper95))
-        tell(f"determined: {c.name} = {value}, sd {sd}, 95 % interval {low} to {high}")
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
         _tell_table(table)
@@ -64,22 +76,17 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
             tell(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
     # of those held out, where a model that was fitted too closely shows.
-    for name, m in fit.metrics.items():
-        _print_agreement(f"{name}, simulated", m)
-    for name, m in fit.one_step.items():
-        _print_agreement(f"{name}, one step ahead", m)
-    for name, m in fit.validation.items():
-        _print_agreement(f"{name}, held out, simulated", m)
-    for name, m in fit.validation_free_run.items():
-        if diverges(m):
-            tell(f"{name}, held out, simulated in one piece: diverges")
-        else:
-            _print_agreement(f"{name}, held out, simulated in one piece", m)
-    for name, m in fit.one_step_validation.items():
-        _print_agreement(f"{name}, held out, one step ahead", m)
-    held = fit.held_out_frequency
-    for flight in held.flights if held is not None else ():
-        tell(f"{flight.flight}, held out, in frequency: {flight.in_words}")
+    for agreement, what in (
+        (fit.metrics, "simulated"),
+        (fit.one_step, "one step ahead"),
+        (fit.validation, "held out, simulated"),
+        (fit.validation_free_run, "held out, simulated in one piece"),
+        (fit.one_step_validation, "held out, one step ahead"),
+    ):
+        for name, m in agreement.items():
+            _print_agreement(f"{name}, {what}", m)
+    if (held := report_tables.held_out_flights(fit.held_out_frequency)) is not None:
+        _tell_table(held)
     _print_handling(run)
     if (responses := report_tables.responses(fit.responses)) is not None:
         _tell_table(responses)
@@ -93,8 +100,6 @@ def print_fit(run: FitRun, *, verbose: bool = False) -> None:
             tell(sentence)
     if run.baseline is not None:
         _print_baseline(run.baseline)
-    if run.directory is not None:
-        tell(f"report: {run.directory / 'report.html'}")
 
 
 def _shown_nuisances(nuisance: Mapping[str, Estimate]) -> dict[str, Estimate]:
@@ -189,7 +194,7 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
     verdict = check.verdict
     # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
     tell("At the start values (the fit judges at its estimates, which may differ):")
-    _print_verdict(verdict)
+    tell(verdict.text)
     rows = []
     for i, name in enumerate(verdict.names):
         # The covariance is that of the logarithms: its root is the relative sd.
@@ -203,14 +208,16 @@ def print_check(check: Check, *, verbose: bool = False) -> None:
         rows.append((name, expected, percent(verdict.prior_share[name], 0)))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
-        guess = f" ({GUESSED})" if name in check.guessed else ""
-        tell(f"noise of {name}: {terse(sd, 3)}{guess}")
-    follows = all(f.code != NOTHING_FOLLOWS for f in check.findings)
+        if verbose or name in check.guessed:
+            guess = f" ({GUESSED})" if name in check.guessed else ""
+            tell(f"noise of {name}: {terse(sd, 3)}{guess}")
     # Of a value of zero an sd is no part.
     kept = [i for i, name in enumerate(verdict.names) if name not in check.at_zero]
     sds = np.sqrt(np.diag(verdict.covariance))[kept]
-    if doubt := too_good(sds, bool(check.guessed), nothing_follows=not follows):
+    if check.guessed and (doubt := too_good(sds)):
         tell(f"! {doubt.sentence}")
+    if verbose:
+        _print_rank(verdict)
     tell("\nIs this log enough?")
     print_findings(check.findings, verbose=verbose)
 
@@ -239,8 +246,7 @@ def print_findings(findings: Sequence[Finding], *, verbose: bool) -> None:
 _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
 
 
-def _print_verdict(verdict: Verdict) -> None:
-    tell(verdict.text)
+def _print_rank(verdict: Verdict) -> None:
     values = ", ".join(terse(s, 3) for s in verdict.singular_values)
     tell(
         f"rank {verdict.rank} of {len(verdict.names)} ({verdict.rank_without_priors} without "

@@ -26,14 +26,14 @@ def bench_log(tmp_path_factory):
     """A short log of the demo's bench, as its text."""
     path = tmp_path_factory.mktemp("bench") / "bench.csv"
     how = ["--set", "simulate.duration=12", "--out", str(path)]
-    assert main(["simulate", str(ROOT / "configs" / "bench-roll.yaml"), *how]) == 0
+    assert main(["simulate", str(ROOT / "configs" / "bench-gusts.yaml"), *how]) == 0
     return path.read_text()
 
 
 @pytest.fixture
 def bench(tmp_path, bench_log):
     """The demo's configuration on a short log in a folder of its own; returns the config's path."""
-    content = yaml.safe_load((ROOT / "configs" / "bench-roll.yaml").read_text())
+    content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     content["flights"][0]["log"] = "bench.csv"
     content["simulate"]["duration"] = 12

@@ -147,5 +147,5 @@ def test_a_page_from_the_command_line(tmp_path, capfd):
     other = tmp_path / "there" / "page.html"
     assert main(["simulate", str(config), *short, "--view", str(other)]) == 0
     assert other.exists()
-    assert capfd.readouterr().out.count("\n") == 251
+    assert capfd.readouterr().out.count("\n") == 501
     assert main(["simulate", str(config), "--view", str(tmp_path / "page.pdf")]) == 2

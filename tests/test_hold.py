@@ -20,7 +20,7 @@ KEY = "flights.0.signals.inputs.x_roll.hold"
 def chirped(tmp_path_factory):
     """The demo's bench with a chirp, and its log."""
     folder = tmp_path_factory.mktemp("chirp")
-    content = yaml.safe_load((ROOT / "configs" / "bench-roll.yaml").read_text())
+    content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     content["flights"][0]["log"] = "bench.csv"
     del content["disturbance"]

@@ -61,7 +61,7 @@ def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
     assert len(program.strip().splitlines()) <= 16
     assert set(re.findall(r"from (\S+) import", program)) == {"heli_jax"}
     out = run(folder, program)
-    assert "by filter-error: converged" in out
+    assert "by output-error: converged" in out
     assert re.search(r"Ixx +0\.02\d+ .*kg m\^2", out)
     assert "'profile': (0.02" in out
     assert out.strip().splitlines()[-1].startswith("converged 0.02")

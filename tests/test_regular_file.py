@@ -101,7 +101,7 @@ def special_files(folder, ending):
 @pytest.fixture
 def configuration(tmp_path):
     """Writes the demo's configuration with some of it changed; returns its path."""
-    content = yaml.safe_load((ROOT / "configs" / "bench-roll.yaml").read_text())
+    content = yaml.safe_load((ROOT / "configs" / "bench-gusts.yaml").read_text())
     content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
     count = iter(range(1000))
 

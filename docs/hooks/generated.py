@@ -109,16 +109,22 @@ def _made() -> Path:
             for name in re.findall(r"\]\((?:\.\./)?made/([^)#]+)", page.read_text("utf-8")):
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).touch()
-        (folder / "fit.txt").write_text("converged\nacceptance card\n", encoding="utf-8")
+        (folder / "fit.txt").write_text("1\n2\n3\nacceptance card\n", encoding="utf-8")
         return folder
     shutil.copytree(_ROOT / "configs", folder / "configs")
     # Commands name files as they are told, and a page must not show where it was built.
     with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["simulate", _DEMO, "--out", "runs/demo/bench.csv"]) == 0
-        assert main(["fit", _DEMO, "--set", "fit.starts=1", "--out", "fit"]) == 0
+        assert main(["fit", _DEMO, "--verbose", "--out", "fit"]) == 0
         Path("fit.txt").write_text(printed.getvalue(), encoding="utf-8")
         assert main(["sweep", *_SWEEP, "--out", "sweep"]) == 0
     return folder
+
+
+def _statements() -> str:
+    """The three statements that the demo's fit begins with."""
+    lines = (_made() / "fit.txt").read_text(encoding="utf-8").splitlines()
+    return "\n".join(["```text", *lines[:3], "```"])
 
 
 def _printed(begins: str) -> str:
@@ -309,7 +315,7 @@ _API = {
 }
 
 _PARTS: dict[str, Callable[[], str]] = {
-    "demo-first-line": lambda: _printed("converged"),
+    "demo-statements": _statements,
     "demo-card": lambda: _printed("acceptance card"),
     "keys": _keys,
     "fit-keys": _fit_keys,

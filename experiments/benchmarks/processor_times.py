@@ -39,8 +39,8 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("simulate", ("simulate", "configs/bench-roll.yaml", "--out", "OUT.csv"), 2.5),
     Command("info", ("info", "runs/demo/bench.csv"), 0.7),
-    Command("check", ("check", "configs/bench-roll.yaml"), 2.5),
-    Command("fit", ("fit", "configs/bench-roll.yaml", "--out", "OUT"), 4.5),
+    Command("check", ("check", "configs/bench-roll.yaml"), 2.0),
+    Command("fit", ("fit", "configs/bench-roll.yaml", "--out", "OUT"), 3.5),
     Command("sweep", ("sweep", "configs/bench-sweep.yaml", "--no-figures", "--out", "OUT"), 3.5),
 )
 

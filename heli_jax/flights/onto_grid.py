@@ -245,12 +245,10 @@ def _alike(
 def _resampled_with(
     signal: Timed, inputs: Sequence[tuple[Timed, np.ndarray]], times: np.ndarray
 ) -> np.ndarray:
-    """An output that jumps with inputs, low-passed (M,).
+    """Low-pass an output (M,) that jumps with inputs.
 
-    What jumps in it is known at all times, as the inputs are, and is taken from them. Samples tell
-    of a jump only between which of them it was: low-passed by itself it would be half a step early,
-    and of another size at the end of the band. How far the output jumps is what its own moves say,
-    by least squares.
+    The jump is taken from the inputs, scaled by least squares, because it is known at all times.
+    The output's samples alone would put it half a step early.
 
     Args:
         inputs: held ones that it follows at the very sample, each with what `held_low_passed`

@@ -80,7 +80,7 @@ class TopicClock:
 
     @property
     def rounding(self) -> float:
-        """How coarsely the stamps are rounded [s]."""
+        """Rounding of the stamps [s]."""
         if self.topic.rows is None:
             return rounding_of(self.seconds)
         return rounding_of(self.topic.rows.stamps[self.rows]) * self.topic.rows.scale
@@ -92,7 +92,7 @@ class TopicClock:
         return replace(self, seconds=self.seconds[rows], rows=of_topic)
 
     def places(self, i: int) -> tuple[str, ...]:
-        """Where the i-th time stands: `line 12, column 't'`; of an autopilot's log the topic."""
+        """Place of the i-th time: `line 12, column 't'`, or the topic of an autopilot's log."""
         if self.topic.rows is None:
             return (f"topic {shown(self.name)}",)
         return self.topic.rows.table.place(self.rows.start + i), column(self.topic.clock)

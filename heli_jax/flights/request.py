@@ -1,4 +1,4 @@
-"""What is asked of a log, checked before the log is read.
+"""Request for the signals of a log, checked before the log is read.
 
 Checked before, because a log can take minutes to read, and a wrong unit or a reversed window need
 not wait for it.
@@ -50,7 +50,7 @@ class Also:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What `read_flight` takes of a log and what it makes of it; each field is also its keyword."""
+    """Options of `read_flight`; each field is also its keyword."""
 
     rate: float | None = None
     """resample to this rate [Hz]; without it the stamps must be a uniform grid"""
@@ -149,7 +149,7 @@ class Request:
 
 
 def _problem(use: str, signal: Signal) -> str:
-    """What is wrong with a signal, of a use such as `input 'u'`; empty where nothing is."""
+    """Reason why a signal is wrong for a use such as `input 'u'`; empty if it is not."""
     try:
         scale = abs(units.factor(signal.unit, signal.si))
     except ValueError as e:

@@ -14,7 +14,7 @@ from heli_jax.identification.design.windows import Ranking, rank_windows
 from heli_jax.identification.diagnostics import diagnose
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.diagnostics.excitation import (
-    excited_bands,
+    NOTHING_FOLLOWS,
     gusts_guessed,
     inputs_together,
     nothing_follows,
@@ -34,7 +34,6 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.search import SearchResult, first_guess, search
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.messages import sentence
 from heli_jax.stages import stage
 
@@ -137,7 +136,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     c = Context(problem, at, guess.e, guess.e, verdict_of(problem, guess.layout, guess.e))
     notes = (*ranking.notes, *gusts_guessed(c))
     # A record may be at rest for most of its time and still have a good window.
-    asked = (rates_enough, nothing_follows, excited_bands, inputs_together)
+    asked = (rates_enough, nothing_follows, inputs_together)
     record = tuple(
         f._replace(severity="doubt") if f.code == NOTHING_FOLLOWS else f
         for diagnostic in asked

@@ -190,18 +190,6 @@ class Fit:
         return f"Not trusted: {', '.join(each)}{f' ({"; ".join(why)})' if why else ''}."
 
     @property
-    def outcome(self) -> tuple[str, str]:
-        """The status, and what the data determine, what is not trusted and whether the model is
-        adequate: the first line of the terminal and of the page."""
-        text = " ".join(filter(None, (self.verdict.text, self.distrust)))
-        if self.status == "not-converged":
-            # What "the data determine" is a property of an optimum.
-            text = "the optimiser stopped before an optimum, and these numbers are no result."
-        is_open = self.status == "not-identifiable"
-        status = "converged, not identifiable" if is_open else self.status
-        return status, f"{text} adequate: {self.adequate_in_words}"
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """The sentences of the findings, but of those that only say that all is well."""
         return tuple(sentences(f for f in self.findings if f.severity != "ok"))
@@ -236,7 +224,7 @@ class Fit:
 
     @property
     def denials(self) -> tuple[str, ...]:
-        """Why the model is not adequate, each in a few words."""
+        """Reasons why the model is not adequate, each in a few words."""
         return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
 
     @property

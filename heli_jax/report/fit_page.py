@@ -349,12 +349,17 @@ def lines(fit: Fit) -> tuple[Line, Line, Line]:
         determined = Line("warning", "Identifiable, not trusted", text)
     adequate = Line("bad", "Not adequate", f"{'; '.join(fit.denials)}.")
     if fit.adequate:
-        shares = {n: m.vaf for n, m in fit.metrics.items() if math.isfinite(m.vaf)}
-        told = "Nothing in the record speaks against the model."
-        if shares:
-            worst = min(shares, key=lambda n: shares[n])
-            told = f"{told[:-1]}; simulated, VAF of {worst} {vaf_percent(shares[worst])}."
-        adequate = Line("good", "Adequate", told)
+        told = ["Nothing in the record speaks against the model"]
+        for agreement, how in (
+            (fit.metrics, "simulated"),
+            (fit.one_step, "one step ahead"),
+            (fit.validation, "held out"),
+        ):
+            shares = {n: m.vaf for n, m in agreement.items() if math.isfinite(m.vaf)}
+            if shares:
+                worst = min(shares, key=lambda n: shares[n])
+                told.append(f"VAF of {worst} {vaf_percent(shares[worst])} {how}")
+        adequate = Line("good", "Adequate", f"{'; '.join(told)}.")
     return Line("good", "Converged", reached), determined, adequate
 
 

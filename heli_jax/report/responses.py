@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted, forgets
@@ -14,7 +15,6 @@ from heli_jax.analysis.spectra import COHERENT
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.finding import as_data
 from heli_jax.flights.write import write_table
-from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report import tables
 from heli_jax.report.charts import Chart, Numbers
@@ -316,6 +316,22 @@ def _measured(c: Coefficient, factor: float = 1.0) -> str:
     if not c.determined:
         return "not determined"
     return with_sd(c.value * factor, c.sd * factor)
+
+
+def longest_band(
+    hz: Float[np.ndarray, " k"], good: Bool[np.ndarray, " k"]
+) -> tuple[float, float] | None:
+    """Return the widest band (in octaves) without a hole; None where nothing is good.
+
+    Args:
+        hz: rising, any unit.
+    """
+    edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    if not begins.size:
+        return None
+    widest = int(np.argmax(hz[ends] / hz[begins]))
+    return float(hz[begins[widest]]), float(hz[ends[widest]])
 
 
 def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:

@@ -12,7 +12,7 @@ from heli_jax.errors import InputError
 from .test_autopilot_logs import some_ulog
 from .test_blackbox import some_flight, some_values
 
-BENCH = Path(__file__).parents[2] / "configs" / "bench-roll.yaml"
+BENCH = Path(__file__).parents[2] / "configs" / "bench-gusts.yaml"
 
 
 def configured(tmp_path, flight):

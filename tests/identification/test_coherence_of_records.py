@@ -1,4 +1,4 @@
-"""What is said of the excited band where samples are missing, inputs are feeble, records short."""
+"""What follows the inputs where samples are missing, and rates of modes that do not swing."""
 
 from dataclasses import replace
 
@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.identification.diagnostics.excitation import excited_bands
-from heli_jax.identification.diagnostics.loop import feedback_tested
 from heli_jax.identification.diagnostics.timing import of_rates
-from heli_jax.identification.fit import context_of
-from heli_jax.identification.validation.excited_band import excitation_of, seen_parts
-from tests.identification.test_enough import DT, TRUTH, flight, found_of, problem, response
+from heli_jax.identification.validation.excitation import excitation_of
+from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 
 
 def swept(n=4000, noise=0.02):
@@ -24,55 +21,20 @@ def swept(n=4000, noise=0.02):
     return replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
 
 
-def without(f, *holes):
-    y = f.outputs["phi"].copy()
-    for hole in holes:
-        y[hole] = np.nan
-    return replace(f, outputs={"phi": y})
-
-
-def severities(f):
-    return [x.severity for x in found_of(excited_bands, f)]
-
-
-def test_few_missing_samples_leave_the_band_as_it_is():
+def test_holes_hardly_change_what_follows():
     f = swept()
-    for holes in ((), (slice(0, 17),), (slice(100, 103), slice(2000, 2005), slice(3000, 3001))):
-        assert severities(without(f, *holes)) == ["ok"]
-    # A long hole cuts the record in two, and each part has whole segments.
-    parts = seen_parts([without(f, slice(2000, 2100))]).parts
-    assert [p.n_samples for p in parts] == [2000, 1900]
-    assert severities(without(f, slice(2000, 2100))) == ["ok"]
-
-
-def test_no_coherence_is_no_tick():
-    f = swept()
-    sparse = np.full(4000, np.nan)
-    sparse[::5] = f.outputs["phi"][::5]
-    for record in (replace(f, outputs={"phi": sparse}), flight(n=150)):
-        assert severities(record) == ["note"]
-    # Beside an output that is seen.
-    assert severities(replace(f, outputs={"phi": sparse, "p": f.outputs["phi"]})) == ["ok"]
-
-
-def test_a_line_of_vibration_is_no_band():
-    rng, n = np.random.default_rng(0), 1000
-    t = np.arange(n) * DT
-    # Both hear one line, and have nothing else in common.
-    line = 5.0 * np.sin(2 * np.pi * 11.0 * t)
-    u, y = (line + rng.standard_normal(n) for _ in range(2))
-    f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
-    assert severities(f) == ["note"]
-    assert excitation_of([f]).share is not None
-
-
-def test_feedback_that_was_not_tested_is_said():
-    short = problem(replace(swept(150), sd={"phi": 0.01}))
-    [found] = feedback_tested(context_of(short))
-    assert (found.code, found.severity) == ("loop.not-tested", "note")
-    jumps = problem(flight(0))
-    [found] = feedback_tested(context_of(jumps))
-    assert (found.code, found.severity) == ("loop.not-tested", "note")
+    y, shares = f.outputs["phi"], []
+    sparse = np.full(y.size, np.nan)
+    sparse[::5] = y[::5]
+    for hole in (slice(0, 0), slice(0, 17), slice(2000, 2100)):
+        cut = y.copy()
+        cut[hole] = np.nan
+        found = excitation_of(problem(replace(f, outputs={"phi": cut, "p": sparse})))
+        # An output that is mostly missing is left out.
+        assert list(found.outputs) == ["phi"]
+        shares.append(found.outputs["phi"].explained)
+    np.testing.assert_allclose(shares, shares[0], atol=0.15)
+    assert shares[0] > 0.8
 
 
 def test_modes_that_do_not_swing_ask_for_a_rate_too():
@@ -93,33 +55,13 @@ def test_modes_that_do_not_swing_ask_for_a_rate_too():
         [found] = of_rates(asked, [{"phi": 1e-6}])
         assert found.severity == severity
         assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
-        # Guessed noise as large as the motion hides no mode; a stated one does, and it is said.
+        # Guessed noise as large as the motion hides no mode; a stated one does.
         [guessed] = of_rates(replace(asked, flights=(replace(slow, sd={}),)), [{"phi": 1.0}])
         assert guessed.severity == severity
-        [hidden] = of_rates(asked, [{"phi": 1.0}])
-        assert (hidden.severity, hidden.value) == ("doubt", None)
-
-
-@pytest.mark.parametrize("every", [1, 2])
-def test_a_machine_in_gusts_is_seen_to_follow_at_half_the_rate_too(every):
-    # 60 s: at 50 Hz there were eight segments, whose coherence had to pass 0.8.
-    rng, n = np.random.default_rng(5), 6000
-    u = np.repeat(rng.choice([-0.2, 0.2], n // 20), 20)
-    slow = scipy.signal.butter(1, 2.0, fs=100.0, output="sos")
-    gust = scipy.signal.sosfilt(slow, rng.standard_normal(n))
-    y = scipy.signal.sosfilt(slow, u)
-    y += 0.76 * np.std(y) / np.std(gust) * gust
-    signals = {"u": u[::every], "v": np.zeros(n)[::every]}
-    record = replace(
-        flight(n=n // every), dt=0.01 * every, inputs=signals, outputs={"phi": y[::every]}
-    )
-    assert severities(record) == ["ok"]
-    assert excitation_of([record]).limit == 0.6
+        assert not list(of_rates(asked, [{"phi": 1.0}]))
 
 
 def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_together():
-    """Long ones at rest set the length of segments, which the one that moves them did not fill:
-    their coherence was no number, and `nothing in the record tells what each does`."""
     rng = np.random.default_rng(0)
     sos = scipy.signal.butter(2, 1.5, fs=1 / DT, output="sos")
 
@@ -130,6 +72,6 @@ def test_flights_in_which_the_sticks_rest_say_nothing_of_whether_they_move_toget
 
     short = moved(500, 1.0)
     for resting in (0, 8):
-        found = excitation_of([short, *(moved(1500, 0.0) for _ in range(resting))])
+        found = excitation_of(problem(short, *(moved(1500, 0.0) for _ in range(resting))))
         [together] = found.pairs
-        assert together.coherence < found.pair_limit
+        assert together.coherence < 0.5

@@ -11,7 +11,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.problem import MAX_TIME_SHIFT
 from heli_jax.identification.uncertainty.estimates import StandardErrors, estimates_of
-from heli_jax.identification.validation.excitation_test import outputs_against_excitation
+from heli_jax.identification.validation.excitation import excitation_of
 from heli_jax.naming import Scalar
 from heli_jax.numerics.white_noise import noise_guess, white_part
 from tests.identification.test_enough import steps
@@ -167,11 +167,11 @@ def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate():
     record = flight(drift, noise=0.0)
     free = {"La": Free(-1.0), "K": Free(3.0)}
     problem = Problem(SUM, TRUTH, [record], free, Nuisance(bias=False), method="frequency-error")
-    assert outputs_against_excitation(problem)["p"] > 0.01
+    assert excitation_of(problem).outputs["p"].p_value > 0.01
     found = fit(problem, starts=1)
     assert not found.adequate
     assert found.adequacy.by_chance
     [none] = [f for f in found.findings if f.denies]
     assert (none.code, none.severity) == ("excitation.no-output-follows", "refuse")
     assert "loop.no-instrument" not in {f.code for f in found.findings}
-    assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
+    assert excitation_of(Problem(SUM, TRUTH, [FIRST], free)).outputs["p"].p_value < 1e-10

@@ -129,10 +129,10 @@ def test_they_widen_with_autocorrelated_residuals(bench_run, resting):
         assert c.sd > 2.0 * resting.verdict.combinations[0].sd or name != "Ixx"
 
 
-def test_check_warns_of_sampling_and_excitation():
+def test_check_warns_of_feeble_excitation():
     weak = record(BENCH, seed=3, n=N, amplitude=1e-9)
     found = codes(weak, started(BENCH, 1.0, 1.0))
-    assert {"timing.rate-not-judged", "excitation.feeble"} <= found
+    assert "excitation.feeble" in found
 
 
 def test_added_inertia_determines_all_three():

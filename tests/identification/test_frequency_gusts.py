@@ -8,8 +8,8 @@ import scipy.linalg
 import scipy.signal
 
 from heli_jax.identification.diagnostics.loop import moved_by_feedback
+from heli_jax.identification.estimation.frequency_lines import Matrices
 from heli_jax.identification.estimation.frequency_noise import (
-    Machine,
     inverse_roots,
     smoothed,
     whitening_by,
@@ -30,6 +30,10 @@ def discrete(A: list, B: list) -> tuple[np.ndarray, np.ndarray]:
     M[:n, :n], M[:n, n:] = A, B
     E = scipy.linalg.expm(M * DT)
     return E[:n, :n], E[:n, n:]
+
+
+def machine(Ad: np.ndarray, C: np.ndarray) -> Matrices:
+    return Matrices(Ad, np.zeros((len(Ad), 0)), C, np.zeros((len(C), 0)))
 
 
 def gust(rng: np.random.Generator, size: float) -> np.ndarray:
@@ -56,7 +60,7 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
         covariance = (W @ S @ np.conj(np.swapaxes(W, 1, 2)))[: round(10.0 * N * DT)]
         return np.linalg.eigvalsh(covariance)
 
-    by = sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0])
+    by = sizes(whitening_by(machine(Ad, np.eye(3)), errors)[0])
     plain = sizes(inverse_roots(smoothed(errors)[0]))
     assert np.mean(by) == pytest.approx(1.0, abs=0.1)
     # What an integration shows twice is known far better than a mean over lines has it.
@@ -77,15 +81,15 @@ def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
     errors = [
         colour * (rng.standard_normal((K, 2)) + 1j * rng.standard_normal((K, 2))) for _ in range(2)
     ]
-    alone = whitening_by(Machine(Ad[:2, :2], np.eye(2)), errors)[0]
+    alone = whitening_by(machine(Ad[:2, :2], np.eye(2)), errors)[0]
     for rounding in (0.0, 1e-17, -1e-16):
         Ad[:2, 2] = rounding
-        by = whitening_by(Machine(Ad, np.eye(3)[:2]), errors)[0]
+        by = whitening_by(machine(Ad, np.eye(3)[:2]), errors)[0]
         assert np.max(np.abs(by - alone)) < 1e-9 * np.max(np.abs(alone))
 
 
 def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
-    moved = {"Mm": Moved(0.0, 0.6), "Ll": Moved(2.0, 0.1), "Lp": Moved(0.0, 0.0)}
+    moved = {"Mm": Moved(0.6), "Ll": Moved(0.1, 0.2), "Lp": Moved(0.0)}
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
     assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
     assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
@@ -93,7 +97,7 @@ def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     [found] = trust({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
     assert (found.code, found.severity) == ("loop.no-instrument", "doubt")
     assert found.distrusts == ("Mm",)
-    [found] = trust({"Lp": Moved(0.0, 0.003)}, Loop(loops))
+    [found] = trust({"Lp": Moved(0.003)}, Loop(loops))
     assert (found.severity, found.value, found.distrusts) == ("note", 0.003, ())
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]

@@ -14,7 +14,6 @@ from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.identification.diagnostics import quality, units
-from heli_jax.identification.validation.shifts import lateness
 from heli_jax.identification.validation.signal_signs import angle_over_rate, oversized
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
@@ -165,7 +164,6 @@ def test_a_roll_that_was_flown_is_no_wrong_unit(every):
 def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
     log = np.genfromtxt(TREX / name, delimiter=",", names=True)
     for angle, rate in (("phi", "p"), ("theta", "q"), ("psi", "r")):
-        assert lateness(log[angle], log[rate], 0.01) is None
         ratio = angle_over_rate(log[angle], log[rate], 0.01)
         assert ratio is None or ratio.factor > 0
 

@@ -1,7 +1,5 @@
 """Signs, units and clocks of signals that do not go together, and those that do."""
 
-import runpy
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +10,7 @@ from heli_jax import Flight, linear_model
 from heli_jax.identification.diagnostics.timing import inputs_late
 from heli_jax.identification.diagnostics.units import outputs_against_start, rate_against_angle
 from heli_jax.identification.validation.follows_response import Feedback
-from heli_jax.identification.validation.shifts import late_angles, lateness
 from heli_jax.identification.validation.signal_signs import against_start, sticks_of
-from heli_jax.models import with_filters
 from tests.identification.test_enough import DT, SWING, problem, response, steps
 
 N = 1000
@@ -151,86 +147,6 @@ def test_an_output_before_its_stick_is_said_before_any_fit():
     assert said_of(good) == []
     assert said_of(bad) == [("timing.output-leads", "doubt")]
     assert said_of(bad, Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)) == []
-
-
-def swings(seed, late=0.0, n=1500):
-    """An angle in closed form, logged late, and its rate, with the noise of sensors."""
-    rng = np.random.default_rng(seed)
-    size, phase = rng.uniform(0.02, 0.1, (8, 1)), rng.uniform(0.0, 2 * np.pi, (8, 1))
-    omega, t = 2 * np.pi * rng.uniform(0.1, 1.5, (8, 1)), DT * np.arange(n)
-    phi = np.sum(size * np.sin(omega * (t - late) + phase), axis=0)
-    p = np.sum(size * omega * np.cos(omega * t + phase), axis=0)
-    return phi + 0.003 * rng.standard_normal(n), p + 0.02 * rng.standard_normal(n)
-
-
-def late_said(phi, p, model=None):
-    u = np.zeros(phi.size)
-    flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
-    found = late_angles(model or SWING, [("flight 1", flight)])
-    return [late.late for *_, late in found]
-
-
-@pytest.mark.parametrize("late", [0.05, 0.1, -0.05])
-def test_an_angle_that_is_logged_late_against_its_rate_is_said(late):
-    off = []
-    for seed in range(10):
-        phi, p = swings(seed, late)
-        found = lateness(phi, p, DT)
-        assert late_said(phi, p) == [found.late]
-        off.append((found[0] - late) / found[1])
-        # Slower, as attitude mostly is, and off by a scale and a bias.
-        slow = np.where(np.arange(phi.size) % 5 == 0, phi, np.nan)
-        assert late_said(1.0 + slow, 0.9 * p - 0.2)
-        # Lost for a second in two, or for one half of the record.
-        for lost in ((DT * np.arange(phi.size)) % 2.0 < 1.0, np.arange(phi.size) < phi.size // 2):
-            found = lateness(np.where(lost, np.nan, phi), p, DT)
-            assert abs(found.late - late) < max(5.0 * found.sd, 0.005)
-    assert np.sqrt(np.mean(np.square(off))) < 2.0
-
-
-@pytest.mark.parametrize("late", [0.5, -0.5, 1.3])
-def test_a_long_delay_of_an_angle_is_said(late):
-    for seed in range(10):
-        assert late_said(*swings(seed, late)) == [pytest.approx(late, abs=0.05)]
-
-
-def test_the_delay_of_a_motion_that_repeats_itself_is_not_sure():
-    t = DT * np.arange(1500)
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        omega = 2 * np.pi / rng.uniform(0.8, 2.0)
-        noise = 0.003 * rng.standard_normal((2, t.size))
-        p = 0.1 * omega * np.cos(omega * t) + noise[1]
-        assert late_said(0.1 * np.sin(omega * t) + noise[0], p) == []
-        assert late_said(0.1 * np.sin(omega * (t - 0.5)) + noise[0], p)
-
-
-def test_an_angle_that_is_on_time_is_not_called_late():
-    for seed in range(10):
-        assert late_said(*swings(seed)) == []
-        assert late_said(*swings(seed, 0.008)) == []
-        assert late_said(*moved(seed)[1:]) == []
-        assert late_said(swings(seed, 0.1)[0], swings(seed + 50)[1]) == []
-
-
-def test_rotation_about_other_axes_is_no_delay():
-    path = Path(__file__).parents[2] / "experiments" / "data_compatibility.py"
-    Motion = runpy.run_path(str(path))["Motion"]
-    t = 0.04 * np.arange(700)
-    for seed in range(8):
-        motion, rng = Motion(np.random.default_rng(seed)), np.random.default_rng(seed + 100)
-        # Twice as large as there: angles up to 50 degrees.
-        motion.amplitude = 2.0 * motion.amplitude
-        for angle, rate in zip(motion.angles(t).T, motion.omega(t).T, strict=True):
-            found = lateness(angle + 0.006 * rng.standard_normal(t.size), rate, 0.04)
-            assert found is None or abs(found[0]) < max(0.04, 4.0 * found[1])
-
-
-def test_a_delay_that_the_model_has_is_not_said():
-    phi, p = swings(1, 0.1)
-    known = with_filters(SWING, {"phi": ()}, {"phi": 0.1})
-    assert late_said(phi, p)
-    assert late_said(phi, p, known) == []
 
 
 def swept_and_held(seed=0, held_by=0.3, swept=0.0, sign=1.0):

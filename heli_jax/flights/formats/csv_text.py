@@ -387,7 +387,7 @@ class CsvTable:
 
     @property
     def sha256(self) -> str:
-        """Of the file."""
+        """Fingerprint of the file."""
         return self._digest.hex()
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -429,7 +429,7 @@ class CsvTable:
         return f"line {self._record(row)[0]}"
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """Text of a cell."""
         cell = self._record(row)[1][self.names.index(name)].strip()
         return shown(cell) if cell else "nothing"
 

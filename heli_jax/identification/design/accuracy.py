@@ -97,22 +97,18 @@ GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
 """of a noise that nobody stated"""
 _TOO_GOOD = 1e-3
 """relative sd below which no parameter of a helicopter is known: models and sensors are worse"""
-_WORTH_DOUBT = 0.1
-"""relative sd above which nobody takes an expectation for a promise"""
 
 
-def too_good(
-    sds: Sequence[float] | np.ndarray, guessed: bool, *, nothing_follows: bool = False
-) -> Finding | None:
-    """Return a finding if expected sds are too small to be true."""
+def too_good(sds: Sequence[float] | np.ndarray) -> Finding | None:
+    """Return a finding if expected sds are too small to be true.
+
+    Args:
+        sds: relative, where the noise was guessed.
+    """
     least = float(np.min(sds, initial=np.inf))
-    if nothing_follows and least < _WORTH_DOUBT:
-        code = "accuracy.nothing-follows"
-    elif guessed and least < _TOO_GOOD:
-        code = "accuracy.guessed-noise"
-    else:
+    if not least < _TOO_GOOD:
         return None
-    return found(code, value=least, percent=100.0 * least)
+    return found("accuracy.guessed-noise", value=least, percent=100.0 * least)
 
 
 def starting_at_zero(problem: Problem) -> dict[str, tuple[float, str]]:

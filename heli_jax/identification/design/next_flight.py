@@ -1,20 +1,17 @@
-"""Outputs and manoeuvres to add to a record, by Fisher's information at the start values.
+"""The manoeuvre to add to a record, by Fisher's information at the start values.
 
-The Jacobian gets the rows of outputs that the log lacks, as the model shows them; and candidates of
-the same duration and amplitude as the record are flown, one input at a time: doublets, 3-2-1-1
-steps and a chirp, and the record once more for comparison (input design over a few manoeuvres that
-a pilot can fly: Mehra, 1974; Jategaonkar, 2006, chapter 2).
+Candidates of the duration and amplitude of the record are flown, one input at a time: doublets,
+3-2-1-1 steps and a chirp, and the record once more for comparison (input design over a few
+manoeuvres that a pilot can fly: Mehra, 1974; Jategaonkar, 2006, chapter 2).
 """
 
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.design.accuracy import (
     FREE,
@@ -27,124 +24,14 @@ from heli_jax.identification.design.accuracy import (
 )
 from heli_jax.identification.design.windows import DETERMINES
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
-from heli_jax.identification.estimation.simulated_flights import signal_numbers, signals
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
-    Data,
     Layout,
     Solution,
     flight_places,
     layout_of,
 )
 from heli_jax.simulation.inputs import chirp, multistep_3211
-
-TYPICAL = {"rad": 0.01, "rad/s": 0.01, "m": 0.5, "m/s": 0.1, "m/s^2": 0.3}
-"""noise of small autopilots' sensors (attitude, gyro, GPS position and velocity, accelerometer),
-SI, by unit: for outputs of a unit that no measured output has"""
-
-
-class MissingOutput(NamedTuple):
-    """One output that the log lacks."""
-
-    name: str
-    sd: float
-    """of the noise that it is taken to have [SI]"""
-    ratios: Float[np.ndarray, " q"]
-    """sd of each parameter of interest with it, over that without; 0 where only it determines"""
-    before: Float[np.ndarray, " q"]
-    """relative sd of each without it"""
-
-
-def look_at_missing(
-    problem: Problem, at: Solution
-) -> tuple[tuple[str, ...], list[MissingOutput]] | None:
-    """Return the parameters of interest, and for each output that no flight has what it would do;
-    None where the method's rows are not samples of one output each.
-    """
-    # The rows of a filter's predictions belong to all outputs together, which say each other's.
-    if at.layout.noise_model != "white":
-        return None
-    have = {n for names in at.layout.outputs for n in names}
-    lacking = [n for n in naming.names(problem.model.Outputs) if n not in have]
-    if not lacking:
-        return at.layout.of_interest, []
-    layout, data, z = _extended(problem, at, lacking)
-    # Of noise one here: rows are divided by the right one once the simulation shows it.
-    noise = at.noise._replace(sd=tuple({**sd, **dict.fromkeys(lacking, 1.0)} for sd in at.noise.sd))
-    noise = jax.tree.map(lambda v: np.asarray(v, z.dtype), noise)
-    e = evaluate(layout, data, noise, z)
-    sds = _noises(problem, at, e.simulated, lacking)
-    s = sensitivity_at(problem, layout, e)
-    # The output of each row; what follows the samples belongs to every choice.
-    numbers, named = signal_numbers(layout, data), np.array([n for _, n in signals(layout)])
-    output = np.concatenate([named[numbers], np.full(len(s.shared) - numbers.size, "")])
-    shared, own = s.shared.copy(), s.own.copy()
-    for name, sd in sds.items():
-        shared[output == name] /= sd
-        own[output == name] /= sd
-        each = zip(flight_places(layout), layout.outputs, e.simulated, strict=True)
-        for places, outputs, run in each if layout.bias else ():
-            # A weak prior of ten times the signal, as of the outputs that are measured.
-            bias = places.biases[outputs.index(name)] - layout.first_nuisance
-            own[:, bias] *= 10.0 * float(np.sqrt(np.mean(run[name] ** 2)))
-    s = s._replace(shared=shared, own=own)
-    used = ~np.isin(output, lacking)
-    before, results = expected_sd(s.unknowns, triangle(s.part(used))), []
-    for name, sd in sds.items():
-        after = expected_sd(s.unknowns, triangle(s.part(used | (output == name))))
-        # What nothing determines before and after is as it was; what only the further output
-        # determines is infinitely better.
-        ratio = np.where(np.isfinite(after), 0.0, 1.0)
-        both = np.isfinite(before) & np.isfinite(after) & (before > 0)
-        np.divide(after, before, out=ratio, where=both)
-        results.append(MissingOutput(name, sd, ratio, before))
-    return at.layout.of_interest, results
-
-
-def _extended(problem: Problem, at: Solution, lacking: list[str]) -> tuple[Layout, Data, jax.Array]:
-    """Layout, data and unknowns with further outputs, of which nothing is measured yet."""
-    dtype, flights, parts, whole = at.z.dtype, [], [], np.asarray(at.z)
-    z, ones = [whole[: at.layout.first_nuisance]], {n: jnp.ones((), dtype) for n in lacking}
-    own = flight_places(at.layout)
-    for flight, numbers, places in zip(problem.training, at.data.flights, own, strict=True):
-        zeros = np.zeros(flight.n_samples)
-        flights.append(replace(flight, outputs={**flight.outputs, **dict.fromkeys(lacking, zeros)}))
-        outputs = {**numbers.outputs, **{n: jnp.asarray(zeros, dtype) for n in lacking}}
-        scales = {**numbers.bias_scale, **ones}
-        parts.append(
-            numbers._replace(
-                outputs=dict(sorted(outputs.items())), bias_scale=dict(sorted(scales.items()))
-            )
-        )
-        # Biases are zero at the start values, so that only their number counts.
-        zero = np.zeros(len(lacking) if at.layout.bias else 0)
-        z += [whole[places.states.ravel()], zero, whole[places.constants]]
-    layout = layout_of(problem, tuple(flights))
-    data = at.data._replace(flights=tuple(parts))
-    return layout, data, jnp.asarray(np.concatenate(z), dtype)
-
-
-def _noises(
-    problem: Problem,
-    at: Solution,
-    simulated: tuple[dict[str, np.ndarray], ...],
-    lacking: list[str],
-) -> dict[str, float]:
-    """The noise that each missing output is taken to have; none of what stands still."""
-    record, by_unit = problem.model.Outputs, {}
-    for sd in at.noise.sd:
-        for n, size in sd.items():
-            by_unit.setdefault(naming.unit(record, n), []).append(float(size))
-    sds = {}
-    for n in lacking:
-        unit = naming.unit(record, n)
-        # A gyro has one noise in all its axes; of a unit that nothing measures yet that of small
-        # autopilots' sensors, and of any other it is not known what it would be measured with.
-        sd = float(np.median(by_unit[unit])) if unit in by_unit else TYPICAL.get(unit or "")
-        if sd is not None and any(np.std(run[n]) > 0 for run in simulated):
-            sds[n] = sd
-    return sds
-
 
 _STEPS = (0.2, 0.5, 1.0)
 """lengths of the shortest step of a candidate [s]"""

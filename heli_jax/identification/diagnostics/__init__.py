@@ -50,7 +50,6 @@ DIAGNOSTICS: tuple[Diagnostic, ...] = (
     search.prior_contradicted,
     search.profile_intervals,
     search.band_unused,
-    loop.feedback_tested,
 )
 """causes first: of two findings as severe the first one is shown first"""
 

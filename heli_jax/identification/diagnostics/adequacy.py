@@ -4,18 +4,24 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.finding import Finding, found, note
 from heli_jax.identification.agreement import pooled_metrics
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.validation.adequacy import (
     EXPECTED,
     EXPLAINED,
+    FAR_FROM_WHITE,
     GATE,
     WORSE,
     OutputAdequacy,
-    advice_for,
 )
-from heli_jax.identification.validation.excitation_test import LEVEL
+from heli_jax.identification.validation.excitation import LEVEL
+from heli_jax.identification.validation.held_out import HeldOutFlight
+from heli_jax.messages import sentence
+
+_DIVERGED = 10.0
+"""times the measured range, beyond which a simulation has left it"""
 
 
 def outputs_explained(c: Context) -> Iterator[Finding]:
@@ -37,8 +43,33 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
             lag1=output.lag1,
             times=np.sqrt(output.against_disturbance or np.nan),
             seconds=c.adequacy.ahead or 0.0,
-            advice=advice_for(c.problem, output, c.records, c.adequacy.unstable),
+            advice=_advice(c, output),
         )
+
+
+def _advice(c: Context, output: OutputAdequacy) -> str:
+    """Advice on an output that is not explained: the most telling that is not followed yet."""
+    problem, name = c.problem, output.output
+    filtered = problem.noise_model == "disturbance"
+    diverged = any(
+        not np.max(np.abs(r.simulated[name])) <= _DIVERGED * np.nanmax(np.abs(r.measured[name]))
+        for r in c.records
+        if name in r.measured
+    )
+    if problem.window is not None and diverged:
+        return sentence("advice.shorter-windows")
+    # Filter error corrects its states at every sample, and needs no windows.
+    if problem.window is None and (diverged or c.adequacy.unstable) and not filtered:
+        return sentence(
+            "advice.windows",
+            state="" if problem.nuisance.initial_state else "fit.nuisance.initial_state",
+            shift="fit.nuisance.time_shift" if problem.nuisance.time_shift else "",
+        )
+    if output.lag1 > FAR_FROM_WHITE and not filtered:
+        axes = disturbable(problem.model)
+        code = "advice.disturbance" if axes else "advice.other-model"
+        return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
+    return sentence("advice.columns") if output.vaf >= 0 else ""
 
 
 def _why(output: OutputAdequacy, ahead: float | None) -> str:
@@ -58,7 +89,7 @@ def _why(output: OutputAdequacy, ahead: float | None) -> str:
 
 
 def simulation_as_expected(c: Context) -> Iterator[Finding]:
-    """What looks bad and is what the estimated disturbance makes."""
+    """Agreement that looks bad because of the estimated disturbance."""
     if not c.fitted or c.adequacy.by_chance:
         return
     if c.adequacy.ahead is not None:
@@ -92,16 +123,14 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
         return
     for output in c.adequacy.judged:
         if output.output in c.adequacy.unmoved:
-            filtered = output.against_disturbance is not None
-            code = "adequacy.output-not-predicted" if filtered else "adequacy.output-unmoved"
-            yield found(code, "doubt", output.output, value=output.vaf)
+            yield found("adequacy.output-unmoved", "doubt", output.output, value=output.vaf)
     for name in c.adequacy.still:
         yield found("quality.never-moves", "doubt", name)
 
 
 def responses_explained(c: Context) -> Iterator[Finding]:
-    """Whether fitted frequency responses are explained: by the squared errors over their variance,
-    which gusts do not change."""
+    """Fitted frequency responses that are not explained, by their squared errors over the
+    variance."""
     if c.responses is None or c.unrelated:
         return
     if c.responses.misfit:
@@ -126,7 +155,7 @@ WRONG_OPTIMUM = "search.wrong-optimum"
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
-    """Whether what is left of a record in frequency still follows what excites the vehicle."""
+    """Residuals in frequency that still follow the excitation."""
     if not c.fitted or c.unrelated:
         return
     level, failed = LEVEL / max(len(c.followed), 1), c.failed
@@ -152,8 +181,7 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
-    """Whether any output follows what excites the vehicle: residuals that do not are no merit where
-    the outputs do not either."""
+    """Outputs that do not follow the excitation, so that their residuals do not either."""
     if not c.unrelated:
         return
     least = min(c.unrelated.values())
@@ -175,16 +203,45 @@ def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
 
 def held_out_predicted(c: Context) -> Iterator[Finding]:
     """Flights held out that the model does not predict."""
-    yield from c.held_out.notes
-    if c.held_out.in_frequency is not None:
-        yield from c.held_out.in_frequency.findings
-        return
+    held = c.held_out
+    astray = [
+        s.flight
+        for s in held.signals
+        if not all(np.isfinite(v).all() for v in s.simulated.values())
+    ]
+    if astray:
+        yield found("held-out.not-finite", "note", *astray)
+    elif not held.converged:
+        yield found("held-out.nuisances-not-found", "note")
+    if held.in_frequency is not None:
+        for label in held.in_frequency.not_judged:
+            yield found("held-out.not-judged", "note", label, flight=label)
+        for flight in held.in_frequency.flights:
+            yield from _contradicted(flight)
     # With gusts in the model, or no simulation in the fit, a simulation says little.
-    if c.at.layout.noise_model != "white":
-        return
-    for name, m in pooled_metrics(c.held_out.signals).items():
-        # By more than chance makes of an output that does not respond.
-        if not m.vaf >= WORSE:
-            yield found(
-                "held-out.worse-than-mean", "doubt", name, value=m.vaf, denies=True, limit=WORSE
-            )
+    elif c.at.layout.noise_model == "white":
+        for name, m in pooled_metrics(held.signals).items():
+            # By more than chance makes of an output that does not respond.
+            if not m.vaf >= WORSE:
+                code = "held-out.worse-than-mean"
+                yield found(code, "doubt", name, value=m.vaf, denies=True, limit=WORSE)
+
+
+def _contradicted(flight: HeldOutFlight) -> Iterator[Finding]:
+    """A flight held out of a fit in frequency that contradicts it."""
+    label, furthest = flight.flight, flight.furthest
+    if flight.worse:
+        code = "held-out.worse-than-none"
+        numbers = {"flight": label, "names": flight.worse}
+        yield found(code, "doubt", label, *flight.worse, denies=True, **numbers)
+    if flight.differs and furthest is not None:
+        yield found(
+            "held-out.other-estimates",
+            "doubt",
+            label,
+            value=flight.estimates_p_value,
+            shifts={furthest.parameter: furthest.own - furthest.fitted},
+            limit=LEVEL,
+            flight=label,
+            **furthest._asdict(),
+        )

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.finding import Finding
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.agreement import (
     correlated_residuals,
@@ -51,13 +50,13 @@ from heli_jax.identification.validation.closed_loop_trust import (
     held_upright,
     moved_by_feedback,
 )
-from heli_jax.identification.validation.excitation_test import (
+from heli_jax.identification.validation.excitation import (
     LEVEL,
+    Excitation,
     Followed,
-    outputs_against_excitation,
+    excitation_of,
     residual_against_excitation,
 )
-from heli_jax.identification.validation.excited_band import Excitation, excitation_of
 from heli_jax.identification.validation.follows_response import Feedback, feedback_of
 from heli_jax.identification.validation.held_out import (
     HeldOutFrequency,
@@ -90,7 +89,8 @@ class HeldOut(NamedTuple):
     signals: tuple[Signals, ...] = ()
     free_run: tuple[Signals, ...] = ()
     """with windows: simulated in one piece"""
-    notes: tuple[Finding, ...] = ()
+    converged: bool = True
+    """whether their initial states and biases were found"""
     in_frequency: HeldOutFrequency | None = None
 
 
@@ -157,7 +157,7 @@ class Context:
     @cached_property
     def excitation(self) -> Excitation:
         """Frequencies that the inputs excite, and outputs that follow them."""
-        return excitation_of(self.problem.training)
+        return excitation_of(self.problem)
 
     # What is left of the record.
 
@@ -320,7 +320,7 @@ class Context:
         that holds of every output; else empty."""
         if not (self.fitted and self.at.layout.noise_model == "spectrum"):
             return {}
-        p_values = outputs_against_excitation(self.problem)
+        p_values = {n: f.p_value for n, f in self.excitation.outputs.items()}
         return {} if any(p < LEVEL / len(p_values) for p in p_values.values()) else p_values
 
     @property
@@ -337,11 +337,8 @@ class Context:
             Record(s.flight, flight.dt, s.measured, s.simulated)
             for s, (_, flight) in zip(self.signals, self.flights, strict=True)
         )
-        innovations = tuple(
-            None if s.innovations is None else dict(s.innovations) for s in self.signals
-        )
         unknowns = self.at.layout.determined
-        return Evidence(records, self.metrics, self.whiteness, expected, unknowns, innovations)
+        return Evidence(records, self.metrics, self.whiteness, expected, unknowns)
 
     @property
     def _predicted(self) -> Evidence:
@@ -471,7 +468,7 @@ class Context:
         if self.arrived:
             feedback = (self.loop.held or self.follows) and not self.instruments
             in_frequency = validate_in_frequency(problem, at, self.e, flights, feedback=feedback)
-        return HeldOut(signals_of(checked.e, flights), free_run, checked.notes, in_frequency)
+        return HeldOut(signals_of(checked.e, flights), free_run, checked.converged, in_frequency)
 
     @cached_property
     def rounding(self) -> bool:

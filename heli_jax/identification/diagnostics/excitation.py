@@ -8,11 +8,13 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.finding import Finding, found
 from heli_jax.identification.design.accuracy import unstated_gusts
-from heli_jax.identification.design.next_flight import look_at_missing, plan_next_flight
+from heli_jax.identification.design.next_flight import plan_next_flight
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.unknowns.layout import unpack
-from heli_jax.identification.validation.excitation_test import outputs_against_excitation
-from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS, least_rough
+from heli_jax.identification.validation.excitation import least_rough
+
+NOTHING_FOLLOWS = "excitation.nothing-follows"
+"""code of a record in which no output follows the inputs"""
 
 
 @dataclass(frozen=True)
@@ -20,26 +22,20 @@ class Limits:
     """Limits from which a record is doubted, and from which a number is told."""
 
     nothing: float = 0.2
-    """part of the power of each output below which inputs that no output follows over a band tell
-    nothing, where they follow the response or none of it is beyond chance: a vehicle that was not
-    flying had 0.11"""
+    """part of the power of each output that follows the inputs, below which nothing is found in the
+    record: a vehicle that was not flying had 0.11"""
     chance: float = 0.1
     """p value of the output that follows the inputs most surely, from which on none is taken to: of
     a vehicle in strong gusts it is far less"""
+    together: float = 0.8
+    """coherence of two inputs, the others taken out, from which on they move together: the variance
+    of what each does is 1 / (1 - 0.8) = 5 times as large as if the other were still"""
     noise: float = 0.5
     """mean squared step of an output over that of white noise, above which it shows no motion"""
     feeble: float = 3.0
     """rms of a response over the noise, below which an input hardly excites the model"""
-    narrows: float = 0.9
-    """of an interval's width, below which an output that is not used is told"""
-    halves: float = 0.5
-    """of an interval's width: an output that does that is missed"""
-    known: float = 0.1
-    """relative sd of a parameter below which nothing is missed"""
     better: float = 0.98
     """of the sd that the same record again would leave: less is no reason to fly something else"""
-    named: int = 3
-    """outputs and parameters that are told"""
 
 
 LIMITS = Limits()
@@ -50,72 +46,56 @@ def _explained(c: Context) -> bool:
     return c.fitted and c.status == "converged" and not c.adequacy.denied
 
 
-def excited_bands(c: Context) -> Iterator[Finding]:
-    """The band that each input excites, and the output that follows it there."""
-    if _explained(c):
-        return
-    for name, (low, high) in c.excitation.powers.items():
-        best = c.excitation.followed.get(name)
-        code, severity = "excitation.excited-band", "ok"
-        if not c.excitation.followed:
-            code, severity = "excitation.coherence-unknown", "note"
-        elif best is None:
-            # No pass: this input alone moves nothing, though several together may.
-            code, severity = "excitation.input-alone", "note"
-        yield found(
-            code,
-            severity,
-            name,
-            value=best.coherence if best else None,
-            low=low,
-            high=high,
-            output=best.output if best else "",
-            begin=best.low if best else 0.0,
-            end=best.high if best else 0.0,
-            left_out=", ".join(c.excitation.left_out),
-            limit=c.excitation.limit,
-        )
-
-
 def nothing_follows(c: Context) -> Iterator[Finding]:
-    """Records in which no output follows any input, or no input moves."""
+    """Records in which no output follows the inputs, or no input moves."""
     if _explained(c):
         return
-    limit, share = LIMITS.nothing, c.excitation.share
+    limit, outputs = LIMITS.nothing, c.excitation.outputs.values()
     if not c.excitation.powers:
         name, rough = least_rough(c.problem.training)
         if rough > LIMITS.noise:
             yield found(NOTHING_FOLLOWS, "refuse", value=0.0, limit=limit)
         else:
             yield found("excitation.free-motion", "note", name, value=rough, limit=LIMITS.noise)
-    elif share is not None:
-        severity = "doubt"
-        if share < limit:
-            # What the two have in common is chance, or comes from inputs that follow the response:
-            # a rate loop on the ground.
-            p_values = outputs_against_excitation(c.problem)
-            by_chance = min(p_values.values(), default=1.0) >= LIMITS.chance
-            severity = "refuse" if by_chance or c.follows else "doubt"
-        yield found(NOTHING_FOLLOWS, severity, value=share, limit=limit)
+    elif outputs and (share := max(f.explained for f in outputs)) < limit:
+        # What the two have in common is chance, or comes from inputs that follow the response: a
+        # rate loop on the ground.
+        by_chance = min(f.p_value for f in outputs) >= LIMITS.chance
+        severity = "refuse" if by_chance or c.follows else "doubt"
+        yield found(NOTHING_FOLLOWS, severity, value=max(share, 0.0), limit=limit)
+
+
+def excited_bands(c: Context) -> Iterator[Finding]:
+    """The bands that the inputs excite, and the outputs that follow."""
+    following = {
+        n: f.explained for n, f in c.excitation.outputs.items() if f.explained >= LIMITS.nothing
+    }
+    if following and not c.fitted:
+        bands = c.excitation.powers
+        yield found(
+            "excitation.excited-band",
+            "ok",
+            *bands,
+            value=max(following.values()),
+            bands=[f"{n} {low:.2g} to {high:.2g} Hz" for n, (low, high) in bands.items()],
+            outputs=list(following),
+            shares=list(following.values()),
+            limit=LIMITS.nothing,
+        )
 
 
 def inputs_together(c: Context) -> Iterator[Finding]:
-    """Inputs that move together, so that their effects cannot be told apart."""
-    if _explained(c):
-        return
-    limit = c.excitation.pair_limit
-    for i, (names, coherence) in enumerate(c.excitation.pairs):
-        if coherence >= limit:
+    """Inputs that move together, so that their effects cannot be separated."""
+    for names, coherence in () if _explained(c) else c.excitation.pairs:
+        if coherence >= LIMITS.together:
             yield found(
                 "excitation.inputs-together",
                 "doubt",
                 *names,
                 value=coherence,
                 wider=max(1.0 - coherence, 1e-12) ** -0.5,
-                limit=limit,
+                limit=LIMITS.together,
             )
-        elif i == 0:
-            yield found("excitation.inputs-apart", "ok", *names, value=coherence, limit=limit)
 
 
 def feeble_inputs(c: Context) -> Iterator[Finding]:
@@ -150,53 +130,19 @@ def gusts_guessed(c: Context) -> Iterator[Finding]:
         yield found("noise.gusts-guessed", "note", *guessed, sizes=sizes)
 
 
-def missing_outputs(c: Context) -> Iterator[Finding]:
-    """Outputs that the model has and the log lacks, and that would narrow intervals."""
-    unknowns, missing = (None if c.fitted else look_at_missing(c.problem, c.at)) or ((), [])
-    missing = sorted(missing, key=lambda m: float(np.min(m.ratios)))
-    if missing and not np.min(missing[0].ratios) < LIMITS.narrows:
-        least = float(np.min(missing[0].ratios))
-        yield found(
-            "excitation.no-missing-output", "ok", missing[0].name, value=least, limit=LIMITS.narrows
-        )
-        return
-    for m in missing[: LIMITS.named]:
-        order = [i for i in np.argsort(m.ratios) if m.ratios[i] < LIMITS.narrows][: LIMITS.named]
-        if not order:
-            continue
-        # What is known well already need not be known better.
-        missed = np.any((m.ratios < LIMITS.halves) & ~(m.before < LIMITS.known))
-        yield found(
-            "excitation.missing-output",
-            "doubt" if missed else "ok",
-            m.name,
-            value=float(m.ratios[order[0]]),
-            sd=m.sd,
-            unit=naming.unit(c.problem.model.Outputs, m.name) or "",
-            parameters=[unknowns[i] for i in order],
-            ratios=[float(m.ratios[i]) for i in order],
-            limit=LIMITS.halves,
-        )
-
-
 def next_flight(c: Context) -> Iterator[Finding]:
-    """The manoeuvre that narrows the widest interval most."""
+    """The manoeuvre that narrows the widest interval most, if one does more than the same record
+    again."""
     plan = None if c.fitted else plan_next_flight(c.problem, c.at, c.e)
-    if plan is None:
+    if plan is None or not plan.after < LIMITS.better * plan.again:
         return
-    determines = np.isfinite(plan.after)
-    ratio = plan.after / plan.again if determines and plan.again > 0 else 1.0
-    code = "excitation.next-flight" if ratio < LIMITS.better else "excitation.fly-again"
-    if not determines:
-        code = "excitation.no-flight-determines"
-    elif not np.isfinite(plan.before):
-        code = "excitation.flight-determines"
     unit = naming.unit(c.problem.model.Inputs, plan.best.input) or ""
+    determined = bool(np.isfinite(plan.before))
     yield found(
-        code,
+        "excitation.next-flight" if determined else "excitation.flight-determines",
         "note",
         plan.parameter,
-        value=ratio,
+        value=plan.after / plan.again if determined else 0.0,
         before=100.0 * plan.before,
         again=100.0 * plan.again,
         after=100.0 * plan.after,
@@ -216,6 +162,5 @@ DIAGNOSTICS = (
     inputs_together,
     feeble_inputs,
     gusts_guessed,
-    missing_outputs,
     next_flight,
 )

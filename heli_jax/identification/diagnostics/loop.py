@@ -15,26 +15,11 @@ from heli_jax.identification.validation.closed_loop_trust import (
     untrusted,
     weak_by_instrument,
 )
-from heli_jax.identification.validation.follows_response import (
-    LEVEL,
-    SEEN,
-    Feedback,
-    untested,
-    why_untested,
-)
+from heli_jax.identification.validation.follows_response import LEVEL, Feedback
 
 FEEDBACK = "loop.feedback"
 _HELD = 1.0
 """a mode that grows by e to this over a record shows that its vehicle is held"""
-
-
-def feedback_tested(c: Context) -> Iterator[Finding]:
-    """Feedback that could not be tested, in all flights or of some outputs."""
-    why = None if c.feedback or c.fitted else why_untested(c.problem)
-    if why is not None:
-        yield found("loop.not-tested", "note", reason=why.reason)
-    for names, flights in untested(c.problem).items():
-        yield found("loop.output-not-tested", "note", *names, flights=flights, missing=1.0 - SEEN)
 
 
 def inputs_follow_response(c: Context) -> Iterator[Finding]:
@@ -83,7 +68,7 @@ def inputs_follow_response(c: Context) -> Iterator[Finding]:
 
 
 def _frees_a_delay(problem: Problem, late: Sequence[str]) -> str:
-    """What to free to tell inputs that are logged late from a closed loop."""
+    """Advice on what to free, to separate inputs that are logged late from a closed loop."""
     own = dict(problem.model.delays)
     asked = problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late)
     return "" if asked or not late else "fit.nuisance.time_shift, or delays of the model"

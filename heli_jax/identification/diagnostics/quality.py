@@ -40,20 +40,16 @@ def saturation(c: Context) -> Iterator[Finding]:
             percent=100.0 * share,
             limit=RAIL_SHARE,
         )
-    if not cut:
-        yield found("quality.no-saturation", "ok", value=0.0, limit=RAIL_SHARE)
 
 
 def stuck_outputs(c: Context) -> Iterator[Finding]:
     """Outputs that stay at one value while other signals move, or jump to one again and again."""
-    fine = True
     for label, flight in c.flights:
         signals = flight.source.outputs if flight.source else {}
         for (name, _), facts in flight.facts.items():
             if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
                 value = facts.dropouts.value
                 logged = signals[name].from_si(np.array(value)) if name in signals else value
-                fine = False
                 yield found(
                     "quality.dropouts",
                     "doubt",
@@ -67,7 +63,6 @@ def stuck_outputs(c: Context) -> Iterator[Finding]:
                     limit=DROP_SHARE,
                 )
             if facts.stuck is not None:
-                fine = False
                 yield found(
                     "quality.stuck-output",
                     "doubt",
@@ -80,42 +75,32 @@ def stuck_outputs(c: Context) -> Iterator[Finding]:
                     at=facts.stuck.value,
                     limit=STUCK_SECONDS,
                 )
-    if fine:
-        yield found("quality.no-stuck-output", "ok", value=0.0, limit=STUCK_SECONDS)
 
 
 def strays(c: Context) -> Iterator[Finding]:
     """Samples that may stand for no value and are kept."""
-    stray = [
-        (label, name, odd)
-        for label, flight in c.flights
-        for (name, _), facts in flight.facts.items()
-        for odd in facts.strays
-    ]
-    for label, name, odd in stray:
-        yield found(
-            "quality.stray-samples",
-            "doubt",
-            name,
-            value=float(odd.times.size),
-            flight=label,
-            low=odd.values.min(),
-            high=odd.values.max(),
-            first=odd.times[0],
-        )
-    if not stray:
-        yield found("quality.no-stray-samples", "ok", value=0.0)
+    for label, flight in c.flights:
+        for (name, _), facts in flight.facts.items():
+            for odd in facts.strays:
+                yield found(
+                    "quality.stray-samples",
+                    "doubt",
+                    name,
+                    value=float(odd.times.size),
+                    flight=label,
+                    low=odd.values.min(),
+                    high=odd.values.max(),
+                    first=odd.times[0],
+                )
 
 
 def quantisation(c: Context) -> Iterator[Finding]:
     """Outputs whose steps are coarse beside the noise that is assumed."""
-    worst = 0.0
     for label, flight in c.flights:
         for name in flight.outputs:
             facts = flight.facts[name, "output"]
             rounding = facts.rounding(flight.dt) if facts.levels > 1 else 0.0
             ratio = rounding / c.noise[f"{label}/{name}"]
-            worst = max(worst, ratio)
             if ratio > 1.0:
                 yield found(
                     "quality.quantisation",
@@ -126,8 +111,6 @@ def quantisation(c: Context) -> Iterator[Finding]:
                     step=facts.step,
                     rounding=rounding,
                 )
-    if worst <= 1.0:
-        yield found("quality.fine-steps", "ok", value=worst)
 
 
 def smoothed(c: Context) -> Iterator[Finding]:

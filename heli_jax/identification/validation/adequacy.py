@@ -1,6 +1,6 @@
-"""Whether the model is adequate: does it explain what was measured, beside noise and disturbance?
+"""Adequacy of the model: does it explain what was measured, beside noise and disturbance?
 
-That an optimiser arrived and that the data determine the parameters says nothing of it: the best
+That an optimiser converged and that the data determine the parameters says nothing of it: the best
 parameters of a wrong model are found and determined as well as those of the right one.
 
 What is judged is the simulated response of every fitted output. The acceptance card asks for a
@@ -22,11 +22,10 @@ import scipy.special
 
 from heli_jax import naming
 from heli_jax.analysis.operating_point import modes_of_flight
-from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, FlightData, Solution
+from heli_jax.identification.unknowns.layout import FlightData, Solution
 from heli_jax.identification.validation.metrics import (
     Metrics,
     Whiteness,
@@ -35,9 +34,6 @@ from heli_jax.identification.validation.metrics import (
 from heli_jax.messages import sentence
 from heli_jax.numerics.white_noise import white_part
 
-# What to do about an output that the model does not explain.
-
-
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
 GATE = 0.9
@@ -45,14 +41,12 @@ GATE = 0.9
 FAR_FROM_WHITE = 0.5
 """autocorrelation of innovations at one sample beyond which the filter predicts badly; a
 disturbance with one pole too few leaves 0.1 to 0.3"""
-_DIVERGED = 10.0
-"""a simulation that leaves the measured range by this factor"""
 _GROWTH = 3.0
 """an unstable mode that grows by e to this over the record"""
 
 
 class OutputAdequacy(NamedTuple):
-    """Whether one output is explained, and by what numbers."""
+    """The numbers that show if one output is explained."""
 
     # The names of the fields are keys of fit.json.
     output: str
@@ -82,7 +76,7 @@ class OutputAdequacy(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is compared, by flight: SI, NaN where nothing is measured."""
+    """Signals that are compared, by flight: SI, NaN where nothing is measured."""
 
     label: str
     dt: float
@@ -91,51 +85,8 @@ class Record(NamedTuple):
     simulated: Mapping[str, np.ndarray]
 
 
-def advice_for(
-    problem: Problem,
-    output: OutputAdequacy,
-    records: Sequence[Record],
-    unstable: bool,
-) -> str:
-    """What to do about an output that is not explained: the most telling that this problem can do.
-
-    Args:
-        problem: what was fitted: what it has switched on already is no advice.
-        unstable: whether the model is, over the length of the record.
-    """
-    name, filtered = output.output, problem.noise_model == "disturbance"
-    diverged = _diverges(name, records)
-    if problem.window is not None and diverged:
-        return sentence("advice.shorter-windows")
-    # Filter error corrects its states at every sample, and needs no windows.
-    if problem.window is None and (diverged or unstable) and not filtered:
-        return sentence(
-            "advice.windows",
-            state="" if problem.nuisance.initial_state else "fit.nuisance.initial_state",
-            shift="fit.nuisance.time_shift" if problem.nuisance.time_shift else "",
-        )
-    if output.lag1 > FAR_FROM_WHITE and not filtered:
-        axes = disturbable(problem.model)
-        code = "advice.disturbance" if axes else "advice.other-model"
-        return sentence(code, output=name, lag1=output.lag1, axis=axes[0] if axes else "")
-    return sentence("advice.columns") if output.vaf >= 0 else ""
-
-
-def _diverges(name: str, records: Sequence[Record]) -> bool:
-    """Whether in some flight the simulation leaves what was measured by far."""
-    for r in records:
-        if name not in r.measured:
-            continue
-        simulated = r.simulated[name]
-        if not np.isfinite(simulated).all():
-            return True
-        if np.max(np.abs(simulated)) > _DIVERGED * np.nanmax(np.abs(r.measured[name])):
-            return True
-    return False
-
-
 def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
-    """Whether a mode of the linearised model grows by e to `growth` over the longest window;
+    """True if a mode of the linearised model grows by e to `growth` over the longest window;
     `params` is a record of the model's Params, SI."""
     # An eigenvalue just right of the axis is a slow drift, of which the record shows nothing.
     longest = max(f.duration for f in problem.training)
@@ -145,34 +96,6 @@ def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
         if linearised is not None and np.max(np.real(linearised[0])) * longest > growth:
             return True
     return False
-
-
-# Does a filter predict anything of an output, beyond what its mean or the last sample says?
-
-
-BETTER = 0.8
-"""share of the squared error of the mean, or of the sample before, that a prediction may leave at
-most: more is what smoothing a noisy signal leaves without any model"""
-
-
-def predicts_nothing(flights: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Whether predictions one step ahead are hardly better than the mean of the flight, or than the
-    sample before (persistence).
-
-    Args:
-        flights: by flight the measured output (N,) and the errors of its prediction (N,), SI, NaN
-            where nothing was measured.
-    """
-    left, mean, before = 0.0, 0.0, 0.0
-    for measured, error in flights:
-        y, error = np.asarray(measured), np.asarray(error)
-        # A sample is foretold by the one before only where both were measured.
-        both = np.isfinite(y[1:]) & np.isfinite(y[:-1])
-        if both.any():
-            left += float(np.sum(error[1:][both] ** 2))
-            mean += float(np.sum((y[1:][both] - np.nanmean(y)) ** 2))
-            before += float(np.sum(np.diff(y)[both] ** 2))
-    return left > BETTER * min(mean, before) > 0.0
 
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -190,7 +113,7 @@ three standard deviations where the disturbance is so slow that the record holds
 
 
 class Adequacy(NamedTuple):
-    """How well the fitted outputs are explained in time."""
+    """Adequacy of the fitted outputs in time."""
 
     # The names of the first three fields are keys of fit.json.
     judged: tuple[OutputAdequacy, ...] = ()
@@ -207,13 +130,13 @@ class Adequacy(NamedTuple):
 
     @property
     def denied(self) -> bool:
-        """Whether an output is not explained."""
+        """True if an output is not explained."""
         return self.by_chance or any(not output.adequate for output in self.judged)
 
     @property
     def explains_nothing(self) -> bool:
-        """Whether the model follows every output worse than its mean, so that the record determines
-        none of its parameters."""
+        """True if the model follows every output worse than its mean, so that the record
+        determines none of its parameters."""
         # A disturbance, or predictions ahead, let a good model's simulation be as poor.
         if not self.denied or self.ahead is not None:
             return False
@@ -222,7 +145,7 @@ class Adequacy(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What adequacy is assessed by: the fitted flights, and what is known of their residuals."""
+    """The evidence on adequacy: the fitted flights and their residuals."""
 
     records: tuple[Record, ...]
     agreement: Mapping[str, Metrics]
@@ -235,15 +158,13 @@ class Evidence(NamedTuple):
     unknowns: int = 0
     """how many were estimated; a response that explains no more than as many unknowns explain of
     noise by chance shows nothing"""
-    innovations: tuple[Mapping[str, np.ndarray] | None, ...] = ()
-    """by flight and output (N,), SI: the errors of the prediction one step ahead"""
     ahead: float | None = None
     """[s] that is predicted at most, from a filter's states, where that stands in place of the
     simulation: of an unstable model"""
 
 
 def misses(expected: Mapping[str, float]) -> bool:
-    """Whether a simulation misses an output by more than its disturbance lets expect.
+    """True if a simulation misses an output by more than its disturbance lets expect.
 
     Args:
         expected: by output the power of its error over that which is expected.
@@ -252,14 +173,14 @@ def misses(expected: Mapping[str, float]) -> bool:
 
 
 def joined_metrics(name: str, records: Sequence[Record]) -> Metrics:
-    """Of one output over all records that have it."""
+    """The adequacy of one output over all records that have it."""
     both = [(r.measured[name], r.simulated[name]) for r in records if name in r.measured]
     measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
     return metrics(measured, predicted)
 
 
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
-    """Whether the model is adequate to the fitted flights.
+    """The adequacy of the model to the fitted flights.
 
     Args:
         params: the vehicle with the estimates in place, a record of the model's Params, SI.
@@ -274,12 +195,14 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         for name, m in evidence.agreement.items()
         if name not in still
     )
-    bad = [output for output in outputs if not output.adequate]
-    if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
+    bad = any(not output.adequate for output in outputs)
+    noise = () if disturbed else tuple(o for o in outputs if _of_noise(o, evidence))
+    # One output that stands out is enough: the others may be ones that these inputs do not move.
+    if outputs and not bad and noise == outputs:
         outputs = tuple(output._replace(adequate=False) for output in outputs)
         return Adequacy(outputs, by_chance=True, still=still)
-    unmoved = tuple(o.output for o in outputs if o.adequate and _nothing_explained(o, evidence))
-    unstable = unstable or (bool(bad) and is_unstable(problem, params))
+    unmoved = tuple(o.output for o in noise if o.adequate)
+    unstable = unstable or (bad and is_unstable(problem, params))
     return Adequacy(outputs, False, evidence.ahead, unmoved, still, unstable)
 
 
@@ -287,29 +210,8 @@ _BY_CHANCE = 1e-3
 """probability that noise alone is explained as well"""
 
 
-def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool:
-    """Whether the response of some output stands out of the noise."""
-    # One output that stands out is enough: the others may be ones that these inputs do not move.
-    return not outputs or not all(_of_noise(output, evidence) for output in outputs)
-
-
-def _nothing_explained(output: OutputAdequacy, evidence: Evidence) -> bool:
-    """Whether of an output nothing is explained, simulated or one step ahead."""
-    if evidence.error_ratio is None:
-        return _of_noise(output, evidence)
-    if not output.explained < 1.0 - EXPLAINED:
-        return False
-    return predicts_nothing(
-        [
-            (r.measured[output.output], ahead[output.output])
-            for r, ahead in zip(evidence.records, evidence.innovations, strict=False)
-            if ahead is not None and output.output in r.measured
-        ]
-    )
-
-
 def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
-    """Whether of an output no more is explained than of noise alone: a likelihood ratio of the
+    """True if no more of an output is explained than of noise alone: a likelihood ratio of the
     model against a constant (Wilks, 1938)."""
     unknowns = evidence.unknowns
     if unknowns < 1 or not np.isfinite(output.vaf):
@@ -327,7 +229,7 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
-    """Whether an output never moves: nothing is to be explained."""
+    """True if an output never moves: nothing is to be explained."""
     # By its range: the mean of equal numbers, and so their variance, is off by rounding. As
     # `metrics` has it, so that what has no VAF is not judged by one.
     return all(
@@ -378,17 +280,16 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
 
 # Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
 #
-# What is then estimated is the colour of the noise, and not how the machine answers: from other
+# What is then estimated is the colour of the noise, and not how the vehicle answers: from other
 # starts, or with another disturbance, it is something else, with an interval as narrow.
 
 
 def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Verdict:
-    """The verdict; where the inputs explain nothing that determines no parameter."""
+    """Return the verdict; that nothing is determined if the inputs explain nothing."""
     # Without a disturbance that is asked of the response: it has to stand out of the noise.
     if not verdict.identifiable or not e.innovations:
         return verdict
-    gain = gain_of_inputs(at, e)
-    free = len(at.layout.free)
+    gain, free = gain_of_inputs(at, e), len(at.layout.free)
     # Written so that a gain that is no number changes nothing.
     if not scipy.special.chdtrc(free, max(gain, 0.0)) >= _BY_CHANCE:
         return verdict
@@ -403,30 +304,27 @@ def inputs_explain_nothing(at: Solution, e: Evaluation, verdict: Verdict) -> Ver
 
 
 def gain_of_inputs(at: Solution, e: Evaluation) -> float:
-    """Twice the log-likelihood that the inputs gain at the optimum over inputs that rest at their
-    means; NaN where no input moves.
+    """Return twice the log-likelihood that the inputs gain at the optimum over inputs that rest at
+    their means; NaN where no input moves.
 
     All unknowns stay as they are: estimated anew without the inputs the likelihood could only be
     larger, and the gain smaller, so that a gain of no account is certain.
     """
-    if not any(_moving(flight) for flight in at.data.flights):
+    layout, data, noise, z = at
+    if not any(_moving(flight) for flight in data.flights):
         return float("nan")
-    still = at.data._replace(flights=tuple(_at_rest(flight) for flight in at.data.flights))
-    without = evaluate(at.layout, still, at.noise, at.z)
+    resting = []
+    for flight in data.flights:
+        inputs = naming.asdict(flight.inputs)
+        means = {n: jnp.full_like(u, jnp.mean(u)) for n, u in inputs.items()}
+        resting.append(flight._replace(inputs=naming.replace(flight.inputs, **means)))
+    still = data._replace(flights=tuple(resting))
+    without = evaluate(layout, still, noise, z)
     if not np.isfinite(without.r).all():
         return float("nan")
-    return 2.0 * (_likelihood(at, at.data, e) - _likelihood(at, still, without))
-
-
-def _likelihood(at: Solution, data: Data, e: Evaluation) -> float:
-    return at.layout.objective.log_likelihood(at.layout, data, at.noise, e)
+    likelihood = layout.objective.log_likelihood
+    return 2.0 * (likelihood(layout, data, noise, e) - likelihood(layout, still, noise, without))
 
 
 def _moving(flight: FlightData) -> list[str]:
     return [n for n, u in naming.asdict(flight.inputs).items() if np.ptp(np.asarray(u)) > 0]
-
-
-def _at_rest(flight: FlightData) -> FlightData:
-    """The flight with each input at its mean, of the same shapes and types."""
-    still = {n: jnp.full_like(u, jnp.mean(u)) for n, u in naming.asdict(flight.inputs).items()}
-    return flight._replace(inputs=naming.replace(flight.inputs, **still))

@@ -1,35 +1,28 @@
-r"""Which estimates feedback may have moved, where nobody logged an excitation.
+r"""Estimates that feedback may have moved, where nobody logged an excitation.
 
-Feedback brings what disturbs the machine into its inputs. Directly the response is off by the part
+Feedback brings what disturbs the vehicle into its inputs. Directly the response is off by the part
 $\gamma^2$ of the input that comes of it, and the record does not tell that part: a model follows
 its inputs where it can, and its residual then shows nothing of it. Two things it does tell.
 
-What of the response is coherent with the residual all the same: over the $n$ frequencies that make
-one average an estimate is off by $\sqrt{n \gamma^2}$ of its standard deviations at least.
-
 What feedback may have brought in: from one output, at a constant gain, $|k|^2 S_{ee}$ of $S_{uu}$,
 which is nowhere more than all of the input; with the largest such gain, as a mean over the outputs,
-since nobody knows which is fed back. A loop holds the machine at low frequencies, where gusts are
+since nobody knows which is fed back. A loop holds the vehicle at low frequencies, where gusts are
 large in it and sweeps move sticks no more than elsewhere.
 
-An unstable machine that was held all the same had a loop with a bandwidth of twice its unstable
+An unstable vehicle that was held all the same had a loop with a bandwidth of twice its unstable
 pole at least: up to there all of the input may have come of it, whatever the residual is.
 
 Each is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
-there is a loop: gusts leave residuals that a response is coherent with by chance, and so does a
-model that lacks something. Parameters are named where inputs were found to follow the response, or
-where somebody must have held the machine: the model is unstable, and the record does not grow.
+there is a loop. Parameters are named where inputs were found to follow the response, or where
+somebody must have held the vehicle: the model is unstable, and the record does not grow. Inputs
+that are taken by instrument bring in nothing.
 
-Inputs that are taken by instrument bring in nothing; of the others in the same fit only the second
-is told, since equations by instrument leave a residual that feedback makes coherent.
-
-Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Bendat and
-Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance; Astrom and
+Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Astrom and
 Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole asks for.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -57,14 +50,11 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.follows_response import Feedback
 
-TRUSTED = 1.4
-"""stated standard deviations by which feedback may have moved an estimate that is trusted: its
-interval then covers two thirds of the time"""
 MAY_BE = 0.25
 """part of the input that feedback may have brought in, where a parameter that is trusted shows"""
 HELD = 0.1
 """part of what tells of a parameter that is trusted from frequencies at which the loop that holds
-an unstable machine has to act: there all of the input may be that loop's"""
+an unstable vehicle has to act: there all of the input may be that loop's"""
 BESIDE = 0.05
 """the same where other inputs are taken by instrument: an input's effect is off by that part of it
 at least, in a fit that is taken for one that feedback does no harm to"""
@@ -81,19 +71,17 @@ _PART = 0.05
 
 
 class Moved(NamedTuple):
-    """What feedback may have done to one estimate. The names of the fields are keys of fit.json."""
+    """Parts of the information on one estimate that feedback may have made."""
 
-    by: float
-    """standard deviations that it is off by at least"""
     may_be: float
     """part of the input that feedback may have brought in, 0 to 1"""
     held: float = 0.0
-    """part of what tells of it that lies where the loop which holds an unstable machine acts"""
+    """part of what tells of it that lies where the loop which holds an unstable vehicle acts"""
 
     @property
     def part(self) -> float:
-        """Of the input where it shows, what may have come of feedback."""
-        return max(self.may_be, self.held)
+        """The larger one."""
+        return max(self)
 
 
 def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
@@ -103,44 +91,44 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     Args:
         at: where the fit ended.
     """
-    layout = at.layout
+    layout, data, noise, _ = at
     if layout.objective.fits_responses:
         return _of_responses(at)
     if layout.noise_model != "spectrum":
         return {}
-    lines = _lines(at)
-    if not any(lines.direct):
+    joint, inputs = [], list(naming.asdict(data.flights[0].inputs))
+    for record in records_of(layout):
+        flight, part = data.flights[record.flight], slice(record.first, record.last)
+        outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
+        signals = [*naming.asdict(flight.inputs).values(), *outputs]
+        joint.append(lines_of(np.stack([np.asarray(v)[part] for v in signals], axis=1)))
+    moving = np.sum([np.sum(np.abs(v[:, : len(inputs)]) ** 2, axis=0) for v in joint], axis=0) > 0
+    by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
+    direct = np.array([n not in by for n, moves in zip(inputs, moving, strict=True) if moves])
+    if not direct.any():
         return {}
+    kept = np.r_[moving, np.ones(joint[0].shape[1] - moving.size, bool)]
+    W = [np.asarray(w) for w in noise.whitening]
+    errors = jax.device_get(errors_of_lines(*at).errors)
+    spectra = (W, smoothed([v[:, kept] for v in joint], _PART), smoothed(errors, _PART))
+    room = once_a_length(functools.partial(_room, direct=direct), *spectra)
     q = len(layout.of_interest)
-    mean = mean_share(J[:q, :q].T @ J[:q, :q])
-    by = np.zeros(q)
-    if all(lines.direct):
-        shares, chances, n = _coherent_with_residual(lines)
-        by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
-    may_be = mean(information(at, _room_for_feedback(lines)))
-    held = mean(information(at, _where_held(at)))
-    each = zip(layout.of_interest, by, may_be, held, strict=True)
-    return {n: Moved(float(b), float(m), float(h)) for n, b, m, h in each}
+    whole = J[:q, :q].T @ J[:q, :q]
+    may_be, held = (shares(information(at, w), whole) for w in (room, _where_held(at)))
+    each = zip(layout.of_interest, may_be, held, strict=True)
+    return {n: Moved(float(m), float(h)) for n, m, h in each}
 
 
-def mean_share(
-    information: Float[np.ndarray, "q q"],
-) -> Callable[[Float[np.ndarray, "q q"]], Float[np.ndarray, " q"]]:
-    """What makes of a part of the information the share that each unknown has of it, 0 to 1.
-
-    Args:
-        information: the whole information.
-    """
-    sd = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+def shares(
+    part: Float[np.ndarray, "q q"], whole: Float[np.ndarray, "q q"]
+) -> Float[np.ndarray, " q"]:
+    """Return the share that each unknown has of a part of the information, 0 to 1."""
+    sd = np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
     # A parameter that is not determined has no standard deviation to be moved by.
-    covariance = np.linalg.pinv(information / np.outer(sd, sd), rcond=1e-12, hermitian=True)
-
-    def mean(of: Float[np.ndarray, "q q"]) -> Float[np.ndarray, " q"]:
-        part = covariance @ (of / np.outer(sd, sd)) @ covariance
-        with np.errstate(all="ignore"):
-            return np.clip(np.nan_to_num(np.diagonal(part) / np.diagonal(covariance)), 0.0, 1.0)
-
-    return mean
+    covariance = np.linalg.pinv(whole / np.outer(sd, sd), rcond=1e-12, hermitian=True)
+    of_part = np.diagonal(covariance @ (part / np.outer(sd, sd)) @ covariance)
+    with np.errstate(all="ignore"):
+        return np.clip(np.nan_to_num(of_part / np.diagonal(covariance)), 0.0, 1.0)
 
 
 def _of_responses(at: Solution) -> dict[str, Moved]:
@@ -157,12 +145,12 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
     See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
     room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)
     by_line = information_by_line(at)
-    may_be = mean_share(by_line.sum(axis=0))(np.einsum("k,kab->ab", room, by_line))
-    return {n: Moved(0.0, float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
+    may_be = shares(np.einsum("k,kab->ab", room, by_line), by_line.sum(axis=0))
+    return {n: Moved(float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
 
 
 def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
-    """Of the unknowns of interest, at each line of the windows of fitted responses.
+    """Information on the unknowns of interest at each line of the windows of fitted responses.
 
     Args:
         at: where the fit ended.
@@ -177,7 +165,7 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
 
 
 def held_upright(at: Solution) -> bool:
-    """Whether the model is unstable and a record does not grow as it would alone.
+    """True if the model is unstable and a record does not grow as it would alone.
 
     Args:
         at: where the fit ended.
@@ -221,15 +209,15 @@ class Loop(NamedTuple):
     """Who closes a loop, as far as it is known."""
 
     found: Sequence[Feedback]
-    """whether inputs follow the response"""
+    """by flight and input, whether it follows the response"""
     instruments: Sequence[str] = ()
     """the inputs that are taken by instrument"""
     held: bool = False
-    """whether somebody must hold the machine"""
+    """whether somebody must hold the vehicle"""
 
     @property
     def closed(self) -> bool:
-        """Whether an input that is taken for given follows the response, or may: where only one
+        """True if an input that is taken for given follows the response, or may: where only one
         with an instrument was found to, whoever closes its loop may move the others as well."""
         if self.instruments:
             return bool(self.inputs) and any(one.present for one in self.found)
@@ -237,8 +225,8 @@ class Loop(NamedTuple):
 
     @property
     def inputs(self) -> list[str]:
-        """Those without an instrument that follow the response; all that move freely where it was
-        found of none."""
+        """The inputs without an instrument that follow the response; all that move freely if
+        none was found."""
         direct = [one for one in self.found if one.input not in self.instruments]
         those = [one for one in direct if one.present] or direct
         return list(dict.fromkeys(one.input for one in those))
@@ -255,84 +243,27 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
     most = BESIDE if loop.instruments else MAY_BE
     # Beside inputs by instrument somebody logged what excites the slow mode.
     beyond = 1.0 if loop.instruments else HELD
-    return tuple(
-        n for n, m in moved.items() if m.by > TRUSTED or m.may_be > most or m.held > beyond
-    )
+    return tuple(n for n, m in moved.items() if m.may_be > most or m.held > beyond)
 
 
 def knows_no_gusts(problem: Problem) -> bool:
-    """Whether a fit is one in time without gusts in its model."""
+    """True if a fit is one in time without gusts in its model."""
     objective = objective_of(problem.method)
     in_time = not (objective.noise_model == "spectrum" or objective.fits_responses)
     return in_time and objective.noise_model != "disturbance"
 
 
-class _Lines(NamedTuple):
-    """By record at its own frequencies."""
-
-    W: list[np.ndarray]
-    errors: list[np.ndarray]
-    measured: list[np.ndarray]
-    inputs: list[np.ndarray]
-    """those that move"""
-    direct: tuple[bool, ...]
-    """by input, whether it is taken for given"""
-
-
-def _lines(at: Solution) -> _Lines:
-    layout, data, noise, z = at
-    measured, inputs = [], []
-    for record in records_of(layout):
-        flight, part = data.flights[record.flight], slice(record.first, record.last)
-        sticks = naming.asdict(flight.inputs)
-        for signals, made in (
-            ([flight.outputs[n] for n in layout.outputs[record.flight]], measured),
-            (list(sticks.values()), inputs),
-        ):
-            v = np.stack([np.asarray(x)[part] for x in signals], axis=1)
-            made.append(lines_of(v))
-    moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
-    errors = jax.device_get(errors_of_lines(layout, data, noise, z).errors)
-    W = [np.asarray(w) for w in noise.whitening]
-    by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
-    names = list(naming.asdict(data.flights[0].inputs))
-    direct = tuple(names[i] not in by for i in moving)
-    return _Lines(W, errors, measured, [u[:, moving] for u in inputs], direct)
-
-
-def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.ndarray], float]:
-    """By record and frequency the part of the model's response that is coherent with the residual,
-    what of it is chance, and the lines of all records in one average at the lowest frequencies."""
-    pairs = []
-    for W, e, y in zip(lines.W, lines.errors, lines.measured, strict=True):
-        white = [np.einsum("kij,kj->ki", W, v) for v in (y - e, e)]
-        pairs.append(np.concatenate(white, axis=1))
-    p, per_line, records = lines.W[0].shape[1], 2.0 * np.pi**0.5, len(pairs)
-
-    def coherent(S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        crossed = S[:, p:, :p]
-        solved = np.linalg.solve(S[:, p:, p:], crossed)
-        explained = np.einsum("kia,kia->k", np.conj(crossed), solved)
-        width = np.maximum(LEAST, _PART * np.arange(1, len(S) + 1))
-        share = np.real(explained / np.einsum("kii->k", S[:, :p, :p]))
-        return share, np.minimum(p / (per_line * width * records), 1.0)
-
-    each = once_a_length(coherent, smoothed(pairs, _PART))
-    return [s for s, _ in each], [c for _, c in each], per_line * LEAST * records
-
-
-def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
-    """By record and frequency the part of the input that a constant gain may have brought in."""
-    joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
-    spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
-    return once_a_length(functools.partial(_room, direct=np.array(lines.direct)), *spectra)
-
-
 def _room(
     W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
 ) -> Float[np.ndarray, " k"]:
-    """By frequency the same, of the whitening, the spectra of inputs and outputs together, and
-    those of the residual; of the inputs that are taken directly."""
+    """By frequency the part of the input that a constant gain may have brought in.
+
+    Args:
+        W: whitening.
+        S: spectra of inputs and outputs together.
+        See: spectra of the residual.
+        direct: by input, True if it is taken for given.
+    """
     m = S.shape[1] - See.shape[1]
     e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
     u = np.where(u > 0, u, 1e-300)
@@ -351,7 +282,7 @@ def _room(
 def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
-    """Of the unknowns of interest, each frequency by its weight."""
+    """Information on the unknowns of interest, each frequency by its weight."""
     layout, data, noise, z = at
     q = len(layout.of_interest)
     if not any(np.any(w) for w in weights):
@@ -394,12 +325,12 @@ def weak_by_instrument(
     if layout.noise_model != "spectrum" or not instruments_of(problem):
         return ()
     if layout.objective.fits_responses:
-        shares = _shares_of_responses(problem, at)
-        return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
-    if at.data.flights[0].by_instrument is None:
+        weak = _shares_of_responses(problem, at)
+    elif at.data.flights[0].by_instrument is None:
         return ()
-    shares = _of_lines(at)
-    return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
+    else:
+        weak = _of_lines(at)
+    return tuple(n for n, share in zip(layout.of_interest, weak, strict=True) if share > _MOST)
 
 
 def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:
@@ -413,7 +344,7 @@ def _of_lines(at: Solution) -> Float[np.ndarray, " q"]:
     followed, F = _followed(signals, [(r.first, r.last) for r in records])
     direct = at._replace(noise=noise._replace(by_instrument=np.zeros(())))
     weak = [g * (f < STRONG) for g, f in zip(followed, F, strict=True)]
-    return mean_share(information(direct, followed))(information(direct, weak))
+    return shares(information(direct, weak), information(direct, followed))
 
 
 def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " q"]:
@@ -426,7 +357,7 @@ def _shares_of_responses(problem: Problem, at: Solution) -> Float[np.ndarray, " 
     F = _followed(signals, [(0, f.n_samples) for f in flights])[1][0]
     hz = np.arange(1, len(F) + 1) / (flights[0].n_samples * flights[0].dt)
     weak = np.interp(at.noise.whitening.windows.hz, hz, F) < STRONG
-    return mean_share(by_line.sum(axis=0))(by_line[weak].sum(axis=0))
+    return shares(by_line[weak].sum(axis=0), by_line.sum(axis=0))
 
 
 def _followed(

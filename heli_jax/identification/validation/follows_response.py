@@ -1,9 +1,9 @@
-"""Whether inputs follow the response: feedback, by a pilot or a controller.
+"""Feedback: do inputs follow the response, through a pilot or a controller?
 
-Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
-multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
+Innovations are what a record's own past cannot predict of its outputs: the residuals of a
+multivariable ARX model of the record itself, so that a poor model of the vehicle is no alarm.
 Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
-13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
+13.4 and 16.5); without it, it does not. Each input is freed of what its own past predicts, and the
 rest is correlated with sums of past innovations. The variance of such a correlation between two
 autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
@@ -31,13 +31,6 @@ from jaxtyping import Float
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.problem import Problem
-from heli_jax.numbers import percent
-
-# How one signal is correlated with sums over past samples of another, and how surely.
-#
-# The variance of such a correlation between two autocorrelated signals is Bartlett's: the sum over
-# all lags of the product of both autocorrelations (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
-
 
 _NOTHING = 1e-7
 """of the root of what a sum's power is at least where its terms are unrelated, below which it is
@@ -66,7 +59,7 @@ class Correlated(NamedTuple):
 def correlations_with_sums(
     u: Float[np.ndarray, " N"], e: Float[np.ndarray, "N p"], blocks: Sequence[tuple[int, int]]
 ) -> Correlated:
-    """Of u with the sums of each column of e over each block of lags.
+    """Correlation of u with the sums of each column of e over each block of lags.
 
     Args:
         u: NaN where it is missing.
@@ -102,12 +95,12 @@ def correlations_with_sums(
 
 
 def _products_over_lags(x: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "N p"]:
-    """Of each column with itself, by lag."""
+    """Autocorrelation of each column, by lag."""
     size = scipy.fft.next_fast_len(2 * len(x), real=True)
     return np.fft.irfft(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: len(x)]
 
 
-# What the past of a record does not foretell of it: the residuals of ARX models.
+# What the past of a record does not predict of it: the residuals of ARX models.
 #
 # The order is the one that BIC takes; where samples are missing, no row is used in which one
 # stands.
@@ -124,8 +117,8 @@ _RIDGE = 1e-12
 def arx_residuals(
     y: Float[np.ndarray, "N p"], past: Float[np.ndarray, "N z"]
 ) -> Float[np.ndarray, "N p"] | None:
-    """What a constant and the samples of other signals before it (their `past`) do not foretell of
-    y, NaN where one of them is missing; None where the record is too short."""
+    """The part of y that a constant and earlier samples of other signals (their `past`) do not
+    predict, NaN where one is missing; None if the record is too short."""
     longest, (N, z) = _ORDERS[-1], past.shape
     scale = np.nanstd(past, axis=0)
     past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
@@ -147,7 +140,7 @@ def arx_residuals(
     factor = np.linalg.cholesky(x.T @ x + _RIDGE * m * np.eye(sizes[-1]))
     along = scipy.linalg.solve_triangular(factor, x.T @ at, lower=True)
     unexplained = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
-    # What rounding leaves of a signal that its past foretells exactly may be below zero.
+    # What rounding leaves of a signal that its past predicts exactly may be below zero.
     criteria = [
         m * np.sum(np.log(np.maximum(unexplained[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
         for k in sizes
@@ -162,7 +155,7 @@ def arx_residuals(
 LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""
 RATE = 50.0
-"""samples a second at most: no feedback that a machine flies by is faster than a quarter of that"""
+"""samples a second at most: no feedback that a vehicle flies by is faster than a quarter of that"""
 _SLOW_RATE = 10.0
 """samples a second at which slow feedback, as a pilot's, shows through a sensor's noise"""
 _PARTS = 5
@@ -183,12 +176,13 @@ _LONG_REST, _AT_REST = 20, 0.5
 such rests take in one whose input was programmed"""
 _STILL = 1e-4
 """of the range of an input, below which a difference is no motion"""
-SEEN = 0.8
+_SEEN = 0.8
 """part of the samples of an output that is used"""
 
 
 class Feedback(NamedTuple):
-    """What was found of one input of one flight. The names of the fields are keys of fit.json."""
+    """The result of the test for one input of one flight. The names of the fields are keys of
+    fit.json."""
 
     flight: str
     input: str
@@ -207,39 +201,54 @@ class Feedback(NamedTuple):
 
     @property
     def present(self) -> bool:
-        """Whether the input follows the response."""
+        """True if the input follows the response."""
         return self.p_value < LEVEL
 
 
 def feedback(
     flight: Flight, together: int = 1, earlier: Mapping[str, float] | None = None
 ) -> tuple[Feedback, ...]:
-    """By input that moves freely, whether it follows past innovations; nothing where the record is
-    too short to tell.
+    """Return for each input that moves freely the past innovations that it follows most surely;
+    nothing where the record is too short to tell.
 
     Args:
         flight: inputs and outputs as measured; no model is asked.
-        together: how many flights are tested side by side, for the p values.
+        together: number of flights that are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    tested = [tested_at(flight, earlier or {}, rate) for rate in rates_of(flight)]
-    each = [one for one in tested if isinstance(one, Tested)]
-    label, found = flight.name or "flight 1", {}
-    for one in each:
-        for name in dict.fromkeys(n for view in one.views for n in view.free):
-            made = _dependence(one, name, together * len(each))
-            late = one.steps.get(name, 0) * flight.dt
-            now = made._replace(flight=label, earlier=late)
-            found[name] = min(found.get(name, now), now, key=_sureness)
+    # Half of a record at most: a delay beyond is none that it could show.
+    most, dt = flight.n_samples // 2, flight.dt
+    steps = {n: min(math.ceil(s / dt - 1e-9), most) for n, s in (earlier or {}).items()}
+    by_rate = [views for rate in _rates_of(flight) if (views := _views(flight, steps, rate))]
+    found: dict[str, Feedback] = {}
+    for views in by_rate:
+        N = len(views[0].innovations)
+        blocks = lag_blocks(max(1, min(round(_LONGEST / views[0].dt), N // 10)))
+        seconds = [(first * views[0].dt, last * views[0].dt) for first, last in blocks]
+        for name in dict.fromkeys(n for view in views for n in view.free):
+            those = [view for view in views if name in view.free]
+            # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+            count = len(those) * those[0].inputs * len(those[0].outputs) * len(blocks)
+            for view in those:
+                each = correlations_with_sums(view.free[name], view.innovations, blocks)
+                for k, b in np.ndindex(each.p_value.shape):
+                    one = Feedback(
+                        flight.name or "flight 1",
+                        name,
+                        view.outputs[k],
+                        float(each.correlation[k, b]),
+                        seconds[b],
+                        min(1.0, together * len(by_rate) * count * float(each.p_value[k, b])),
+                        steps.get(name, 0) * dt,
+                    )
+                    # Of several that are sure beyond all numbers the correlation decides.
+                    found[name] = min(
+                        found.get(name, one), one, key=lambda f: (f.p_value, f.correlation)
+                    )
     return tuple(found.values())
 
 
-def _sureness(one: Feedback) -> tuple[float, float]:
-    # Of several that are sure beyond all numbers the correlation decides.
-    return one.p_value, one.correlation
-
-
-def rates_of(flight: Flight) -> tuple[float, ...]:
+def _rates_of(flight: Flight) -> tuple[float, ...]:
     """Samples a second at which a flight is looked at [Hz]."""
     # No faster than the inputs come, nor than half of the log: when a frame of a stick began within
     # a sample, and how it moved there, is not known, and an output that answers to it would pass
@@ -250,102 +259,60 @@ def rates_of(flight: Flight) -> tuple[float, ...]:
 
 
 def _frames(u: np.ndarray) -> float:
-    """How often an input has a new value while it moves, of its samples."""
+    """The share of an input's moving samples that have a new value."""
     at = np.flatnonzero(np.diff(u) != 0.0)
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
 
-def _dependence(tested: "Tested", name: str, together: int) -> Feedback:
-    """Of one input the past innovations that it follows most surely."""
-    views = [view for view in tested.views if name in view.free]
-    count = len(views[0].innovations)
-    blocks = lag_blocks(max(1, min(round(_LONGEST / tested.dt), count // 10)))
-    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
-    tests = together * len(views) * len(tested.inputs) * len(tested.outputs) * len(blocks)
-    made = []
-    for view in views:
-        each = correlations_with_sums(view.free[name], view.innovations, blocks)
-        k, b = min(
-            np.ndindex(each.p_value.shape), key=lambda at: (each.p_value[at], each.correlation[at])
-        )
-        lag = (blocks[b][0] * tested.dt, blocks[b][1] * tested.dt)
-        p, correlation = min(1.0, tests * float(each.p_value[k, b])), float(each.correlation[k, b])
-        made.append(Feedback("", name, tested.outputs[k], correlation, lag, p))
-    return min(made, key=_sureness)
-
-
 class _View(NamedTuple):
-    """What is correlated: of the past, and of an input what is compared with it."""
+    """Signals of a flight at one rate, of which the past is compared with inputs."""
 
     free: dict[str, np.ndarray]
-    """by input what its own past does not foretell (N,)"""
+    """by input what its own past does not predict (N,)"""
     innovations: Float[np.ndarray, "N p"]
-
-
-class Tested(NamedTuple):
-    """A flight at one rate."""
-
-    views: tuple[_View, ...]
-    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    steps: dict[str, int]
-    """by input by how many samples of the flight it was taken earlier"""
+    inputs: int
+    """how many inputs move"""
     dt: float
 
 
-class Untested(NamedTuple):
-    """Why nothing of a flight is correlated."""
-
-    reason: str
-    """in words"""
-
-
-def tested_at(flight: Flight, earlier: Mapping[str, float], rate: float) -> Tested | Untested:
-    """Return the signals of a flight that are correlated, or the reason why none are.
+def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]:
+    """Two pairs of what is compared; none where all outputs stay or lack too much, the record is
+    too short, or no input moves freely.
 
     Args:
-        earlier: by input, how much earlier than logged it is to be taken [s].
+        steps: by how many samples an input is taken earlier than logged, where it is.
         rate: samples a second at most [Hz].
     """
-    # Half of a record at most: a delay beyond is none that it could show.
-    most = flight.n_samples // 2
-    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
-    inputs, outputs, parts, dt = decimated(flight, steps, rate)
-    if not outputs:
-        most = percent(1 - SEEN, 0)
-        return Untested(f"every output stays where it is or lacks more than {most} of its samples")
-    n = next(iter(outputs.values())).size
-    if n < _LEAST:
-        expected = f"expected {_LEAST * dt:.3g} s at least"
-        return Untested(f"the record is too short ({n * dt:.3g} s, {expected})")
+    inputs, outputs, parts, dt = _decimated(flight, steps, rate)
+    if not outputs or next(iter(outputs.values())).size < _LEAST:
+        return []
     # Steps are slopes at a lower rate.
-    quick = decimated(flight, steps, RATE).inputs
+    quick = _decimated(flight, steps, RATE).inputs
     moving = [n for n in inputs if _moves_freely(quick.get(n, inputs[n]))]
     free = {n: v for n in moving if (v := _unforeseen(inputs[n], inputs[n][:, None])) is not None}
     if not free:
-        why = "inputs move as programmed ones do (in jumps, between rests, or as foreseen)"
-        return Untested(why)
+        return []
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
-    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # From the past of all signals together. What one output alone cannot predict may well be the
     # answer to an input, and would pass for feedback. A sample's own inputs stand beside the
     # outputs before it.
     now = np.concatenate(list(parts.values()), axis=1)
     now = np.concatenate([now[1:], now[-1:]])
     given = arx_residuals(y, np.concatenate([y, now], axis=1))
     past = arx_residuals(y, np.concatenate([y, u], axis=1))
-    views = [_View(v, e) for v, e in ((free, given), (finer, past)) if e is not None and v]
-    if not views:
-        return Untested("too few samples stand in a row without a missing one")
-    return Tested(tuple(views), tuple(inputs), tuple(outputs), steps, dt)
+    names = tuple(outputs)
+    pairs = ((free, given), (finer, past))
+    return [_View(v, e, names, len(inputs), dt) for v, e in pairs if e is not None and v]
 
 
 def _unforeseen(
     u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
 ) -> Float[np.ndarray, " N"] | None:
-    """What an input's own past (N, m) does not foretell of it (N,), without its jumps; None where
-    nothing is left.
+    """The part of an input (N,) that its own past (N, m) does not predict, without its jumps; None
+    where nothing is left.
 
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
@@ -366,7 +333,7 @@ def _unforeseen(
 
 
 def _moves_freely(u: Float[np.ndarray, " N"]) -> bool:
-    """Whether there is anything in an input that could follow."""
+    """True if there is anything in an input that could follow."""
     # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
     # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
     # of its corners rings on into the rest, as it does in the response.
@@ -381,7 +348,7 @@ def _rests(u: Float[np.ndarray, " N"]) -> float:
     return float(np.sum(runs[runs >= _LONG_REST])) / u.size
 
 
-class Decimated(NamedTuple):
+class _Decimated(NamedTuple):
     """Signals at a moderate rate, by name."""
 
     inputs: dict[str, np.ndarray]
@@ -393,7 +360,7 @@ class Decimated(NamedTuple):
     dt: float
 
 
-def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decimated:
+def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Decimated:
     """A flight averaged down.
 
     Args:
@@ -423,12 +390,12 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
     inputs = {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0}
     outputs = {n: thinned(taken(y, 0)) for n, y in flight.outputs.items()}
     # A record of less than one block leaves none.
-    return Decimated(
+    return _Decimated(
         {n: thinned(u) for n, u in inputs.items()},
         {
             n: y
             for n, y in outputs.items()
-            if y.size and np.mean(np.isfinite(y)) >= SEEN and np.nanstd(y) > 0
+            if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
         },
         {n: within(u) for n, u in inputs.items()},
         flight.dt * every,
@@ -438,24 +405,10 @@ def decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> Decima
 # Whether the inputs of a problem's flights follow the response.
 
 
-def why_untested(problem: Problem) -> Untested | None:
-    """Why nothing was tested of any flight; None where something was."""
-    reasons = {
-        label: tested
-        for label, f in zip(labels(problem.training), problem.training, strict=True)
-        if isinstance(tested := tested_at(f, {}, rates_of(f)[0]), Untested)
-    }
-    kinds = list(dict.fromkeys(reasons.values()))
-    if len(kinds) < 2:
-        return kinds[0] if kinds else None
-    return Untested("; ".join(f"{label}: {one.reason}" for label, one in reasons.items()))
-
-
 def feedback_of(
     problem: Problem, delays: Mapping[str, tuple[float, float | None]] | None = None
 ) -> tuple[Feedback, ...]:
-    """Of all flights that are fitted; nothing where sensors are compared with each other, of which
-    none is a stick that anybody moves.
+    """The test for all fitted flights; empty where sensors are compared with each other.
 
     Args:
         delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
@@ -479,8 +432,7 @@ def feedback_of(
 def _delay(
     problem: Problem, flight: Flight, name: str, delays: Mapping[str, tuple[float, float | None]]
 ) -> tuple[float, float, bool]:
-    """Of an input its delay and its sd [s], as far as they are known, and whether that was
-    estimated."""
+    """Delay and sd [s] of an input, as far as they are known, and if the delay was estimated."""
     delay, variance, estimated = 0.0, 0.0, False
     own = dict(problem.model.delays).get(name)
     if own is not None and own not in delays:
@@ -491,14 +443,3 @@ def _delay(
         if sd is not None:
             delay, variance, estimated = delay + value, variance + sd**2, True
     return delay, math.sqrt(variance), estimated
-
-
-def untested(problem: Problem) -> dict[tuple[str, ...], list[str]]:
-    """By outputs of which feedback cannot be told, since too much is missing, the flights."""
-    lacking: dict[tuple[str, ...], list[str]] = {}
-    for label, flight in zip(labels(problem.training), problem.training, strict=True):
-        tested = decimated(flight, {}, RATE).outputs
-        gappy = [n for n, y in flight.outputs.items() if n not in tested and np.isnan(y).any()]
-        if gappy:
-            lacking.setdefault(tuple(gappy), []).append(label)
-    return lacking

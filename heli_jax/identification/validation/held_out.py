@@ -1,6 +1,6 @@
 """Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,7 +10,6 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
-from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight, labels
 from heli_jax.identification.estimation.data import data_of, start_vector
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
@@ -29,12 +28,7 @@ from heli_jax.identification.unknowns.layout import (
     flight_places,
     layout_of,
 )
-from heli_jax.identification.validation.excitation_test import (
-    LEVEL,
-    errors_against_excitation,
-)
-from heli_jax.identification.validation.excited_band import moving_outputs, with_outputs
-from heli_jax.numbers import p_value, percent, plain_words
+from heli_jax.identification.validation.excitation import LEVEL, errors_against_excitation
 
 _STEPS = 60
 """of Levenberg-Marquardt at most"""
@@ -47,7 +41,8 @@ class Validation(NamedTuple):
     free_run: tuple[dict[str, np.ndarray], ...] | None
     """with windows: by flight and output the simulation (N,) in one piece from the initial state of
     the first window, with the bias; None without windows"""
-    notes: tuple[Finding, ...]
+    converged: bool
+    """whether initial states and biases were found"""
 
 
 def validate(
@@ -55,8 +50,6 @@ def validate(
 ) -> Validation:
     """Predict the flights held out with the estimates; only their initial states (of every window)
     and biases are adjusted, by least squares.
-
-    Nothing is raised where that fails: the notes say so.
 
     Args:
         z: (q,) the optimum of the fitted flights in `layout`.
@@ -87,7 +80,7 @@ def validate(
     if any(count > 1 for count, _ in other.windows):
         one_piece, whole = _in_one_piece(other, full)
         free_run = simulated_outputs(one_piece, data, whole)
-    return Validation(e, free_run, tuple(_notes(held, e, converged)))
+    return Validation(e, free_run, converged)
 
 
 def _noise_of(problem: Problem, layout: Layout, noise: Noise, held: tuple[Flight, ...]) -> Noise:
@@ -139,17 +132,6 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
 
 
-def _notes(held: tuple[Flight, ...], e: Evaluation, converged: bool) -> list[Finding]:
-    astray = [
-        label
-        for label, simulated in zip(labels(held), e.simulated, strict=True)
-        if not all(np.isfinite(v).all() for v in simulated.values())
-    ]
-    if astray:
-        return [found("held-out.not-finite", "note", *astray)]
-    return [] if converged else [found("held-out.nuisances-not-found", "note")]
-
-
 # Flights held out, judged in frequency: nothing is simulated, so that unstable models can be
 # judged too, and gusts raise the noise and not the doubt.
 #
@@ -199,49 +181,13 @@ class HeldOutFlight(NamedTuple):
         """True if the flight gives other estimates."""
         return self.estimates_p_value is not None and self.estimates_p_value < LEVEL
 
-    @property
-    def in_words(self) -> str:
-        """The estimates and what is explained, in a line."""
-        known = []
-        if self.estimates_p_value is not None:
-            verb = "differ" if self.differs else "agree"
-            known.append(f"its own estimates {verb} (p {p_value(self.estimates_p_value)})")
-        shares = [
-            f"{n} {plain_words(percent(v, 1)) if v >= 0 else 'none'}"
-            for n, v in self.explained.items()
-        ]
-        if shares:
-            known.append(f"explained of what follows the excitation: {', '.join(shares)}")
-        return "; ".join(known) or "says nothing of the model"
-
-    @property
-    def findings(self) -> Iterator[Finding]:
-        """What contradicts the fit."""
-        if self.worse:
-            yield found(
-                "held-out.worse-than-none", "doubt", self.flight, *self.worse, denies=True,
-                flight=self.flight, names=self.worse,
-            )  # fmt: skip
-        if self.differs and self.furthest is not None:
-            f = self.furthest
-            yield found(
-                "held-out.other-estimates", "doubt", self.flight, value=self.estimates_p_value,
-                shifts={f.parameter: f.own - f.fitted}, limit=LEVEL, flight=self.flight,
-                **f._asdict(),
-            )  # fmt: skip
-
 
 class HeldOutFrequency(NamedTuple):
     """The flights held out of a fit in frequency."""
 
     flights: tuple[HeldOutFlight, ...]
-    notes: tuple[Finding, ...]
-    """why a flight is not judged"""
-
-    @property
-    def findings(self) -> list[Finding]:
-        """What they contradict, and which of them are not judged."""
-        return [*self.notes, *(finding for f in self.flights for finding in f.findings)]
+    not_judged: tuple[str, ...]
+    """the flights that cannot be compared with the fitted ones"""
 
 
 class _Fitted(NamedTuple):
@@ -267,36 +213,32 @@ def validate_in_frequency(
     if not held or at.layout.noise_model != "spectrum" or not np.isfinite(J).all():
         return None
     fitted = _Fitted(J.T @ J, at.layout.of_interest, np.asarray(e.named), np.asarray(e.slopes))
-    flights, notes = [], []
+    judged, others = [], []
     for label, flight in zip(labels(tuple(held)), held, strict=True):
-        part, why = _comparable(problem, at, flight, feedback=feedback)
-        judged = None
+        part, one = _comparable(problem, at, flight, feedback=feedback), None
         if part is not None:
             with np.errstate(all="ignore"):
-                judged = _judged(problem, at, fitted, label, part)
-            why = why if judged is not None else "its errors have no spectrum"
-        flights += [judged] if judged is not None else []
-        if why:
-            notes.append(found("held-out.not-judged", "note", label, flight=label, why=why))
-    return HeldOutFrequency(tuple(flights), tuple(notes))
+                one = _judged(problem, at, fitted, label, part)
+        if one is None:
+            others.append(label)
+        else:
+            judged.append(one)
+    return HeldOutFrequency(tuple(judged), tuple(others))
 
 
-def _comparable(
-    problem: Problem, at: Solution, flight: Flight, *, feedback: bool
-) -> tuple[Flight | None, str]:
-    """The flight with the outputs that can be judged, or None; what is left out, and why."""
-    if feedback:
-        return None, "inputs follow the outputs, and no instrument is used"
+def _comparable(problem: Problem, at: Solution, flight: Flight, *, feedback: bool) -> Flight | None:
+    """The flight with the outputs that can be judged; None if there are none, no instrument moves,
+    or inputs follow the outputs and no instrument is used."""
     by = instruments_of(problem)
-    if by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by):
-        return None, "none of its instruments moves"
-    common = [n for n in flight.outputs if n in at.layout.outputs[0]]
-    if not common:
-        return None, f"it has none of the fitted outputs ({', '.join(at.layout.outputs[0])})"
-    sound, still = moving_outputs(with_outputs(flight, common))
-    if sound is not None and not parts_of(sound):
-        return None, "no part of it has all of its outputs"
-    return sound, still
+    if feedback or (by and not any(np.ptp(flight.instruments.get(n, [0.0])) > 0 for n in by)):
+        return None
+    common = (n for n in flight.outputs if n in at.layout.outputs[0])
+    moving = {n for n in common if np.nanmin(flight.outputs[n]) < np.nanmax(flight.outputs[n])}
+    outputs, sd = (
+        {n: v for n, v in of.items() if n in moving} for of in (flight.outputs, flight.sd)
+    )
+    part = replace(flight, outputs=outputs, sd=sd) if moving else None
+    return part if part is not None and parts_of(part) else None
 
 
 def _judged(

@@ -1,4 +1,4 @@
-"""Whether the log is fast enough for the dynamics, at the start values or the estimates.
+"""Rates of a log beside the modes of the model, at the start values or the estimates.
 
 Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
 aliases. An input that was sampled while it moved is known at its samples alone: between them a
@@ -6,7 +6,7 @@ straight line misses a part (pi f / rate)^2 / 3 of a motion at f, a staircase pi
 twice the frequency nothing is left of the motion; at five times a line misses a seventh.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ class _Limits:
     """the same for a mode that does not swing: in 2 pi of its time constants it is over"""
     enough: float = 5.0
     """samples in a period of a mode, from which on it is seen"""
+    shows: float = 3.0
+    """times the noise by which a mode moves an output, from which on it matters"""
     part: float = 0.1
     """of an output's own motion, from which on a mode matters whatever the noise is guessed to be:
     a guess from slow samples takes the motion between them for noise"""
@@ -57,17 +59,78 @@ class _Limits:
 RATE = _Limits()
 
 
+class Modes(NamedTuple):
+    """A linearised model along its eigenvectors."""
+
+    at: OperatingPoint
+    eigenvalues: np.ndarray
+    """(n,) [1/s]"""
+    right: np.ndarray
+    """(n, n) a mode a column"""
+    left: np.ndarray
+    """(n, n) a mode a row"""
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+
+    def strongest(
+        self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
+    ) -> tuple[float, str, str]:
+        """Return the part of mode k in the response of an output to a step of an input's size, over
+        the output's noise, where that is largest, with the input's and the output's name. If no
+        input moves: the same of the free motion, all of which is the mode that shows best.
+
+        Args:
+            noise: sd by output, SI.
+        """
+        outputs = naming.names(problem.model.Outputs)
+        best = (0.0, "", "")
+        if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
+            for y in flight.outputs:
+                shown = np.abs(self.C[outputs.index(y)] @ self.right)
+                shown *= np.linalg.norm(self.left, axis=1)
+                part = shown[k] / max(float(shown.max()), 1e-300)
+                best = max(best, (part * np.nanstd(flight.outputs[y]) / float(noise[y]), "", y))
+            return best
+        for j, u in enumerate(naming.names(problem.model.Inputs)):
+            size = float(np.std(flight.inputs[u])) / abs(self.eigenvalues[k])
+            for y in flight.outputs:
+                residue = abs(self.C[outputs.index(y)] @ self.right[:, k])
+                residue *= abs(self.left[k] @ self.B[:, j])
+                best = max(best, (residue * size / float(noise[y]), u, y))
+        return best
+
+
+def _modes_of(problem: Problem, params: Any, flight: Flight) -> Modes | None:
+    """Return the model's modes about the point that stands for a flight; None where its matrices
+    are not finite.
+
+    Args:
+        params: of the flight, SI.
+    """
+    at = operating_point(
+        problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
+    )
+    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
+    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
+    if not all(np.isfinite(M).all() for M in (A, B, C)):
+        return None
+    eigenvalues, right = np.linalg.eig(A)
+    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
+    return Modes(at, eigenvalues, right, np.linalg.pinv(right), A, B, C)
+
+
+# Rates beside the modes that show.
+
+
 class _Mode(NamedTuple):
     """A mode that shows in the record."""
 
-    eigenvalue: complex
+    hz: float
+    """its natural frequency"""
+    swings: bool
     input: str
     output: str
-
-    @property
-    def hz(self) -> float:
-        """Its natural frequency."""
-        return abs(self.eigenvalue) / (2.0 * np.pi)
 
 
 class Rate(NamedTuple):
@@ -79,7 +142,7 @@ class Rate(NamedTuple):
     least: float
     """samples in a period of the mode, below which nothing of it is seen"""
     staircase: bool = False
-    """whether the signal is an input of steps of equal length"""
+    """true for an input of steps of equal length"""
 
     @property
     def samples(self) -> float:
@@ -89,83 +152,65 @@ class Rate(NamedTuple):
 
 def rates_against_modes(
     problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
-) -> tuple[list[Rate], float]:
-    """The rates of inputs that move, and of outputs, against the fastest mode that matters; where
-    no mode matters, the natural frequency [Hz] of the fastest, else 0.
+) -> list[Rate]:
+    """Return the rates of inputs that move, and of outputs, against the fastest mode that matters;
+    none if no mode does.
 
     Args:
         params: the model's Params, SI.
         noise: sd by output, SI.
     """
-    modes, hidden = _modes_that_show(problem, params, flight, _shown_from(flight, noise))
+    modes = sorted(_modes_that_show(problem, params, flight, noise))
+    if not modes:
+        return []
     rates = []
     for name, u in flight.inputs.items():
         rate = input_rate(flight, name, u)
         felt = [mode for mode in modes if mode.input == name]
         if rate is not None and felt:
             # All stairs of one length are a clock's, and so is a test signal with a clock.
-            stairs, mode = flight.hold[name] == "zero-order", max(felt, key=_hz)
-            rates.append(Rate((name,), rate, mode, RATE.hopeless, stairs))
-    if modes:
-        # The fastest alone: what is too slow for it is said once.
-        mode, of = max(modes, key=_hz), {y: output_rate(flight, y) for y in flight.outputs}
-        fastest = max(of.values())
-        # A decay has no alias, but between two samples all of it may be over.
-        least = RATE.hopeless if abs(mode.eigenvalue.imag) > 0 else RATE.settled
-        rates.append(Rate(tuple(y for y in of if of[y] == fastest), fastest, mode, least))
-    return rates, hidden
-
-
-def _hz(mode: _Mode) -> float:
-    return mode.hz
-
-
-def _shown_from(flight: Flight, noise: Mapping[str, Any]) -> dict[str, float]:
-    """By output, by how much a mode has to move it to matter."""
-    sizes = {}
-    for name, y in flight.outputs.items():
-        own = RATE.part * float(np.nanstd(y))
-        sizes[name] = SHOWS * float(noise[name])
-        # One that stays where it is shows no mode, however small its noise seems.
-        if name not in flight.sd and own > 0:
-            sizes[name] = min(sizes[name], own)
-    return sizes
+            stairs = flight.hold[name] == "zero-order"
+            rates.append(Rate((name,), rate, felt[-1], RATE.hopeless, stairs))
+    of = {y: output_rate(flight, y) for y in flight.outputs}
+    fastest = max(of.values())
+    # A decay has no alias, but between two samples all of it may be over.
+    least = RATE.hopeless if modes[-1].swings else RATE.settled
+    outputs = tuple(y for y in of if of[y] == fastest)
+    return [*rates, Rate(outputs, fastest, modes[-1], least)]
 
 
 def _modes_that_show(
-    problem: Problem, params: Any, flight: Flight, sizes: Mapping[str, float]
-) -> tuple[list[_Mode], float]:
-    """Those whose part in the answer to a step of an input's size stands out, and where there are
-    only others the frequency [Hz] of their fastest, else 0."""
+    problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
+) -> Iterator[_Mode]:
+    """Yield those whose part in the response to a step of an input's size stands out."""
+    sizes = {}
+    for name, y in flight.outputs.items():
+        own = RATE.part * float(np.nanstd(y))
+        sizes[name] = RATE.shows * float(noise[name])
+        # One that stays where it is shows no mode, however small its noise seems.
+        if name not in flight.sd and own > 0:
+            sizes[name] = min(sizes[name], own)
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    params = naming.replace(params, **known)
-    at = operating_point(
-        problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
-    )
-    modes = modes_about(problem, params, at)
+    modes = _modes_of(problem, naming.replace(params, **known), flight)
     behind = states_behind(problem.model)
-    machine = [n not in behind for n in naming.names(problem.model.State)]
-    fastest = 0.0
-    shown = []
+    vehicle = [n not in behind for n in naming.names(problem.model.State)]
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # A filter's own mode has no part in the machine. Its constants are known, and it is no
+        # A filter's own mode has no part in the vehicle. Its constants are known, and it is no
         # motion that a log would have to show.
         right = modes.right[:, k]
-        if np.linalg.norm(right[machine]) < 1e-6 * np.linalg.norm(right):
+        if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
         part, u, y = modes.strongest(k, problem, flight, sizes)
-        fastest = max(fastest, abs(eigenvalue) / (2.0 * np.pi))
         if part >= 1.0:
-            shown.append(_Mode(complex(eigenvalue), u, y))
-    return shown, 0.0 if shown else fastest
+            yield _Mode(abs(eigenvalue) / (2.0 * np.pi), abs(eigenvalue.imag) > 0, u, y)
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
-    """The rate [Hz] at which an input was sampled while it moved; None where it does not move, or
-    is known between its samples because it was commanded in steps.
+    """Return the rate [Hz] at which an input was sampled while it moved; None if it does not move,
+    or if it is known between its samples because it was commanded in steps.
 
     Args:
         flight: says what the input does between samples, and who decided that.
@@ -195,7 +240,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 
 
 def _corner_rate(dt: float, u: np.ndarray) -> float:
-    """The rate of the samples between which an input follows straight lines."""
+    """Return the rate of the samples between which an input follows straight lines."""
     bends = np.abs(np.diff(u, 2))
     # Of most samples: a single absurd one would make the stick's own corners look like rounding.
     low, high = np.quantile(u, [0.01, 0.99])
@@ -214,15 +259,15 @@ def _corner_rate(dt: float, u: np.ndarray) -> float:
 
 
 def output_rate(flight: Flight, name: str) -> float:
-    """The rate [Hz] of the samples of an output that are there."""
+    """Return the rate [Hz] of the samples of an output that are there."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
     usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
     return 1.0 / max(usual * flight.dt, flight.logged_step(name, "output"))
 
 
 def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | None:
-    """The rate [Hz] of an input, and the part of its power above a quarter of it, where that power
-    does not fall off before half of the rate; None where it does.
+    """Return the rate [Hz] of an input, and the part of its power above a quarter of it; None if
+    that power falls off before half of the rate.
 
     A controller that runs faster than the log moves its input between the samples, by what it saw
     of the response there.
@@ -261,8 +306,6 @@ _SWINGS = 10.0
 between the samples, and any other frequency past them fits as well"""
 _STEP = 1e-4
 """relative step of the parameters for these changes"""
-SHOWS = 3.0
-"""times the noise by which a mode moves an output, from which on it matters"""
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -286,7 +329,7 @@ class FastMode(NamedTuple):
 def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], ...]:
-    """By flight and output the sd that residuals leave to noise, less what a model misses, SI."""
+    """Return by flight and output the sd of the noise in residuals without what a model misses."""
     # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
     return tuple(
         {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
@@ -294,102 +337,28 @@ def measurement_noise(
     )
 
 
-class Modes(NamedTuple):
-    """A linearised model along its eigenvectors."""
-
-    eigenvalues: np.ndarray
-    """(n,) [1/s]"""
-    right: np.ndarray
-    """(n, n) a mode a column"""
-    left: np.ndarray
-    """(n, n) a mode a row"""
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-
-    def strongest(
-        self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
-    ) -> tuple[float, str, str]:
-        """The part of mode k in the answer of an output to a step of an input's size, over the
-        output's noise, where that is largest: with the input's and the output's name. Where no
-        input moves, in the free motion: of the modes that the output shows best all of it.
-
-        Args:
-            noise: sd by output, SI.
-        """
-        outputs = naming.names(problem.model.Outputs)
-        best = (0.0, "", "")
-        if not any(np.ptp(u) > 0 for u in flight.inputs.values()):
-            for y in flight.outputs:
-                shown = np.abs(self.C[outputs.index(y)] @ self.right)
-                shown *= np.linalg.norm(self.left, axis=1)
-                part = shown[k] / max(float(shown.max()), 1e-300)
-                best = max(best, (part * np.nanstd(flight.outputs[y]) / float(noise[y]), "", y))
-            return best
-        for j, u in enumerate(naming.names(problem.model.Inputs)):
-            size = float(np.std(flight.inputs[u]))
-            for y in flight.outputs:
-                residue = abs(self.C[outputs.index(y)] @ self.right[:, k])
-                residue *= abs(self.left[k] @ self.B[:, j])
-                part = residue / abs(self.eigenvalues[k]) * size / float(noise[y])
-                best = max(best, (part, u, y))
-        return best
-
-
-def modes_about(problem: Problem, params: Any, at: OperatingPoint) -> Modes | None:
-    """The model's modes about a point; None where its matrices are not finite.
-
-    Args:
-        params: of the flight, SI.
-        at: where the model is linearised.
-    """
-    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
-    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
-    if not all(np.isfinite(M).all() for M in (A, B, C)):
-        return None
-    eigenvalues, right = np.linalg.eig(A)
-    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
-    return Modes(eigenvalues, right, np.linalg.pinv(right), A, B, C)
-
-
 def fast_modes(
     problem: Problem,
     values: Mapping[str, float],
     noise: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[FastMode]:
-    """For each fitted flight the fastest mode that its samples cannot show and that is not known.
+    """Return by flight the fastest mode that its samples cannot show and that is not known.
 
     Args:
         values: of the free parameters, SI; gains and shifts among them move no mode.
         noise: sd by flight and output, SI; without it nothing is said to be undetermined.
     """
     free = {n: v for n, v in values.items() if n in problem.free}
-    modes = []
-    for i, flight in enumerate(problem.training):
-        here = free | flight.known
-        at = operating_point(
-            problem.model,
-            problem.params_with(here),
-            flight.inputs,
-            flight.outputs,
-            flight.dt,
-            substeps=problem.substeps,
-        )
-        moving = [n for n in free if n not in flight.known]
-        fast = _of_flight(problem, flight, here, at, moving, noise[i] if noise else None)
-        modes += [] if fast is None else [fast]
-    return modes
+    flights = zip(problem.training, noise or [None] * len(problem.training), strict=True)
+    modes = [_of_flight(problem, flight, free, of) for flight, of in flights]
+    return [mode for mode in modes if mode is not None]
 
 
 def _of_flight(
-    problem: Problem,
-    flight: Flight,
-    here: Mapping[str, float],
-    at: OperatingPoint,
-    moving: list[str],
-    noise: Mapping[str, Any] | None,
+    problem: Problem, flight: Flight, free: Mapping[str, float], noise: Mapping[str, Any] | None
 ) -> FastMode | None:
-    modes = modes_about(problem, problem.params_with(here), at)
+    here = {**free, **flight.known}
+    modes = _modes_of(problem, problem.params_with(here), flight)
     if modes is None:
         return None
     nyquist = np.pi / flight.dt
@@ -397,37 +366,39 @@ def _of_flight(
     past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _NEAR * nyquist]
     if not past:
         return None
-    slopes = _relative_slopes(problem, here, at, moving, modes)
+    slopes = _relative_slopes(problem, here, [n for n in free if n not in flight.known], modes)
     # A filter or a servo whose constants are given is simulated as it is, and has no alias.
     past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
     if not past:
         return None
-    slopes = {n: s for n, s in slopes.items() if not _known_otherwise(problem, n)}
-    undetermined = [
-        n
-        for n, slope in slopes.items()
-        if noise is not None
-        and any(
-            abs(slope[k].imag) > _TURNED
-            and modes.eigenvalues[k].imag >= _AT_NYQUIST * nyquist
-            # What is gone within a sample swings in none, under any alias, unless it swings many
-            # times before it is gone: then its frequency was told by nothing.
-            and (
-                -modes.eigenvalues[k].real * flight.dt < 1.0
-                or abs(modes.eigenvalues[k].imag) > -modes.eigenvalues[k].real * _SWINGS
-            )
-            and modes.strongest(k, problem, flight, noise)[0] >= SHOWS
-            for k in past
-        )
-    ]
     first = max(past, key=lambda k: float(modes.eigenvalues[k].imag))
     fastest = float(modes.eigenvalues[first].imag)
+    lost = []
+    for k in past:
+        swing, decay = modes.eigenvalues[k].imag, -modes.eigenvalues[k].real
+        # What is gone within a sample swings in none, under any alias, unless it swings many times
+        # before it is gone: then its frequency was told by nothing.
+        swings = decay * flight.dt < 1.0 or swing > decay * _SWINGS
+        shows = noise is not None and modes.strongest(k, problem, flight, noise)[0] >= RATE.shows
+        lost += [k] if swing >= _AT_NYQUIST * nyquist and swings and shows else []
+    # A prior excludes the alias; the modes of a delay are an approximation's.
+    turn = {
+        n: np.imag(s)
+        for n, s in slopes.items()
+        if problem.free[n].prior is None and n not in problem.model.delay_parameters
+    }
+    undetermined = tuple(n for n, s in turn.items() if any(abs(s[lost]) > _TURNED))
     # By powers: that is how a frequency goes with a stiffness or a time constant.
-    turned = {n: float(s[first].imag) for n, s in slopes.items() if abs(s[first].imag) > _TURNED}
-    other = (2.0 * nyquist - fastest) / fastest
-    turning = tuple((n, other ** (1.0 / s)) for n, s in turned.items() if other > 0)
-    label = flight.name or "the flight"
-    return FastMode(label, fastest, nyquist, at.words, tuple(undetermined), turning)
+    other = max(2.0 * nyquist - fastest, 0.0) / fastest
+    turning = {n: s[first] for n, s in turn.items() if other > 0 and abs(s[first]) > _TURNED}
+    return FastMode(
+        flight.name or "the flight",
+        fastest,
+        nyquist,
+        modes.at.words,
+        undetermined,
+        tuple((n, float(other ** (1.0 / s))) for n, s in turning.items()),
+    )
 
 
 _AS_GOOD = 0.02
@@ -436,7 +407,7 @@ something, chi-squared's few squares tell nothing"""
 
 
 def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMode]:
-    """The modes, each with the parameters that take it to an alias which fits as well.
+    """Return the modes, each with the parameters that take it to an alias which fits as well.
 
     Args:
         modes: of `fast_modes` at an optimum.
@@ -456,26 +427,19 @@ def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMo
     return aliased
 
 
-def _known_otherwise(problem: Problem, name: str) -> bool:
-    """Whether a parameter's alias is excluded by its prior, or it is a delay, whose modes are an
-    approximation's."""
-    return problem.free[name].prior is not None or name in problem.model.delay_parameters
-
-
 def _relative_slopes(
     problem: Problem,
     here: Mapping[str, float],
-    at: OperatingPoint,
     names: Sequence[str],
     modes: Modes,
 ) -> dict[str, np.ndarray]:
-    """By parameter of every eigenvalue (n,) complex its change over its size, for a relative change
-    of that parameter: first-order perturbation of a simple eigenvalue."""
+    """Return by parameter the relative changes (n,), complex, of the eigenvalues for a relative
+    change of it: first-order perturbation of simple eigenvalues."""
     slopes = {}
     for name in names:
         value = here[name]
         there = problem.params_with({**here, name: value + _STEP * (abs(value) or 1.0)})
-        A = linearize(problem.model, there, at.state, at.inputs).matrices.A
+        A = linearize(problem.model, there, modes.at.state, modes.at.inputs).matrices.A
         slope = (np.asarray(A, np.float64) - modes.A) / _STEP
         changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
         slopes[name] = changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)

@@ -42,6 +42,8 @@ _AT_LEAST = 14.0
 """gain below which no p value is computed: by one filter alone chance makes it in 1 of 1000"""
 _ROUNDING = 1e-9
 """part of a column below which nothing is left of it"""
+_WILD = 5.0 / 0.6745
+"""times the median of whitened residuals' sizes, beyond which they are wild: 5 sd of normal ones"""
 _EULER = 0.5772156649015329
 _AT_ONCE = 8
 """residuals that are multiplied with all columns together"""
@@ -123,6 +125,7 @@ def lines_of(
     # What jumps because samples are missing is no answer: the filter's order after a hole is as if
     # nothing had been measured.
     white[:, across(holes, e.size)[ORDER:]] = 0.0
+    white[0] = bounded(white[0])
     v = np.asarray(scipy.fft.rfft(white))[:, 1 : 1 + (n - 1) // 2] / np.sqrt(n)
     # Of a bias rounding alone is left, which no step of it makes up for.
     mean_squares = np.mean(np.real(v) ** 2 + np.imag(v) ** 2, axis=1, keepdims=True)
@@ -135,8 +138,15 @@ def lines_of(
     return Lines(v[0], v[1 : 1 + q].T, v[1 + q :].T, angles, size)
 
 
+def bounded(e: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Bound whitened residuals at 5 robust standard deviations (Huber's psi; Huber, 1981): a few
+    wild samples have most of the power, and go with some drive by chance."""
+    most = _WILD * float(np.median(np.abs(e[e != 0.0]))) if np.any(e) else 0.0
+    return np.clip(e, -most, most)
+
+
 def across(holes: Sequence[int], size: int) -> np.ndarray:
-    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    """The samples (size,) to which the filter of `whitening` brings samples from before a hole."""
     after = np.zeros(size, bool)
     for first in holes:
         after[first : first + ORDER] = True
@@ -356,7 +366,8 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
-    """That a gain is one of the others, which are maxima of about exponential numbers."""
+    """The probability that a gain is one of the others, which are maxima of about exponential
+    numbers."""
     scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
     if not scale > 0:
         return 1.0

@@ -67,8 +67,8 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def angle_over_rate(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
 ) -> AngleOverRate | None:
-    """How far an angle moves beside the integral of its rate; None where nothing can be told: a gap
-    is long, the record is short, or the two have little in common.
+    """The motion of an angle over that of the integral of its rate; None if nothing can be
+    compared: a gap is long, the record is short, or the two have little in common.
 
     Args:
         angle: [rad], NaN where missing.
@@ -103,7 +103,7 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
-    """Of a signal with straight lines between its samples, from zero.
+    """The integral from zero of a signal with straight lines between its samples.
 
     Args:
         rate: without a missing sample.
@@ -197,7 +197,7 @@ def sticks_of(model: Model) -> dict[str, str]:
 
 
 class _Sign(NamedTuple):
-    """How an output goes with the simulated one in a flight, where that is sure."""
+    """The correlation of an output with the simulated one in a flight, where that is sure."""
 
     correlation: float
     size: float
@@ -214,7 +214,7 @@ def _signs(flight: Flight, run: Mapping[str, np.ndarray]) -> dict[str, _Sign]:
 
 
 def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) -> bool:
-    """Whether no flight that says more of an output says that its sign is right."""
+    """True if no flight with more information on an output shows that its sign is right."""
     others = (signs[name] for signs in by_flight if name in signs)
     return sign.correlation > 0 or not any(
         o.correlation > 0 and o.size > _MORE * sign.size for o in others
@@ -299,27 +299,21 @@ def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
-    """Whether an output is an attitude or a rate of the vehicle, and no other angle of it."""
+    """True if an output is an attitude or a rate of the vehicle, and no other angle of it."""
     of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
     return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
 
 
 def _flown(model: Model, flight: Flight, name: str, size: float) -> bool:
-    """Whether an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
+    """True if an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
     so it is in aerobatics, and where both are in degrees."""
     rate = next((a.rate for a in axes_of(model) if a.angle == name), None)
-    p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
-    if p is None or not np.isfinite(p).any() or size > _FLOWN_TURNS * 2 * np.pi:
+    p = flight.outputs.get(rate or "")
+    if p is None or not np.nanmax(np.abs(p), initial=0.0) <= _LARGEST["rad/s"]:
         return False
-    if np.nanmax(np.abs(p)) > _LARGEST["rad/s"]:
-        return False
-    seen, rated = np.isfinite(phi), np.isfinite(p)
-    # From one sample of the angle to its next, which a slower sensor has seconds later.
-    at = np.arange(p.size)
-    turned = integral(np.interp(at, at[rated], p[rated]), flight.dt)
-    moved, by_rate = np.diff(phi[seen]), np.diff(turned[seen])
-    power = float(np.sum(by_rate**2))
-    return power > 0 and abs(float(np.sum(moved * by_rate)) / power - 1.0) < _FLOWN
+    ratio = angle_over_rate(flight.outputs[name], p, flight.dt)
+    turns = size <= _FLOWN_TURNS * 2 * np.pi
+    return turns and ratio is not None and abs(ratio.factor - 1.0) < _FLOWN
 
 
 # A stick in per cent that is read as plain numbers fits as well as one read right, with its effect
@@ -419,7 +413,7 @@ def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:
 
 
 def _size(measured: np.ndarray, simulated: np.ndarray) -> float:
-    """How many times as far an output moves as was simulated; 0 where nothing can be told."""
+    """The ratio of an output's motion to the simulated one; 0 if nothing can be compared."""
     seen = np.isfinite(measured)
     with np.errstate(over="ignore", invalid="ignore"):
         far = float(np.std(simulated[seen])) if seen.any() else 0.0

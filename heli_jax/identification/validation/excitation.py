@@ -1,0 +1,335 @@
+"""Excitation: the power of a signal that follows others, in bands of a record's lines.
+
+In a narrow band a response is a constant gain, so that least squares over the band's lines gives
+the power of a signal that follows others. Chance makes as much of it as the unknown gains do
+(Wilks, for complex normal errors). Three questions are asked in this way:
+
+- Do outputs follow what excites the vehicle: the logged excitation where inputs are taken by it,
+  else the inputs?
+- Does the residual of a model in frequency? That of the right model does not. Nothing is
+  simulated, so that the verdict holds for unstable vehicles, and gusts raise the noise and not the
+  test. By instrument it is the test of overidentification (Sargan, 1958).
+- Do inputs move together?
+
+Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System Identification
+(1999), 16.6, for residuals against inputs; Bendat and Piersol, Random Data (2010), chapter 7, for
+partial coherence.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.special
+from jaxtyping import Bool, Complex, Float
+
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_lines import (
+    errors_of_lines,
+    lines_of,
+    records_of,
+)
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Solution
+
+LEVEL = 0.01
+"""of the test of all outputs together"""
+_FIRST, _GROWTH = 12, 1.15
+"""lines of the lowest band, and how much wider the next one is"""
+_LOW, _HIGH = 0.05, 0.95
+"""parts of an input's power between which its band lies"""
+_LEAST_POWER = 1e-3
+"""of an input's largest density of power: below that it does not excite"""
+_SEEN = 0.8
+"""part of an output's samples that has to be measured: the holes are bridged by straight lines"""
+_ROUNDING = 1e-6
+"""part of an input's power below which nothing is left of it"""
+
+
+class Followed(NamedTuple):
+    """The part of a signal that follows the excitation."""
+
+    p_value: float
+    """probability that noise alone follows as much"""
+    explained: float
+    """part of an output's power that follows; of a residual, part of the power that follows of the
+    output which the model explains"""
+    by_chance: float = 0.0
+    """standard deviation of that part"""
+
+
+class Pair(NamedTuple):
+    """Two inputs that may move together."""
+
+    inputs: tuple[str, str]
+    coherence: float
+    """the other inputs taken out, averaged by the power that both have"""
+
+
+class Excitation(NamedTuple):
+    """The inputs of some flights, and what follows them."""
+
+    powers: dict[str, tuple[float, float]]
+    """by input that moves, the band [Hz] that holds 90 % of its power"""
+    outputs: dict[str, Followed]
+    """by output; without those that lack samples or never move, and where records are too short"""
+    pairs: tuple[Pair, ...]
+    """of the inputs that move, the most alike first"""
+
+
+def excitation_of(problem: Problem) -> Excitation:
+    """Return what the inputs of the fitted flights excite."""
+    flights, by = problem.training, instruments_of(problem)
+    # A flight at rest has lines without power, among which those of another would be few in a band.
+    flown = [f for f in flights if any(np.ptp(u) > 0 for u in f.inputs.values())]
+    if not flown:
+        return Excitation({}, {}, ())
+    names = [n for n in flown[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flown)]
+    lines = [lines_of(np.stack([f.inputs[n] for n in names], 1)) * f.dt**0.5 for f in flown]
+    # The lines of all flights in one order, as if of one record.
+    each = zip(flown, lines, strict=True)
+    hz = np.concatenate([np.arange(1, len(v) + 1) / (f.n_samples * f.dt) for f, v in each])
+    order = np.argsort(hz, kind="stable")
+    hz, X = hz[order], np.concatenate(lines)[order]
+    sums = np.cumsum(np.abs(X.T) ** 2, axis=1)
+    powers = {
+        n: (
+            float(hz[np.searchsorted(s, _LOW * s[-1])]),
+            float(hz[np.searchsorted(s, _HIGH * s[-1])]),
+        )
+        for n, s in zip(names, sums, strict=True)
+    }
+    return Excitation(powers, _outputs(flown, by), _pairs(X, names))
+
+
+def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed]:
+    """By output the part that follows the excitation."""
+    sums: dict[str, np.ndarray] = {}
+    for flight in flights:
+        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
+        drives = [v for v in drives if np.ptp(v) > 0]
+        measured = {n: _bridged(y) for n, y in flight.outputs.items() if _seen(y) >= _SEEN}
+        measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
+        if not drives or not measured:
+            continue
+        X = lines_of(np.stack(drives, axis=1))
+        # What ends elsewhere than it began, as a slow mode does, has its leap at all lines: what is
+        # left above a straight line between its ends is asked, too.
+        above = [y - np.linspace(y[0], y[-1], y.size) for y in measured.values()]
+        for k, v in enumerate((list(measured.values()), above)):
+            y = lines_of(np.stack(v, axis=1))
+            bands = _in_bands(y[:, :, None], X)
+            whole, followed = (
+                np.sum(v[bands.excited, :, 0], axis=0) for v in (bands.whole, bands.followed)
+            )
+            totals = np.column_stack([bands.test(), followed, whole])
+            for name, statistics in zip(measured, totals, strict=True):
+                sums.setdefault(name, np.zeros((2, 4)))[k] += statistics
+    return {
+        # Of two questions about one record.
+        name: Followed(
+            min(1.0, 2.0 * float(np.min(scipy.special.chdtrc(s[:, 1], s[:, 0])))),
+            float(np.max(s[:, 2] / np.maximum(s[:, 3], 1e-300))),
+        )
+        for name, s in sums.items()
+        if np.all(s[:, 1] > 0)
+    }
+
+
+def _seen(y: Float[np.ndarray, " N"]) -> float:
+    return float(np.mean(np.isfinite(y)))
+
+
+def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    seen = np.flatnonzero(np.isfinite(y))
+    return np.interp(np.arange(y.size), seen, y[seen])
+
+
+def _pairs(X: Complex[np.ndarray, "K m"], moving: Sequence[str]) -> tuple[Pair, ...]:
+    """The coherence of each two inputs."""
+    pairs, inputs = [], X.shape[1]
+    for a, b in itertools.combinations(range(inputs), 2):
+        u, v, others = X[:, [a]], X[:, [b]], np.delete(X, [a, b], axis=1)
+        alone, beside, both = (
+            _in_bands(v[:, :, None], drives, inputs=inputs)
+            for drives in (u, others, np.hstack([others, u]))
+        )
+        power, own = (
+            np.sum(bands.whole, axis=(1, 2))
+            for bands in (alone, _in_bands(u[:, :, None], v, inputs=inputs))
+        )
+        by_alone, by_others, by_both = (v.followed[:, 0, 0] for v in (alone, beside, both))
+        left = power - by_others
+        # Where the others explain all of one, what is left is rounding: the pair by itself.
+        known = left > _ROUNDING * power
+        part = np.where(known, by_both - by_others, by_alone) / np.maximum(
+            np.where(known, left, power), 1e-300
+        )
+        coherence = np.clip(part, 0.0, 1.0)
+        # Where both have power: that is where each could be taken for the other.
+        weights = np.min([p / max(float(np.sum(p)), 1e-300) for p in (power, own)], axis=0)
+        mean = float(np.sum(coherence * weights) / max(float(np.sum(weights)), 1e-300))
+        pairs.append(Pair((moving[a], moving[b]), mean))
+    return tuple(sorted(pairs, key=lambda pair: -pair.coherence))
+
+
+def least_rough(flights: Sequence[Flight]) -> tuple[str, float]:
+    """Return the output that shows most of a motion, and its mean squared step from sample to
+    sample over that of white noise (von Neumann).
+
+    Args:
+        flights: with one output at least.
+    """
+
+    def roughness(y: Float[np.ndarray, " N"]) -> float:
+        y = y[np.isfinite(y)]
+        spread = float(np.var(y)) if y.size > 2 else 0.0
+        return float(np.mean(np.diff(y) ** 2)) / (2.0 * spread) if spread > 0 else 1.0
+
+    each = ((n, roughness(y)) for f in flights for n, y in f.outputs.items())
+    return min(each, key=lambda one: one[1])
+
+
+def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:
+    """Return by output the part of its residual that follows the excitation; outputs of too few
+    lines are left out.
+
+    Args:
+        at: where a fit by frequency error ended.
+    """
+    errors = jax.device_get(errors_of_lines(*at).errors)
+    by = instruments_of(problem) if at.data.flights[0].by_instrument is not None else ()
+    return errors_against_excitation(problem.training, at, errors, by)
+
+
+def errors_against_excitation(
+    flights: Sequence[Flight],
+    at: Solution,
+    errors: Sequence[Complex[np.ndarray, "K p"]],
+    by: Sequence[str],
+) -> dict[str, Followed]:
+    """Return by output the part of errors that follows the excitation; outputs of too few lines are
+    left out.
+
+    Args:
+        flights: those of the layout, fitted or held out.
+        at: where they are evaluated.
+    """
+    layout, _, noise, _ = at
+    sums: dict[str, np.ndarray] = {}
+    sizes: dict[int, np.ndarray] = {}
+    for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
+        flight, part = flights[record.flight], slice(record.first, record.last)
+        names = layout.outputs[record.flight]
+        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
+        drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
+        if not drives:
+            continue
+        X = lines_of(np.stack(drives, axis=1))
+        y = lines_of(np.stack([flight.outputs[n][part] for n in names], axis=1))
+        # Records of one length share their whitening.
+        if id(W) not in sizes:
+            root = np.linalg.inv(np.asarray(W))
+            # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
+            sizes[id(W)] = np.sqrt(np.sum(np.abs(root) ** 2, axis=2))
+        bands = _in_bands(np.stack([e, y], axis=2), X, sizes[id(W)])
+        # Not the model's response: a wrong model's may be larger than anything that was measured.
+        asked, scale = bands.asked, bands.scale
+        powers = np.sum((asked * scale)[:, :, None] * bands.followed, axis=0)
+        chance = np.sum(asked * bands.rank * (scale * bands.per_line[:, :, 0]) ** 2, axis=0)
+        totals = np.column_stack([bands.test(), powers, chance])
+        for name, statistics in zip(names, totals, strict=True):
+            sums[name] = sums.get(name, np.zeros(5)) + statistics
+    return {
+        name: Followed(
+            float(scipy.special.chdtrc(freedom, statistic)),
+            float(1.0 - left / answer) if answer > 0 else 1.0,
+            float(np.sqrt(variance) / answer) if answer > 0 else np.inf,
+        )
+        for name, (statistic, freedom, left, answer, variance) in sums.items()
+        if freedom > 0
+    }
+
+
+class _Bands(NamedTuple):
+    """Powers of signals in bands, each by output and signal of it."""
+
+    lines: Float[np.ndarray, "b 1"]
+    rank: Float[np.ndarray, "b p"]
+    """of the excitation"""
+    whole: Float[np.ndarray, "b p c"]
+    parts: Float[np.ndarray, "b p c"]
+    """that least squares explains by the excitation"""
+    scale: Float[np.ndarray, "b p"]
+    """mean square of what the signals were divided by"""
+    excited: Bool[np.ndarray, " b"]
+    """where an excitation has power"""
+
+    @property
+    def per_line(self) -> Float[np.ndarray, "b p c"]:
+        """The power by line that is not explained."""
+        return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
+
+    @property
+    def followed(self) -> Float[np.ndarray, "b p c"]:
+        """The power that follows the excitation, less what chance makes."""
+        return self.parts - self.rank[:, :, None] * self.per_line
+
+    def test(self) -> Float[np.ndarray, "p 2"]:
+        """By output the likelihood ratio of its first signal with and without the excitation, and
+        its degrees of freedom."""
+        asked, n, m = self.asked, self.lines, self.rank
+        share = self.parts[:, :, 0] / np.where(asked, self.whole[:, :, 0], np.inf)
+        statistic = np.where(asked, -(2.0 * n - m - 1.0) * np.log1p(-share), 0.0)
+        return np.stack(
+            [np.sum(statistic, axis=0), np.sum(np.where(asked, 2.0 * m, 0.0), axis=0)], 1
+        )
+
+    @property
+    def asked(self) -> Bool[np.ndarray, "b p"]:
+        """True at lines where the first signal is more than what follows the excitation."""
+        return (self.rank > 0) & (self.whole[:, :, 0] > self.parts[:, :, 0])
+
+
+def _in_bands(
+    signals: Complex[np.ndarray, "K p c"],
+    X: Complex[np.ndarray, "K m"],
+    size: Float[np.ndarray, "K s"] | None = None,
+    inputs: int = 0,
+) -> _Bands:
+    """Explain signals by an excitation in each band.
+
+    Args:
+        size: of each output, or (s = 1) of all; one unless given.
+        inputs: as many as bands have to tell apart; those of X unless given.
+    """
+    size = np.ones((len(X), 1)) if size is None else size
+    first, lines = 0, float(max(_FIRST, 4 * (inputs or X.shape[1])))
+    found = list[tuple[_Bands, np.ndarray]]()
+    while first + int(lines) <= len(X):
+        n, band = int(lines), slice(first, first + int(lines))
+        first, lines = band.stop, lines * _GROWTH
+        over = 1.0 / size[band].T
+        # All outputs side by side: each has excitations of its own size.
+        Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
+        along = np.abs(np.einsum("pii->pi", R))
+        kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)
+        Q = np.where(kept[:, None, :], Q, 0.0)
+        m = np.broadcast_to(np.sum(kept, axis=1), (signals.shape[1],))
+        v = np.swapaxes(signals[band], 0, 1) * over[:, :, None]
+        whole = np.sum(np.abs(v) ** 2, axis=1)
+        parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ v) ** 2, axis=1)
+        scale = np.broadcast_to(np.mean(size[band] ** 2, axis=0), m.shape)
+        density = np.mean(np.abs(X[band]) ** 2, axis=0)
+        found.append((_Bands(np.array([n]), m, whole, parts, scale, np.array(False)), density))
+    if not found:
+        p, c = signals.shape[1:]
+        b1, bp, bpc = np.zeros((0, 1)), np.zeros((0, p)), np.zeros((0, p, c))
+        return _Bands(b1, bp, bpc, bpc, bp, np.zeros(0, bool))
+    bands, densities = zip(*found, strict=True)
+    density = np.stack(densities)
+    excited = np.any(density >= _LEAST_POWER * np.max(density, axis=0, initial=0.0), axis=1)
+    return _Bands(*(np.stack(v) for v in zip(*bands, strict=True)))._replace(excited=excited)
