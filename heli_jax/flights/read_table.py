@@ -82,7 +82,9 @@ def load_table(table: Table, request: Request) -> ChannelLog:
     return replace(log, notes=(*log.notes, *said), cautions=cautions)
 
 
-def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -> ChannelLog:
+def _with_clock(
+    table: Table, numbers: Mapping[str, np.ndarray], time: Signal, name: str = ""
+) -> ChannelLog:
     """Return the columns (N,) as one topic, whose times count from the first row."""
     scale, stamps = clock_scale(table, time), without_overflow(numbers[time.name])
     columns = {n: x for n, x in numbers.items() if n != time.name}
@@ -91,7 +93,7 @@ def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -
     # Subtracted first, so that a calendar's digits do not cost any.
     first = float(stamps[0]) if stamps.size else 0.0
     times = (stamps - first) * scale
-    topic = Topic(Path(table.path).name, times, columns, stated, time.name, rows)
+    topic = Topic(name or Path(table.path).name, times, columns, stated, time.name, rows)
     return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=first * scale)
 
 
@@ -150,7 +152,9 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     if clock is None or clock.problem:
         why = clock.problem if clock else "no column looks like a clock"
         remedy = "expected --time NAME, a column of increasing times, or "
-        remedy += "a file without the rows that go back" if clock else "--time-rate HZ"
+        remedy += (
+            "a file without the rows that go back" if clock else "--time-rate HZ, samples a second"
+        )
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
@@ -176,7 +180,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
     table = counted(table) if clock.column == ROWS else in_runs(table, clock)
     numbers = table.numbers(list(dict.fromkeys([*names, clock.column])))
-    log = _with_clock(table, numbers, clock.signal)
+    log = _with_clock(table, numbers, clock.signal, "the table")
     return replace(log, notes=(*notes, *log.notes))
 
 

@@ -191,7 +191,7 @@ class TableView:
 
     @property
     def sha256(self) -> str:
-        """Of the file."""
+        """SHA-256 of the file."""
         return self.table.sha256
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -212,11 +212,11 @@ class TableView:
         return made
 
     def place(self, row: int) -> str:
-        """Where a row stands in the file."""
+        """The place of a row in the file."""
         return self.table.place(row)
 
     def cell_text(self, name: str, row: int) -> str:
-        """What stands in a cell, in words."""
+        """The content of a cell, in words."""
         return self.table.cell_text(name, row) if name in self.table.names else str(row)
 
     def time_unit(self, name: str) -> str | None:
