@@ -120,17 +120,14 @@ def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog
     return with_derived(log, request.options.swashplate)
 
 
-def _only(request: Request, keys: frozenset[Key]) -> Request:
+def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Request:
+    """Return the request for some signals; over all of the log if `whole`: a lag is found from as
+    much as there is."""
     part = copy.copy(request)
     part.signals = {key: s for key, s in request.signals.items() if key in keys}
+    if whole:
+        part.options = dataclasses.replace(request.options, window=None)
     return part
-
-
-def _whole(request: Request) -> Request:
-    """The same over all of the log: a lag is found from as much as there is."""
-    request = copy.copy(request)
-    request.options = dataclasses.replace(request.options, window=None)
-    return request
 
 
 def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Request]:
@@ -150,7 +147,9 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Requ
     else:
         lag = float(other.begin - log.begin)
         theirs = _span(signals, other.begin)
-        ours = _span(signals_of(log, _whole(request))[0], log.begin)
+        ours = _span(
+            signals_of(log, _only(request, frozenset(request.signals), whole=True))[0], log.begin
+        )
         said = _as_one(request, also, ours, theirs, stated)
     return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, said), asked
 
@@ -167,7 +166,7 @@ def _aligned(
     # Apart from the others, since it may well be one of them.
     options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    reference = signals_of(log, _only(_whole(request), frozenset({key})))[0][key].timed
+    reference = signals_of(log, _only(request, frozenset({key}), whole=True))[0][key].timed
     (twin,) = signals_of(_open(alone, file), alone)[0].values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
