@@ -396,6 +396,7 @@ class CsvTable:
         with progress.reading(self.path, self.size):
             columns = self._columns([self.names.index(name) for name in names])
         self._digest.begin()
+        numbers = {}
         for name, (values, _, _) in zip(names, columns, strict=True):
             if isinstance(values, int):
                 cell = self.cell_text(name, values)
@@ -404,7 +405,8 @@ class CsvTable:
                 if ":" in cell:
                     problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
                 raise wrong(self.path, problem, self.place(values), column(name))
-        return {n: values for n, (values, _, _) in zip(names, columns, strict=True)}
+            numbers[name] = values
+        return numbers
 
     def survey(self) -> list[Survey]:
         """Every column, in the file's order."""
@@ -448,7 +450,9 @@ class CsvTable:
             likely = self._likely_numbers(likely)
             table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
         plain = {} if table is None else {i: table.column(str(i)) for i in likely}
-        made = {i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()}
+        made: dict[int, _Column] = {
+            i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()
+        }
         rest = [i for i in dict.fromkeys(indices) if i not in made]
         for i, cells in zip(rest, self._texts(rest) if rest else (), strict=True):
             made[i] = self._parsed(self.names[i], cells)
