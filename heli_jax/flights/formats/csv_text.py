@@ -551,6 +551,8 @@ class CsvTable:
 
     def _texts(self, indices: Sequence[int]) -> list[list[str | None]]:
         """The cells of some columns, without the blanks around them, None where nothing is left."""
+        import pyarrow as pa
+
         if len(self._rows) > _LARGEST_TEXT:
             problem = (
                 "has quotes, a row of other than the header's number of cells, or a cell that is "
@@ -559,6 +561,12 @@ class CsvTable:
             )
             raise wrong(self.path, problem)
         columns: list[list[str | None]] = [[] for _ in indices]
+        table = self._arrow(self._rows, dict.fromkeys(indices, pa.string()))
+        if table is not None:
+            for texts, i in zip(columns, indices, strict=True):
+                cells = map(str.strip, table.column(str(i)).to_pylist())
+                texts += [None if cell in _NOTHING else cell for cell in cells]
+            return columns
         for line, cells in self._records():
             if len(cells) != len(self.names):
                 raise wrong(self.path, self._ragged(len(cells)), f"line {line}")
