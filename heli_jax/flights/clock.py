@@ -141,7 +141,10 @@ def guess_clock(
     if not found:
         return None, False
     name = found[0]
-    unit = table.time_unit(name) or split_unit(name)[1] or _unit_alone(name)
+    unit = table.time_unit(name) or split_unit(name)[1]
+    # `ms` and `minutes` alone are names too; seconds are what clocks of any unit are called.
+    alone = "" if name.casefold() in LETTERS else time_unit(name) or ""
+    unit = unit or ("" if alone == "s" else alone)
     return Signal(name, unit or likely_unit(values[name]), "s"), not unit
 
 
@@ -164,13 +167,6 @@ def _says_when_sampled(table: Table, name: str) -> bool:
     topic = re.split(r"[./]", name)[-2:-1]
     commands = holds_commands(topic[0] if any(topic) else PurePath(table.path).name)
     return "time" not in table.names and not commands
-
-
-def _unit_alone(name: str) -> str:
-    """The unit of time that is all of a name, as `ms` and `minutes`; empty of seconds, which clocks
-    of any unit are called."""
-    unit = time_unit(name) or ""
-    return "" if unit == "s" or name.casefold() in LETTERS else unit
 
 
 def _increases(values: np.ndarray) -> bool:
@@ -433,8 +429,6 @@ def numbering(surveys: Sequence[Survey]) -> str:
 
 def numbering_notes(column: str) -> tuple[Finding, ...]:
     """A note on a column that numbers runs, where one does."""
-    if not column:
-        return ()
     remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
     words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
     return (note("clock.runs-numbered", words, column),)

@@ -274,7 +274,7 @@ def describe_table(
             *_other_lengths(surveys),
             *clock_notes(table),
             *(counter_notes(surveys) if clock is None else ()),
-            *numbering_notes(clock.numbering if clock else ""),
+            *(numbering_notes(clock.numbering) if clock and clock.numbering else ()),
             *(contradicted_rate(table, clock.column, clock.rate) if clock else ()),
             *marks,
         ),

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.derived import DerivedLog, DerivedTable, sources
+from heli_jax.flights.derived import sources
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import Table, wrong
@@ -217,7 +217,7 @@ class Named(NamedTuple):
     """whether a channel without a usable clock is an error; it is left out otherwise"""
 
 
-type NamedBy = Callable[[DerivedTable | DerivedLog], Named]
+type NamedBy = Callable[[Table | ChannelLog], Named]
 
 
 def by_preset(name: str) -> NamedBy:
@@ -228,7 +228,7 @@ def by_preset(name: str) -> NamedBy:
     """
     table = preset(name)
 
-    def named(log: DerivedTable | DerivedLog) -> Named:
+    def named(log: Table | ChannelLog) -> Named:
         chosen = {signal: choose(log, each) for signal, each in table.signals.items()}
         signals = {
             signal: Signal(

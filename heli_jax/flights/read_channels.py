@@ -203,7 +203,9 @@ def _in_si(
         problem = f"got {numbers[i]} at {clock.seconds[i]:.6g} s, expected a finite number{more}"
         raise wrong(log.path, problem, f"channel {shown(signal.name)}")
     table, row = clock.topic.rows.table, clock.rows.start + i
-    problem = f"got {table.cell_text(signal.name, row)}, expected a finite number{more}"
+    is_derived = signal.name not in table.names
+    cell = f"{numbers[i]:g}" if is_derived else table.cell_text(signal.name, row)
+    problem = f"got {cell}, expected a finite number{more}"
     raise wrong(log.path, problem, table.place(row), column(signal.name))
 
 

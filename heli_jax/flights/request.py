@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from heli_jax import units
 from heli_jax.finding import Finding, note
+from heli_jax.flights.derived import Swashplate
 from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.origins import scale_problem
@@ -70,6 +71,8 @@ class ReadOptions:
     whether it does so at the very sample; such held inputs are low-passed as the output is"""
     runs: str = ""
     """the column of a table that numbers its runs"""
+    swashplate: Swashplate | None = None
+    """geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`"""
     split: bool = False
     """whether runs are told by a time that begins anew, to become flights of their own"""
 
@@ -119,13 +122,6 @@ class Request:
         for name, value in self.known.items():
             if not math.isfinite(value):
                 raise wrong(path, f"known {name!r} is {value:g}, expected a finite number")
-
-    @property
-    def columns(self) -> list[str]:
-        """The columns to read, each once, the time first."""
-        time = [] if self.time is None else [self.time.name]
-        runs = [self.options.runs] if self.options.runs else []
-        return list(dict.fromkeys([*time, *(s.name for s in self.signals.values()), *runs]))
 
     def of_kind[V](self, kind: str, samples: Mapping[tuple[str, str], V]) -> dict[str, V]:
         """The samples of all inputs or of all outputs by the model's name, in the user's order."""

@@ -171,14 +171,7 @@ def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) ->
 
 _TURNS = {"rpm": 1.0 / 60.0, "Hz": 1.0, "rad/s": 0.5 / np.pi}
 """turns per second of the units that presets have: pint takes a quarter of a second to load"""
-_SIGNALS = (
-    "roll_rate",
-    "pitch_rate",
-    "yaw_rate",
-    "forward_force",
-    "right_force",
-    "down_force",
-)
+_SIGNALS = (*("roll_rate", "pitch_rate", "yaw_rate", "forward_force", "right_force", "down_force"),)
 """of a preset, in which a rotor shows"""
 _RUNS = 0.5
 """part of the highest speed from which on the rotor is not just being started"""
