@@ -111,12 +111,7 @@ def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
-    and how far it is on the way to the next.
-
-    Args:
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
-    """
+    and how far it is on the way to the next."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -156,8 +151,6 @@ def averages(
 
     Args:
         counts: lines of a record and how many there are of them, for each length.
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
     """
     at, _ = knots_of(K, part, least)
     kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]

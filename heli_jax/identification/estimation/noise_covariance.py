@@ -11,7 +11,7 @@ from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
+from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Free, Problem
@@ -177,13 +177,17 @@ def gain_left(
         parameters -= len(at_bound)
     squares = float(np.sum(np.square(r)))
     least = squares * max(_SHARE, _PER_UNKNOWN * J.shape[1] / r.size)
-    # Negated: also what is not finite is none of this function's business.
-    if not gauss_newton_gain(r, J) > least:
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return None
     norms = np.linalg.norm(J, axis=0)
     units = np.where(norms > 0, norms, 1.0)
-    left, singular, right = np.linalg.svd(J / units, full_matrices=False)
-    along = left.T @ r
+    Q, R = np.linalg.qr(J / units)
+    along = Q.T @ r
+    # The whole of a Gauss-Newton step takes away the part of r in the span of J's columns.
+    if not np.sum(along**2) > least:
+        return None
+    left, singular, right = np.linalg.svd(R)
+    along = left.T @ along
     with np.errstate(divide="ignore", over="ignore"):
         steps = np.abs(along / singular)[:, None] * np.abs(right / units)[:, :parameters]
         # What the linear model promises for a step to far beyond where it holds is worth nothing:
