@@ -1,4 +1,4 @@
-"""Do the inputs excite what is asked, and what would excite it better?"""
+"""Excitation by the inputs, and the manoeuvre that would add most."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,6 @@ from heli_jax.identification.design.next_flight import plan_next_flight
 from heli_jax.identification.diagnostics.context import Context
 from heli_jax.identification.unknowns.layout import unpack
 from heli_jax.identification.validation.excitation import least_rough
-
 
 NOTHING_FOLLOWS = "excitation.nothing-follows"
 """code of a record in which no output follows the inputs"""

@@ -1,4 +1,4 @@
-r"""What inputs excite: the power of a signal that follows others, in bands of a record's lines.
+"""Excitation: the power of a signal that follows others, in bands of a record's lines.
 
 In a narrow band a response is a constant gain, so that least squares over the band's lines gives
 the power of a signal that follows others. Chance makes as much of it as the unknown gains do
@@ -111,7 +111,7 @@ def _outputs(flights: Sequence[Flight], by: Sequence[str]) -> dict[str, Followed
     for flight in flights:
         drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
         drives = [v for v in drives if np.ptp(v) > 0]
-        measured = {n: _bridged(y) for n, y in flight.outputs.items() if _SEEN <= _seen(y)}
+        measured = {n: _bridged(y) for n, y in flight.outputs.items() if _seen(y) >= _SEEN}
         measured = {n: y for n, y in measured.items() if np.ptp(y) > 0}
         if not drives or not measured:
             continue
@@ -270,7 +270,7 @@ class _Bands(NamedTuple):
 
     @property
     def per_line(self) -> Float[np.ndarray, "b p c"]:
-        """What is not explained, by line."""
+        """Power that is not explained, by line."""
         return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
 
     @property
@@ -290,7 +290,7 @@ class _Bands(NamedTuple):
 
     @property
     def asked(self) -> Bool[np.ndarray, "b p"]:
-        """Where the first signal is more than what follows the excitation."""
+        """True if the first signal is more than what follows the excitation."""
         return (self.rank > 0) & (self.whole[:, :, 0] > self.parts[:, :, 0])
 
 
