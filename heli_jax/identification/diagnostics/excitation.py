@@ -1,4 +1,4 @@
-"""Do the inputs excite what is asked, and what would excite it better?"""
+"""Excitation by the inputs, and the manoeuvre that would add most."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
