@@ -199,7 +199,7 @@ def _by_flight(
     w = weights.windows
     N = next(iter(data.flights[group[0]].outputs.values())).shape[0]
     of_windows = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    machines = machines_of(of_windows, data, u, group)
+    vehicles = machines_of(of_windows, data, u, group)
 
     def windows(y: Array) -> Complex[Array, "p *c W k"]:
         E = window_transforms(y.reshape(-1, N), w.starts[group[0]], w.length, w.numbers, w.dt)
@@ -218,9 +218,9 @@ def _by_flight(
 
         return jax.vmap(of_one)(*some)
 
-    each = (machines.driving, _measured(data, w, group), ends)
+    each = (vehicles.driving, _measured(data, w, group), ends)
     # One at a time: what is made of a flight's windows for each unknown fills the caches.
-    return by_flight(data, group, ready, of_some, machines.matrices, each, together=1)
+    return by_flight(data, group, ready, of_some, vehicles.matrices, each, together=1)
 
 
 def _cross(measured: _Measured, E: Complex[Array, "p c W k"]) -> Complex[Array, "k p m c"]:

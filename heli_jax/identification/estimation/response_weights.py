@@ -64,7 +64,7 @@ none of their own"""
 
 type Described = Callable[[np.ndarray, list[int]], np.ndarray | None]
 """of raw spectral matrices (k, q, q) of some outputs, by their place in the windows, what the
-machine makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
+vehicle makes of gusts, and white noise: (k, q, q), or None where that says nothing"""
 
 
 class Averages(NamedTuple):
@@ -451,10 +451,10 @@ def back(weights: ResponseWeights) -> ResponseWeights:
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
 
 
-# What the machine makes of gusts, as windows show it: a shape for the noise of responses.
+# What the vehicle makes of gusts, as windows show it: a shape for the noise of responses.
 #
 # The noise's spectrum in windows is a mean over few of their lines. Gusts come through the
-# machine's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
+# vehicle's own modes, which are no wider than that: the mean makes a wide and low hill of a mode,
 # and what the record tells of the mode is weighed by too much noise beside it and too little at it.
 # So
 #
@@ -474,14 +474,14 @@ is zero, where integrations have no finite response"""
 
 
 def gusts_through(layout: Layout, data: Data, z: Float[Array, " q"], w: Windowed) -> Described:
-    """The shape that the first flight's machine gives to the noise."""
+    """The shape that the first flight's vehicle gives to the noise."""
     seen = dataclasses.replace(layout, outputs=(w.outputs,) * len(data.flights))
-    machine = machine_of(seen, data, z)
-    return described(np.asarray(machine.Ad, float), np.asarray(machine.C, float), w)
+    vehicle = machine_of(seen, data, z)
+    return described(np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float), w)
 
 
 def described(Ad: Float[np.ndarray, "n n"], C: Float[np.ndarray, "p n"], w: Windowed) -> Described:
-    """The shape that a machine gives to the noise."""
+    """The shape that a vehicle gives to the noise."""
     # Each line by itself at first, then those within a part of the frequency.
     first = [0]
     while (

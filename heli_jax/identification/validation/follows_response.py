@@ -1,6 +1,6 @@
 """Feedback: do inputs follow the response, through a pilot or a controller?
 
-Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
+Innovations are what a record's own past cannot predict of its outputs: the residuals of a
 multivariable ARX model of the record itself, so that a poor model of the vehicle is no alarm.
 Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
 13.4 and 16.5); without it, it does not. Each input is freed of what its own past predicts, and the
