@@ -73,22 +73,23 @@ _CONFIG = (
          help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50"),
 )
 _OUT = _arg("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
-_JSON = _arg("--json", help="everything, for other programs")
+_JSON = _arg("--json", help="print everything as JSON, for other programs")
 _VERBOSE = _arg("--verbose", help="all findings in full (default: the three most severe)")
 _LOG = _arg("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
 _OTHER_LOG = _arg("log", nargs="?", metavar="LOG",
                   help="read as the configuration's first (default: its own)")
 _CLOCK = (
-    _arg("--time", metavar="NAME", help="of a table: the column of time stamps"),
-    _arg("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns"),
+    _arg("--time", metavar="NAME", help="column of time stamps of a table"),
+    _arg("--time-unit", metavar="UNIT", help="unit of the stamps: s, ms, us or ns"),
 )
 _TIME_RATE = _arg("--time-rate", type=float, metavar="HZ",
-                  help="of a table without times: samples a second")
-_FLIGHT = _arg("--flight", type=_count, metavar="N", help="of a log of several (from 1)")
-_RESUME = _arg("--resume", help="go on where the study or sweep in --out was ended")
+                  help="samples a second of a table without times")
+_FLIGHT = _arg("--flight", type=_count, metavar="N",
+               help="number of the flight in a log of several (from 1)")
+_RESUME = _arg("--resume", help="continue the study or sweep in --out")
 _WORKERS = (
     _arg("--workers", type=_count, metavar="N", either=True,
-         help="processes of this machine (of a study: as many as cores unless given)"),
+         help="processes on this machine (default for a study: one a core)"),
     _arg("--scheduler", metavar="tcp://HOST:8786", either=True,
          help="compute on the workers of this dask scheduler"),
 )
@@ -98,15 +99,16 @@ _COMMANDS = {
         _arg("--over", action="append", default=[], metavar="KEY=VALUE,VALUE",
              help="a study (docs/studies.md): fit with each value, with several keys each "
              "combination; as --set repeated with one KEY, or study in CONFIG"),
-        _arg("--reports", help="of a study: write each fit's page too, which takes seconds"),
+        _arg("--reports", help="also write the page of each fit of a study"),
     )),
-    "compatibility": ("do a log's sensors agree? their errors", (*_CONFIG, _OUT)),
+    "compatibility": ("agreement of a log's sensors, and their errors", (*_CONFIG, _OUT)),
     "check": ("identifiability, sampling and excitation before any fit", (
         *_CONFIG, _JSON, _VERBOSE,
     )),
-    "windows": ("which parts of a log say most, before any fit", (
+    "windows": ("most informative windows of a log, before any fit", (
         _OTHER_LOG, *_CONFIG,
-        _arg("--length", type=_seconds, metavar="S", help="of a window [s] (default: a twelfth)"),
+        _arg("--length", type=_seconds, metavar="S",
+             help="length of a window [s] (default: a twelfth)"),
     )),
     "frf": ("frequency responses of a log, with coherence and intervals", (
         _OTHER_LOG, *_CONFIG, _OUT,
@@ -121,7 +123,7 @@ _COMMANDS = {
         *_CONFIG, _OUT, _RESUME, *_WORKERS,
         _arg("--devices", type=_count, metavar="N",
              help="processor cores or GPUs to use (default: all)"),
-        _arg("--no-figures", help="draw none: it takes seconds"),
+        _arg("--no-figures", help="draw no figures"),
     )),
     "info": ("signals, rates, duration and gaps of a log", (
         _LOG, *_CLOCK, _TIME_RATE, _FLIGHT, _JSON,
@@ -140,14 +142,14 @@ _COMMANDS = {
         _arg("--window", nargs=2, type=float, metavar=("FROM", "TO"),
              help="[s] from the log's beginning"),
     )),
-    "runs": ("the fits that a folder holds", (
+    "runs": ("list the fits of a folder", (
         _arg("directory", nargs="?", default="runs", metavar="DIR", help="default: runs"), _JSON,
     )),
     "compare": ("fits side by side: estimates, verdicts, agreement", (
         _arg("runs", nargs="+", metavar="RUN", help="directories of heli-jax fit"),
         _arg("--out", metavar="FILE", help="page (.html), estimates as .csv or as LaTeX (.tex)"),
     )),
-    "new": ("a configuration that begins with what a log holds", (
+    "new": ("write a configuration from a log, with guesses marked", (
         _LOG, _TIME_RATE, _FLIGHT,
         _arg("--model", metavar="NAME",
              help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
@@ -155,16 +157,16 @@ _COMMANDS = {
         _arg("--vehicle", metavar="FILE", help="a vehicle file that is there already"),
         _arg("--out", metavar="FILE", help="configuration (default: the log's name)"),
     )),
-    "keys": ("what may stand in a configuration", (
+    "keys": ("keys of a configuration and their meaning", (
         _arg("pattern", nargs="?", metavar="TEXT",
-             help="of keys or their meaning (default: all keys)"),
+             help="text in keys or their meaning (default: all keys)"),
         _JSON,
         _arg("--schema", metavar="FILE",
-             help="write the JSON schema, by which editors complete YAML"),
-        _arg("--fit", help="what stands in fit.json instead"),
+             help="write the JSON schema for editors"),
+        _arg("--fit", help="keys of fit.json instead"),
     )),
-    "new-model": ("write the files that a model of one's own needs", (
-        _arg("name", metavar="NAME", help="of the model and its module"),
+    "new-model": ("write the files of a model of your own", (
+        _arg("name", metavar="NAME", help="name of the model and its module"),
         _arg("--out", metavar="DIR", help="new folder (default: NAME)"),
     )),
 }
@@ -259,7 +261,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command, (words, arguments) in _COMMANDS.items():
         added = commands.add_parser(command, help=words, description=words, epilog=_EXIT_CODES)
-        added.add_argument("--quiet", action="store_true", help="results, doubts and errors alone")
+        added.add_argument(
+            "--quiet", action="store_true", help="print results, doubts and errors only"
+        )
         either = None
         for names, keywords in arguments:
             group = added

@@ -37,8 +37,8 @@ from heli_jax.workflow import FitRun
 
 
 def print_fit(run: FitRun, *, verbose: bool = False) -> None:
-    """What the first screen of the report shows: three statements, estimates, the most severe
-    findings; with `verbose` the rest of it."""
+    """Print the first screen of the report: three statements, estimates, the most severe findings;
+    with `verbose` the rest of it."""
     fit = run.fit
     for line in lines(fit):
         tell(f"{line.word}: {line.text}")

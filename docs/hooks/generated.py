@@ -315,7 +315,7 @@ _API = {
 }
 
 _PARTS: dict[str, Callable[[], str]] = {
-    "demo-first-line": _statements,
+    "demo-statements": _statements,
     "demo-card": lambda: _printed("acceptance card"),
     "keys": _keys,
     "fit-keys": _fit_keys,

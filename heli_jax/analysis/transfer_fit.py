@@ -298,12 +298,10 @@ def _freedom(measured: Measured, unknowns: int) -> float:
 
 
 def _stable(scaled: _Scaled, best, zeros: int, freedom: float):
-    """The optimum with its fast growing poles turned over, where the data do not tell the two
-    apart.
+    """Reflect fast unstable poles of the optimum, unless the data prefer them.
 
-    In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, the more so
-    the farther p lies beyond: without a lot of evidence a vehicle has the pole that does not grow.
-    A slow one is another matter: it stands in the band, or an interval about zero holds it.
+    In the band 1 / (p - s) is nearly 1 / (p + s) with a delay that is shorter by 2 / p, so a
+    vehicle has the stable pole unless there is much evidence. Slow poles lie in the band, and stay.
     """
     poles = _roots(best, zeros)
     growing = _fast_growing(poles)

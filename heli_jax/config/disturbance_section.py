@@ -79,8 +79,8 @@ class DisturbanceConfig(Section):
     tau_w: _Size = None
     """correlation time [s], of several by name or one number for all: as sigma_w"""
     fixed: list[str] = []
-    """what filter error takes as it stands here: sigma_w, tau_w (of several disturbances sigma_w_p,
-    ...), sigma_y: the noise that the outputs state (sd)"""
+    """parameters that filter error does not estimate: sigma_w, tau_w (of several sigma_w_p,
+    ...), sigma_y (the outputs' sd)"""
 
     @property
     def names(self) -> tuple[str, ...]:

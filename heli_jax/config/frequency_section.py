@@ -27,11 +27,11 @@ class TransferConfig(Section):
     output: str
     """the model's name"""
     zeros: Annotated[int, Field(ge=0, le=8)] = 0
-    """of the transfer function"""
+    """number of the transfer function's roots"""
     poles: Annotated[int, Field(ge=1, le=8)]
-    """of the transfer function"""
+    """number of the transfer function's roots"""
     delay: bool = True
-    """whether it has a delay"""
+    """true: with a delay"""
     band: _Band | None = None
     """[Hz]; all frequencies unless given"""
     coherence: _Coherence = 0.6
@@ -67,9 +67,9 @@ class HandlingConfig(Section):
     output: str
     """an angle, or a rate [rad/s], whose response is integrated"""
     response: Literal["rate", "attitude-command", "open-loop"] = "rate"
-    """what of ADS-33E-PRF is read off"""
+    """kind of response in ADS-33E-PRF"""
     gain: Annotated[float, Field(allow_inf_nan=False)] = 1.0
-    """of an open loop that the response is a part of; below zero where it turns the sign over"""
+    """gain of the open loop beside this response; negative to change the sign"""
 
     @model_validator(mode="after")
     def _of_a_loop(self) -> "HandlingConfig":
@@ -91,7 +91,7 @@ class FrequencyConfig(Section):
     """frequencies, equally spaced in the logarithm; 120 unless given, and for fit.method:
     frequency-response all that are independent"""
     coherence: _Coherence = 0.0
-    """of fit.method: frequency-response: least partial coherence, in the mean over an octave"""
+    """least partial coherence of fit.method: frequency-response, in the mean over an octave"""
     pairs: Annotated[list[PairConfig], Field(min_length=1)] | None = None
     """responses that are fitted; all unless given"""
     transfer_functions: list[TransferConfig] = []

@@ -33,7 +33,6 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.clock import by_rate
 from heli_jax.flights.convert import Selection
-from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.preset import Named, NamedBy
@@ -103,8 +102,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
     swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
     logs = experiment.logs
     opened = logs.open(path, f.flight) if asked else logs.get(path, f.flight)
-    log = None if opened is None else with_derived(opened, swashplate)
-    named = _resolved(experiment, f, f"{where}.signals", log if asked else None)
+    named = _resolved(experiment, f, f"{where}.signals", opened if asked else None)
     # Of all logs together: what one lacks may stand in another.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
@@ -114,7 +112,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         runs = (time.runs if time is not None else None) or ""
         flights = (read_parts if f.gaps == "split" or runs else read_flight)(
-            path if log is None else log,
+            path if opened is None else opened,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=_clock(time),
             inputs={n: inputs[n] for n in named.inputs} | instruments,
@@ -128,6 +126,7 @@ def _read_flight(experiment: Experiment, i: int, f: FlightConfig, gain: bool) ->
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
             follows=follows(experiment, f.rate, inputs),
             runs=runs,
+            swashplate=swashplate,
         )
     flights = (flights,) if isinstance(flights, Flight) else flights
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
@@ -220,7 +219,7 @@ def _also(
         _clock(time),
         also.flight,
         align is not None and align.reverse,
-        None if opened is None else with_derived(opened),
+        opened,
     )
 
 
@@ -271,7 +270,7 @@ def _columns(experiment: Experiment) -> NamedBy:
     first, where = config.flights[0], f"{path}: flights[0]"
     gain = config.fit is not None and config.fit.nuisance.input_gain
 
-    def named(log: DerivedTable | DerivedLog) -> Named:
+    def named(log: Table | ChannelLog) -> Named:
         own = _resolved(experiment, first, f"{where}.signals", log)
         everything = _with_also(own, first, where)
         inputs, outputs = _of_model(experiment.model, everything, f"{where}.signals", gain)

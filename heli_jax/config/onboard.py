@@ -34,9 +34,9 @@ class ServosConfig(Section):
     # Off unless asked for: it is the one device here that makes a linear model nonlinear, which
     # costs the exact step.
     rate_limit: bool = False
-    """whether their speed is limited (rate_servo)"""
+    """true: limit their speed (rate_servo)"""
     delay: bool = False
-    """whether they act late (delay_servo)"""
+    """true: delay them (delay_servo)"""
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9_]*$")] = "servo"
     """ends the names of its parameters: omega_servo, ..."""
 
@@ -47,11 +47,11 @@ class RateLoopConfig(Section):
     on: NamesOrPairs | None = None
     """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
     integral: bool = True
-    """whether it has the term Ki"""
+    """true: integral term Ki"""
     feedforward: bool = True
-    """whether it has the term Kff"""
+    """true: feed-forward term Kff"""
     lag: bool = False
-    """whether its gyro is a first-order lag (tau_gyro)"""
+    """true: first-order lag of its gyro (tau_gyro)"""
 
 
 class GyroConfig(Section):
@@ -60,9 +60,9 @@ class GyroConfig(Section):
     on: NamesOrPairs | None = None
     """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
     heading_hold: bool = True
-    """whether the pedal commands a rate that is held; otherwise it damps alone"""
+    """true: the pedal commands a rate that is held; false: damper alone"""
     lag: bool = True
-    """whether its gyro is a first-order lag (tau_gyro)"""
+    """true: first-order lag of its gyro (tau_gyro)"""
 
 
 class SensorsConfig(Section):
@@ -102,15 +102,15 @@ class FilterConfig(Section):
     """A filter between a sensor and the log (`Filter`)."""
 
     kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
-    """of low-pass or notch; from log: by the settings that the log states"""
+    """kind of low-pass or notch; from log: by the settings in the log"""
     hz: _Positive | None = None
-    """where a low-pass is 3 dB down, or the notch's centre"""
+    """cut-off (3 dB) of a low-pass, or centre of a notch"""
     q: _Positive | None = None
     """quality of a biquad or notch"""
     bandwidth: _Positive | None = None
-    """of a notch [Hz], in place of q"""
+    """width of a notch [Hz], in place of q"""
     attenuation: _Positive | None = None
-    """of a notch at its centre [dB]"""
+    """depth of a notch at its centre [dB]"""
 
     @model_validator(mode="after")
     def _consistent(self) -> "FilterConfig":
@@ -159,7 +159,7 @@ class VibrationConfig(Section):
     rotor: _Positive
     """speed of the rotor, in rad/s unless `unit` says otherwise"""
     unit: str = "rad/s"
-    """of the speed: rad/s, rpm, Hz"""
+    """unit of the speed: rad/s, rpm, Hz"""
 
 
 class OnboardConfig(Section):
@@ -175,7 +175,7 @@ class OnboardConfig(Section):
     gyro: GyroConfig | None = None
     """a gyro on the tail"""
     sensors: SensorsConfig | None = None
-    """what the sensors do to the motion"""
+    """sensors of the motion"""
     delays: DelaysConfig | None = None
     """radio and log"""
 

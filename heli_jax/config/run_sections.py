@@ -16,7 +16,7 @@ class StickConfig(Section):
 
     # "sweep" is the older name of "chirp".
     kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
-    """how it moves"""
+    """kind of motion"""
     amplitude: Positive
     """largest deflection, in `unit`"""
     unit: str | None = None
@@ -85,18 +85,18 @@ class SimulateConfig(Section):
     rate: Positive
     """samples a second [Hz]"""
     inputs: dict[str, StickConfig] = {}
-    """how each input moves; those not named stay at rest"""
+    """motion of each input; others stay at rest"""
     noise: dict[str, NoiseConfig] = {}
     """white noise added to the outputs, by name"""
     seed: Annotated[int, Field(ge=0)] = 0
-    """of inputs, noise and disturbance"""
+    """seed of inputs, noise and disturbance"""
     start: StartConfig | None = None
     """hover unless given"""
     wind: tuple[Finite, Finite, Finite] | None = None
     """velocity of the air along x, y and z (up) [m/s]"""
     hold_attitude: bool = False
-    """whether a pilot's gentle feedback is added to the sticks, so that a long manoeuvre does not
-    diverge (`heli_jax.analysis.pilot`)"""
+    """true: add a pilot's attitude feedback, so that a long manoeuvre does not diverge
+    (`heli_jax.analysis.pilot`)"""
     ground: Annotated[float, Field(lt=0, allow_inf_nan=False)] | None = None
     """height at which the run ends [m]; it begins at a height of zero"""
 
@@ -118,15 +118,15 @@ class AxisConfig(Section):
     upper: Finite | None = None
     """end of the range"""
     scale: Literal["linear", "log"] = "linear"
-    """how values lie between the ends"""
+    """spacing of the values between the ends"""
     n: int | None = None
     """points, for a grid or a list"""
     values: list[Finite] | None = None
     """the points themselves, in place of a range"""
     column: str | None = None
-    """of the table; the axis's name unless given"""
+    """column of the table; default the axis's name"""
     unit: str | None = None
-    """of these numbers; the model's SI unit unless given"""
+    """unit of these numbers; default the model's SI unit"""
 
 
 class DesignConfig(Section):
@@ -135,18 +135,18 @@ class DesignConfig(Section):
     # Which of the other keys a kind may have is refused where the design is made, with a sentence
     # that says why.
     design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
-    """how the axes are combined"""
+    """combination of the axes"""
     n: int | None = None
     """design points, for lhs and sobol"""
     axes: dict[str, AxisConfig] = {}
-    """by what varies: a parameter, initial.STATE, gain.INPUT, offset.INPUT, delay, seed"""
+    """axes by name: a parameter, initial.STATE, gain.INPUT, offset.INPUT, delay, seed"""
     # A section within itself: designs nest to any depth.
     of: list["DesignConfig"] = []
     """the designs of a product or a zip"""
     file: str | None = None
     """a table: .csv, .txt, .tsv or .parquet"""
     seed: Annotated[int, Field(ge=0)] | None = None
-    """of lhs and sobol; the sweep's and the place among its designs unless given"""
+    """seed of lhs and sobol; default from the sweep's"""
 
 
 class ReduceConfig(Section):
@@ -158,9 +158,9 @@ class ReduceConfig(Section):
     signal: str | None = None
     """the output it is taken of"""
     input: str | None = None
-    """of margins: the input that the loop moves"""
+    """for margins: the input that the loop moves"""
     gain: Finite = 1.0
-    """of margins: the feedback, input = -gain signal"""
+    """for margins: the feedback, input = -gain signal"""
 
 
 class TrajectoriesConfig(Section):
@@ -176,11 +176,11 @@ class SweepConfig(DesignConfig):
     """Many runs: a design, what is kept of each run, and how it is computed."""
 
     reduce: dict[str, ReduceConfig] = Field(default_factory=dict)
-    """what is kept of each run, by a name of your own"""
+    """results of each run, by a name of your own"""
     trajectories: TrajectoriesConfig | None = None
     """runs to keep whole"""
     inputs: Literal["flights", "simulate"] | None = None
-    """where the inputs come from; the flights unless there are none"""
+    """source of the inputs; default the flights, if there are any"""
     start: StartConfig | None = None
     """the steady flight in which each run of a whole helicopter begins, the flights' sticks as
     they are; what `simulate` makes begins as it says there"""
@@ -189,11 +189,11 @@ class SweepConfig(DesignConfig):
     substeps: int | None = None
     """steps of the solver in a sample"""
     precision: Literal["float64", "float32"] = "float64"
-    """of the computation"""
+    """precision of the computation"""
     chunk: int | None = None
     """design points written at a time"""
     lanes: int | None = None
     """batch size: design points computed side by side on a device"""
     backend: Literal["auto", "xla", "fused"] = "auto"
-    """what computes each run over time: xla, sample by sample for a batch; fused, one program of
-    machine code for a whole run; auto, fused on CPUs where it can be"""
+    """backend of the simulation: xla, sample by sample for a batch; fused, one program of
+    machine code for a run; auto, fused on CPUs if possible"""

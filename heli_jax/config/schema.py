@@ -35,7 +35,7 @@ class TimeConfig(Section):
     signal: str | None = None
     """the column of time stamps, or with a rate one that counts samples"""
     unit: str = "s"
-    """of the stamps: s, ms, us or ns"""
+    """unit of the time stamps: s, ms, us or ns"""
     rate: Positive | None = None
     """samples a second [Hz] of a file without times: of its rows, or of what `signal` counts"""
     runs: str | None = None
@@ -52,9 +52,9 @@ class TimeConfig(Section):
 
 class InputConfig(LoggedInputConfig):
     unit: str | None = None
-    """that the numbers have then; taken to be in SI unless given"""
+    """unit after scale and offset; default SI"""
     hold: Literal["auto", "zero-order", "linear", "mixed"] = "auto"
-    """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
+    """motion between samples (docs/inputs.md); auto: decided from the log"""
     missing: Numbers | None = None
     """numbers in the log, before scale and offset, that stand for no value, one or a list: the
     input is taken as it was before"""
@@ -64,16 +64,16 @@ class OutputConfig(ScaledConfig):
     signal: str
     """a channel's or column's name in the log"""
     unit: str | None = None
-    """that the numbers have then"""
+    """unit after scale and offset"""
     sd: Positive | None = None
     """standard deviation of its noise, in `unit`, as far as it is known"""
     filter: Filters | None = None
-    """what the autopilot filtered it with: from log, or one or several of {kind, hz, ...}
-    (docs/onboard.md); none: nothing is known of it"""
+    """the autopilot's filters: from log, or one or several of {kind, hz, ...} (docs/onboard.md);
+    [] for none"""
     delay: Delay | None = None
-    """by how much it is logged late [s]"""
+    """delay in the log [s]"""
     repeats: Literal["auto", "keep", "missing"] = "auto"
-    """of values that a logger wrote again until the next was there (docs/logs.md)"""
+    """values that a logger repeats until the next sample (docs/logs.md)"""
     missing: Numbers | None = None
     """numbers in the log, before scale and offset, that stand for no value: 0 of a sensor's
     dropouts, or several as a list"""
@@ -81,7 +81,7 @@ class OutputConfig(ScaledConfig):
 
 class SignalsConfig(PresetConfig):
     time: TimeConfig | None = None
-    """of a table of rows; the topics of an autopilot's log have clocks of their own"""
+    """clock of a table; the topics of an autopilot's log have their own"""
     # Names are checked where the model is known: what it has for inputs and outputs is not known
     # here.
     inputs: dict[str, InputConfig] = Field(default={})
@@ -102,7 +102,7 @@ class AlignConfig(Section):
     to: str
     """the same motion in this log, in any unit"""
     reverse: bool = False
-    """whether it has the opposite sign"""
+    """true for the opposite sign"""
 
 
 class AlsoSignalsConfig(SignalsConfig):
@@ -121,11 +121,11 @@ class AlsoConfig(Section):
     log: str
     """the file; its path begins at the configuration"""
     align: AlignConfig | None = None
-    """how its clock is found; unless given its times count as those of the first log"""
+    """search for the lag of its clock; without it both logs share one clock"""
     signals: AlsoSignalsConfig
-    """what is taken from it"""
+    """signals of this log"""
     flight: Annotated[int, Field(ge=1)] | None = None
-    """which flight of a log that holds several, from 1"""
+    """number of the flight in a log of several, from 1"""
 
 
 def _one_log(value: Any) -> Any:
@@ -143,9 +143,9 @@ class FlightConfig(Section):
     """the file; its path begins at the configuration. A list is a study with a fit for each
     (docs/studies.md)"""
     signals: SignalsConfig
-    """which channel is which input and output"""
+    """channels of the inputs and outputs"""
     flight: Annotated[int, Field(ge=1)] | None = None
-    """which flight of a log that holds several, from 1"""
+    """number of the flight in a log of several, from 1"""
     name: str | None = None
     """in tables and figures; 'flight 1' and so on unless given"""
     rate: Positive | None = None
@@ -154,13 +154,13 @@ class FlightConfig(Section):
     window: tuple[Finite, Finite] | Literal["auto"] | None = None
     """[s] from the log's beginning; auto: the windows that say most of what is free"""
     gaps: Literal["fail", "split"] = "fail"
-    """what to do about gaps too long to be bridged: refuse them, or make flights of the parts"""
+    """gaps too long to be bridged: refuse them, or make flights of the parts"""
     also: list[AlsoConfig] = []
     """further logs of the same flight"""
     # Such a run is predicted and never fitted: agreement with it is the only one that no free
     # parameter was bent to.
     hold_out: bool = False
-    """whether it is predicted and not fitted"""
+    """true: predict it, do not fit it"""
     known: dict[str, Finite] = {}
     """parameters of the model that are known of this flight alone, in SI: {Ixx_added: 0.01}"""
     notch: Notches | None = None
@@ -173,7 +173,7 @@ class FlightConfig(Section):
 
 class PriorConfig(Section):
     mean: Finite
-    """of a normal distribution, in SI"""
+    """mean of a normal distribution, in SI"""
     sd: Positive
     """standard deviation, in SI"""
 
@@ -187,21 +187,21 @@ class FreeConfig(Section):
     upper: Finite | None = None
     """bound, in SI"""
     prior: PriorConfig | None = None
-    """what is known of it besides the data"""
+    """prior knowledge"""
     sign: Sign | None = None
-    """whether the estimate may have another sign than the start: keep, or any; unless given, a
-    helicopter's parameters keep theirs and those of a model of one's own may have any"""
+    """keep the sign of the start value, or any sign; default keep for a helicopter's parameters,
+    any for your own models"""
 
 
 class NuisanceConfig(Section):
     initial_state: bool = True
-    """whether the state at the first sample is estimated, of each flight"""
+    """true: estimate the initial state of each flight"""
     bias: bool = True
-    """whether a constant added to each output is, of each flight"""
+    """true: estimate a constant added to each output of each flight"""
     time_shift: bool = False
-    """whether a delay [s] of all inputs is, below zero where they were logged late"""
+    """true: estimate a delay [s] of all inputs, negative if they were logged late"""
     input_gain: bool = False
-    """whether a factor of each input is"""
+    """true: estimate a factor of each input"""
     input_offset: bool | list[str] | None = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
     the sticks of a vehicle in free flight"""
@@ -238,7 +238,7 @@ class StartMethodConfig(Section):
     """equation-error: by regression of the records themselves, for linear models; frequency-error:
     by a fit in frequency, from the starts that are given"""
     stepwise: bool = False
-    """whether terms that hardly help to predict are left at zero"""
+    """true: leave terms at zero that hardly help to predict"""
     # Entry and removal have one limit unless stated; where its number comes from stands with
     # `F_ENTER`.
     f_enter: Positive = F_ENTER
@@ -268,11 +268,11 @@ def _start_method(value: Any) -> Any:
 class FitConfig(Section):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
-    """by what model and data are compared"""
+    """estimation method (docs/methods.md)"""
     also: list[Literal[tuple(METHODS)]] = []  # pyright: ignore[reportInvalidTypeForm]
     """further methods by which the same is fitted, their estimates laid beside those of `method`"""
     free: dict[str, FreeConfig]
-    """what is estimated, by the names of the model"""
+    """parameters to estimate, by the model's names"""
     start: Annotated[
         StartMethodConfig,
         BeforeValidator(_start_method, json_schema_input_type=StartMethod | StartMethodConfig),
@@ -282,18 +282,18 @@ class FitConfig(Section):
     """in frequency: inputs that are taken by their instrument, or none; unless given, all of
     which every flight holds one (docs/frequency-fits.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
-    """what is estimated beside"""
+    """nuisance parameters"""
     shooting: ShootingConfig | None = None
     """windows with initial states of their own"""
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """points to start from; default one, and restarts where a fit explains little"""
     seed: Annotated[int, Field(ge=0)] = 0
-    """of random starts, bootstrap and NUTS"""
+    """seed of random starts, bootstrap and NUTS"""
     max_steps: Annotated[int, Field(ge=1)] = 200
-    """of the optimiser, from each start"""
+    """most steps of the optimiser from each start"""
     compare: bool = False
-    """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
-    several axes may be disturbed, all of them and each left out"""
+    """true: fit candidate models too: no disturbance, one pole, two poles; no stand; with
+    several disturbances all, and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
     """further intervals beside the Gaussian ones"""
 
@@ -323,7 +323,7 @@ class FitConfig(Section):
 class RLSConfig(Section):
     # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
-    """of the discrete transfer function"""
+    """order of the discrete transfer function"""
     # One forgets nothing: all samples count alike, as for a vehicle that does not change in a
     # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -333,7 +333,7 @@ class RLSConfig(Section):
 class ReportConfig(Section):
     # Half a second of each fit, and a page shows none of them.
     png: bool = False
-    """whether figures are PNG files too, beside SVG"""
+    """true: write figures as PNG too, beside SVG"""
 
 
 class Config(Section):
@@ -345,8 +345,8 @@ class Config(Section):
     vehicle: str | dict[str, Any] | None = None
     """may be left out where the model is a file: its own values are a vehicle"""
     corrections: dict[str, bool] | None = None
-    """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
-    off in place of what the model has; for the whole helicopter only"""
+    """corrections of the paper's equations by name, on or off
+    (`heli_jax.dynamics.helicopter.Corrections`); full helicopter only"""
     onboard: OnboardConfig | None = None
     """servos, rate loops, gyro, sensors and delays around the model (docs/onboard.md)"""
     # Any: a number in SI or {value, unit}, as in a vehicle file and checked as there, where the
@@ -358,14 +358,14 @@ class Config(Section):
     flights: list[FlightConfig] = []
     """the logged runs"""
     fit: FitConfig | None = None
-    """what is estimated, and how"""
+    """estimation"""
     # On unless switched off by `rls: null`: the baseline of the paper costs little.
     rls: RLSConfig | None = RLSConfig()
     """the recursive least squares of the paper, beside the fit; null for none"""
     disturbance: DisturbanceConfig | None = None
     """random pushes: drawn by simulate, estimated by filter error"""
     frequency: FrequencyConfig | None = None
-    """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency-fits.md)"""
+    """settings of `heli-jax frf` and of fit.method: frequency-response (docs/frequency-fits.md)"""
     report: ReportConfig = ReportConfig()
     """files beside the page of `fit` and `frf`"""
     simulate: SimulateConfig | None = None

@@ -21,7 +21,7 @@ class ScaledConfig(Section):
     offset: _Finite = 0.0
     """in the log's own numbers"""
     invert: bool = False
-    """whether the sign is turned"""
+    """true: change the sign"""
 
     @model_validator(mode="after")
     def _sensible(self) -> "ScaledConfig":
@@ -66,13 +66,13 @@ class CcpmConfig(Section):
     angles: list[_Finite]
     """[deg] of each, clockwise from the nose, seen from above"""
     radius: Numbers = 1.0
-    """of each from the mast, in any one unit"""
+    """distance of each servo from the mast, in any one unit"""
     offset: Numbers = 0.0
-    """of each at rest, in the log's numbers"""
+    """position of each servo at rest, in the log's numbers"""
     scale: Numbers = 1.0
     """lift for a unit of the log"""
     invert: bool | list[bool] = False
-    """whether a servo moves the other way"""
+    """true for a servo that moves the other way"""
     phase: _Finite = 0.0
     """[deg] by which the plate leads the blades"""
 
@@ -117,7 +117,7 @@ class PresetConfig(Section):
     preset_outputs: list[str] | None = None
     """the outputs to take from it; all that it can supply unless given"""
     ccpm: CcpmConfig | None = None
-    """what `ccpm.collective`, `ccpm.roll` and `ccpm.pitch` are unmixed from"""
+    """swashplate servos from which `ccpm.collective`, `ccpm.roll` and `ccpm.pitch` are computed"""
 
     @model_validator(mode="after")
     def _known(self) -> "PresetConfig":

@@ -1,4 +1,8 @@
-"""Logged runs: the one place where log files are read, units converted and clocks checked."""
+"""Logged runs: the one place where log files are read, units converted and clocks checked.
+
+Any function here raises `heli_jax.errors.InputError` for a wrong file or request: one sentence that
+names the place, what was expected and what was found.
+"""
 
 from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log
 from heli_jax.flights.flight import Flight, Signal, Source

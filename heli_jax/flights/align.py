@@ -195,12 +195,7 @@ class _Smooth:
 def _refined(
     t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
 ) -> tuple[float, float]:
-    """The lag of least squares from a near one, and its standard deviation, both [s].
-
-    Args:
-        t: times (n,) of `x` (n,), by the first clock.
-        x: the first signal, NaN where missing.
-    """
+    """The lag of least squares from a near one, and its standard deviation, both [s]."""
     begun = lag
     for _ in range(_STEPS):
         slope, bend, left = _linearised(t, x, y, lag)

@@ -60,14 +60,7 @@ class AsLogged:
 
 @np.errstate(over="ignore", invalid="ignore")  # differences of huge values
 def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
-    """The signals without marks and turns, and what they were.
-
-    Args:
-        signals: by key, in SI, each on its own clock.
-
-    Raises:
-        InputError: an input has marks; it acts all the time, so that none of it may be missing.
-    """
+    """The signals without marks and turns, and what they were."""
     made, odd, notes = {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
@@ -169,11 +162,7 @@ def is_wrapped(values: np.ndarray, turn: float) -> bool:
 
 
 def unwrapped(values: np.ndarray, turn: float, name: str) -> tuple[np.ndarray, Finding]:
-    """An angle (N,) without its jumps of a turn, and what was done.
-
-    Args:
-        values: NaN where one is missing.
-    """
+    """An angle (N,) without its jumps of a turn, and what was done."""
     seen = np.isfinite(values)
     before = values[seen]
     after = np.unwrap(before, period=turn)

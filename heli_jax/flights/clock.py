@@ -88,9 +88,6 @@ def table_clock(
     Args:
         time: the column of time stamps, where it is stated.
         rate: samples a second [Hz], of rows or of what `time` counts.
-
-    Raises:
-        InputError: there is no such column, or the unit or the rate is none.
     """
     said = ""
     if rate is not None:
@@ -144,7 +141,10 @@ def guess_clock(
     if not found:
         return None, False
     name = found[0]
-    unit = table.time_unit(name) or split_unit(name)[1] or _unit_alone(name)
+    unit = table.time_unit(name) or split_unit(name)[1]
+    # `ms` and `minutes` alone are names too; seconds are what clocks of any unit are called.
+    alone = "" if name.casefold() in LETTERS else time_unit(name) or ""
+    unit = unit or ("" if alone == "s" else alone)
     return Signal(name, unit or likely_unit(values[name]), "s"), not unit
 
 
@@ -167,13 +167,6 @@ def _says_when_sampled(table: Table, name: str) -> bool:
     topic = re.split(r"[./]", name)[-2:-1]
     commands = holds_commands(topic[0] if any(topic) else PurePath(table.path).name)
     return "time" not in table.names and not commands
-
-
-def _unit_alone(name: str) -> str:
-    """The unit of time that is all of a name, as `ms` and `minutes`; empty of seconds, which clocks
-    of any unit are called."""
-    unit = time_unit(name) or ""
-    return "" if unit == "s" or name.casefold() in LETTERS else unit
 
 
 def _increases(values: np.ndarray) -> bool:
@@ -219,11 +212,7 @@ def counter_notes(surveys: Sequence[Survey]) -> tuple[Finding, ...]:
 
 
 def _asked(table: Table, surveys: Sequence[Survey], time: str | Signal) -> Signal:
-    """A column of times as a user names it.
-
-    Raises:
-        InputError: there is none, or its unit is none of time.
-    """
+    """A column of times as a user names it."""
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
     if all(s.values is None for s in surveys if s.name == signal.name):
@@ -266,11 +255,7 @@ def unit_notes(time: Signal, stated: str | None) -> tuple[Finding, ...]:
 
 
 def require_increasing(table: Table, name: str, stamps: np.ndarray) -> None:
-    """Refuse a clock of which a stamp is not later than the one before it.
-
-    Raises:
-        InputError: with what to do about it.
-    """
+    """Refuse a clock of which a stamp is not later than the one before it."""
     back = not_increasing(stamps)
     if back is None:
         return
@@ -444,8 +429,6 @@ def numbering(surveys: Sequence[Survey]) -> str:
 
 def numbering_notes(column: str) -> tuple[Finding, ...]:
     """A note on a column that numbers runs, where one does."""
-    if not column:
-        return ()
     remedy = f"time: {{..., runs: {column}}} in a configuration makes a flight of each"
     words = f"{shown(column)} seems to number runs, which the time does not part: {remedy}"
     return (note("clock.runs-numbered", words, column),)

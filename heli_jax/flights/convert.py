@@ -13,7 +13,6 @@ from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import without_marks_and_turns
 from heli_jax.flights.derived import (
     DerivedLog,
-    DerivedTable,
     Swashplate,
     with_derived,
 )
@@ -93,24 +92,22 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     """
     # Before the log is opened, which may take minutes.
     require_rate_and_window(str(path), selection.rate, selection.window)
-    log = with_derived(open_log(path, selection.flight), selection.swashplate)
+    opened = open_log(path, selection.flight)
     # Asked before a table has lost the form of one, by which a preset may know it.
-    named = None if selection.named is None else selection.named(log)
+    named = None if selection.named is None else selection.named(opened)
     notes = [] if named is None else list(named.notes)
-    if isinstance(log, DerivedTable):
-        stated = (selection.time, selection.time_unit, selection.time_rate)
-        channels = None
-        if isinstance(log.table, ArrayTable) and stated == (None, None, None):
-            channels = by_clocks(log.table)
-        if channels is None:
-            channels = guessed_log(log.table, *stated)
+    stated = (selection.time, selection.time_unit, selection.time_rate)
+    if isinstance(opened, ArrayTable) and stated == (None, None, None):
+        opened = by_clocks(opened) or opened
+    if not isinstance(opened, ChannelLog):
+        opened = guessed_log(opened, *stated)
         # Without a rate the rows are copied as they are, empty cells and all.
-        if selection.rate is not None:
-            channels = without_joins(channels)
-        log = with_derived(channels, selection.swashplate)
-        assert isinstance(log, DerivedLog)
-    elif selection.time or selection.time_unit or selection.time_rate:
-        raise wrong(log.path, "its topics have clocks of their own, expected no time to be stated")
+        opened = opened if selection.rate is None else without_joins(opened)
+    elif any(stated):
+        raise wrong(
+            opened.path, "its topics have clocks of their own, expected no time to be stated"
+        )
+    log = with_derived(opened, selection.swashplate)
     notes += log.notes
     if named is None:
         names = _names(log, selection.signals)
@@ -301,11 +298,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def require_output(out: Path, log: str | Path) -> None:
-    """Refuse a name that no format that is written ends with, and a file that is there already.
-
-    Raises:
-        InputError: naming the endings.
-    """
+    """Refuse a name that no format that is written ends with, and a file that is there already."""
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
     # By the file and not by the name: a link to the log, or another spelling of its path, would

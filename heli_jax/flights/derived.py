@@ -16,7 +16,7 @@ from heli_jax.errors import nearest
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.resample import longest_gap
-from heli_jax.flights.table import Table, TableView, shown, wrong
+from heli_jax.flights.table import shown, wrong
 
 # Servo outputs of a swashplate, unmixed to collective and cyclic (CCPM).
 
@@ -137,9 +137,6 @@ def derivation(
 ) -> Derivation | None:
     """Return the computation of a channel of this name; None for a plain channel.
 
-    Args:
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
-
     Raises:
         ValueError: it looks like a derived channel and is none.
     """
@@ -168,7 +165,12 @@ def derivation(
         groups = (_quaternion(q, known), (north, east, down))
         return Derivation(groups, _row(body_velocity, BODY.index(part)))
     if function == "unwrap" and len(arguments) == 2 and not part:
-        period = _period(arguments[1], expected)
+        try:
+            period = float(arguments[1])
+        except ValueError:
+            raise ValueError(expected) from None
+        if not 0 < period < np.inf:
+            raise ValueError(f"expected a positive period, got {arguments[1]!r:.40}")
         return Derivation(((arguments[0],),), lambda values: _unwrapped(values[0], period))
     if function not in ("euler", "body_velocity", "unwrap"):
         hint = nearest(function, ("euler", "body_velocity", "unwrap"))
@@ -193,16 +195,6 @@ def _quaternion(arguments: Sequence[str], known: Collection[str]) -> tuple[str, 
     indexed = tuple(f"{arguments[0]}[{i}]" for i in range(4))
     numbered = tuple(f"{arguments[0]}{i}" for i in range(1, 5))
     return numbered if numbered[0] in known else indexed
-
-
-def _period(text: str, expected: str) -> float:
-    try:
-        period = float(text)
-    except ValueError:
-        raise ValueError(expected) from None
-    if not 0 < period < np.inf:
-        raise ValueError(f"expected a positive period, got {text!r:.40}")
-    return period
 
 
 def _row(of: Callable[..., np.ndarray], row: int) -> Callable[..., np.ndarray]:
@@ -259,11 +251,7 @@ class DerivedLog(ChannelLog):
             return True
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel; of a derived one that whose clock it has.
-
-        Raises:
-            InputError: there is no such channel, or those it is computed from have several clocks.
-        """
+        """The topic that holds a channel; of a derived one that whose clock it has."""
         # Of all topics, as `names` would have it, but without a tuple of thousands at every call.
         if any(name in topic.columns for topic in self.topics):
             return super().topic_of(name)
@@ -275,12 +263,15 @@ class DerivedLog(ChannelLog):
         if derived is None:
             return super().topic_of(name)
         *others, last = [self._group(group, place) for group in derived.groups]
-        blocks = [_on_clock(last[0].times, topic.times, values) for topic, values in others]
+        blocks = [
+            values if topic is last[0] else _on_clock(last[0].times, topic.times, values)
+            for topic, values in others
+        ]
         values = derived.compute(*blocks, last[1])
         # Angles are in rad whatever the log states; a velocity or a heading keeps its unit.
         stated = last[0].units.get(derived.groups[-1][0], "")
         units = {name: derived.unit or stated}
-        return Topic(last[0].name, last[0].times, {name: values}, units, last[0].clock)
+        return dataclasses.replace(last[0], columns={name: values}, units=units)
 
     def _group(self, names: Sequence[str], place: str) -> tuple[Topic, np.ndarray]:
         """The topic of channels that were written together, and their samples (k, N)."""
@@ -309,51 +300,7 @@ def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray
     return between
 
 
-class DerivedTable(TableView):
-    """A table of rows whose derived columns can be asked for as its own."""
-
-    def __init__(self, table: Table, swashplate: Swashplate | None = None) -> None:
-        super().__init__(table)
-        self.swashplate = swashplate
-
-    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty.
-
-        Raises:
-            InputError: a column is missing, or a name is none of a derived one.
-        """
-        derived = {name: d for name in names if (d := self._derivation(name)) is not None}
-        plain = [name for name in names if name not in derived]
-        plain += [n for d in derived.values() for group in d.groups for n in group]
-        columns = self.table.numbers(list(dict.fromkeys(plain)))
-        for name, d in derived.items():
-            clean = {n: without_marks(columns[n]) for group in d.groups for n in group}
-            columns[name] = d.compute(*(np.stack([clean[n] for n in g]) for g in d.groups))
-        return {name: columns[name] for name in names}
-
-    def _derivation(self, name: str) -> Derivation | None:
-        try:
-            return derivation(name, self.names, self.swashplate)
-        except ValueError as e:
-            raise wrong(self.path, str(e), f"column {shown(name)}") from e
-
-    def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell; of a derived column the number."""
-        if self._derivation(name) is None:
-            return super().cell_text(name, row)
-        return f"{self.numbers([name])[name][row]:g}"
-
-
-def with_derived(
-    log: Table | ChannelLog, swashplate: Swashplate | None = None
-) -> DerivedTable | DerivedLog:
-    """A log whose derived channels can be asked for by name.
-
-    Args:
-        log: as `open_log` gives it.
-        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
-    """
-    if not isinstance(log, ChannelLog):
-        return DerivedTable(log, swashplate)
+def with_derived(log: ChannelLog, swashplate: Swashplate | None = None) -> DerivedLog:
+    """Return a log whose derived channels can be asked for by name."""
     fields = {field.name: getattr(log, field.name) for field in dataclasses.fields(ChannelLog)}
     return DerivedLog(**fields, swashplate=swashplate)

@@ -243,9 +243,6 @@ def describe_table(
     Args:
         rate: samples a second [Hz], of rows or of what `time` counts; with one the rows are the
             clock, or a column that counts them, unless `time` names one.
-
-    Raises:
-        InputError: it has no such column.
     """
     surveys = table.survey()
     signal, guessed, said = table_clock(table, surveys, time, unit, rate)
@@ -277,7 +274,7 @@ def describe_table(
             *_other_lengths(surveys),
             *clock_notes(table),
             *(counter_notes(surveys) if clock is None else ()),
-            *numbering_notes(clock.numbering if clock else ""),
+            *(numbering_notes(clock.numbering) if clock and clock.numbering else ()),
             *(contradicted_rate(table, clock.column, clock.rate) if clock else ()),
             *marks,
         ),

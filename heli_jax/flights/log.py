@@ -119,11 +119,7 @@ class ChannelLog:
         return self.origin + self.first_time
 
     def topic_of(self, name: str) -> Topic:
-        """The topic that holds a channel.
-
-        Raises:
-            InputError: there is no such channel; with the nearest name there is.
-        """
+        """The topic that holds a channel."""
         # A search and no index: a log has some hundred topics, and names are asked for a few times.
         for topic in self.topics:
             if name in topic.columns:
@@ -133,11 +129,7 @@ class ChannelLog:
         raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
 
     def channel(self, name: str) -> Channel:
-        """Times and samples of one channel.
-
-        Raises:
-            InputError: there is no such channel, or its rows have no times.
-        """
+        """Times and samples of one channel."""
         topic = self.topic_of(name)
         # `info` shows such rows; only who asks for times has to be told that there are none.
         if not topic.clock:
@@ -149,12 +141,7 @@ class ChannelLog:
 def sharing_clocks(
     clocks: Mapping[str, np.ndarray], shared: tuple[float, float]
 ) -> tuple[str, ...]:
-    """The columns of times of one topic that are on the other topics' clock, the nearest first.
-
-    Args:
-        clocks: times (N,) [s] by column.
-        shared: first and last time [s] of the others.
-    """
+    """The columns of times of one topic that are on the other topics' clock, the nearest first."""
     first, last = shared
     within = {
         name: float(np.mean((times >= first - _APART) & (times <= last + _APART)))
@@ -172,10 +159,6 @@ def as_floats(values: np.ndarray) -> np.ndarray:
 
 
 def require_samples(path: str, topics: Sequence[Topic]) -> None:
-    """Refuse a log without any samples.
-
-    Raises:
-        InputError: naming the file.
-    """
+    """Refuse a log without any samples."""
     if not any(topic.times.size for topic in topics):
         raise wrong(path, "holds no samples, expected a flight")

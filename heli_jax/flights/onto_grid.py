@@ -61,13 +61,7 @@ def long_gap(seconds: np.ndarray) -> LongGap | None:
 def window_note(
     window: tuple[float, float] | None, end: float, step: float = 0.0
 ) -> tuple[Finding, ...]:
-    """A note where a window reaches beyond the log, else none.
-
-    Args:
-        window: first and last time [s] from the log's beginning.
-        end: of the log [s].
-        step: the usual one [s], by which a window may be longer.
-    """
+    """A note where a window reaches beyond the log, else none."""
     if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
         return ()
     words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
@@ -251,12 +245,10 @@ def _alike(
 def _resampled_with(
     signal: Timed, inputs: Sequence[tuple[Timed, np.ndarray]], times: np.ndarray
 ) -> np.ndarray:
-    """An output that jumps with inputs, low-passed (M,).
+    """Low-pass an output (M,) that jumps with inputs.
 
-    What jumps in it is known at all times, as the inputs are, and is taken from them. Samples tell
-    of a jump only between which of them it was: low-passed by itself it would be half a step early,
-    and of another size at the end of the band. How far the output jumps is what its own moves say,
-    by least squares.
+    The jump is taken from the inputs, scaled by least squares, because it is known at all times.
+    The output's samples alone would put it half a step early.
 
     Args:
         inputs: held ones that it follows at the very sample, each with what `held_low_passed`
@@ -281,14 +273,7 @@ def flight_of(
     holds: Mapping[str, Decision],
     source: Source,
 ) -> Flight:
-    """The flight of samples (N,) on one grid.
-
-    Args:
-        samples: by key, SI.
-        dt: step of the grid [s].
-        t0: time in the log of the first sample [s].
-        source: where the samples came from.
-    """
+    """The flight of samples (N,) on one grid."""
     options = request.options
     return Flight(
         dt=dt,

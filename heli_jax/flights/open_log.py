@@ -32,11 +32,7 @@ EXPECTED = (
 
 
 def open_table(path: str | Path) -> Table:
-    """Open a table of rows: text, Parquet or arrays, of which one column is the time.
-
-    Raises:
-        InputError: as `open_log`, or the file is an autopilot's log.
-    """
+    """Open a table of rows: text, Parquet or arrays, of which one column is the time."""
     log = open_log(path)
     if isinstance(log, ChannelLog):
         raise wrong(log.path, f"is a log of {log.format}, expected a table in CSV or Parquet")
@@ -45,9 +41,6 @@ def open_table(path: str | Path) -> Table:
 
 def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
     """Open a log of any format; columns of tables are read when they are asked for.
-
-    Args:
-        flight: which flight of a file that holds several, from 1.
 
     Returns:
         A table, whose time is one of its columns, or the channels of an autopilot's log.
@@ -72,11 +65,7 @@ def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
 def chosen_flights(
     path: str | Path, logs: Table | tuple[ChannelLog, ...], flight: int | None
 ) -> Table | tuple[ChannelLog, ...]:
-    """The flight of a number, or all without one.
-
-    Raises:
-        InputError: there is none of this number.
-    """
+    """The flight of a number, or all without one."""
     if flight is None:
         return logs
     if not isinstance(logs, tuple):
@@ -91,11 +80,7 @@ def chosen_flights(
 
 
 def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
-    """As `open_log`, but all flights of an autopilot's log.
-
-    Raises:
-        InputError: as `open_log`, but for the number of flights.
-    """
+    """As `open_log`, but all flights of an autopilot's log."""
     path = Path(path)
     try:
         # Any size here: each reader has a limit of its own.
@@ -224,11 +209,7 @@ _ZIP = b"PK\x03\x04"
 
 
 def _refuse_foreign(path: Path, head: bytes) -> None:
-    """Refuse a file that is known not to be read, by its first bytes or by its ending.
-
-    Raises:
-        InputError: with what to make of it.
-    """
+    """Refuse a file that is known not to be read, by its first bytes or by its ending."""
     ending = path.suffix.lower()
     words = next((words for mark, words in _BY_MARK if head.startswith(mark)), None)
     if words is None and head.startswith(_ZIP) and ending != ".npz":

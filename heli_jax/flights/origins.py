@@ -39,10 +39,6 @@ def with_origins(
 ) -> Flight:
     """The flight with its constant inputs, and with what its signals are in the log.
 
-    Args:
-        flight: as it was read, without the constants.
-        inputs: all, in the order in which the flight shall have them.
-
     Raises:
         ValueError: a constant is no finite number.
     """

@@ -18,9 +18,6 @@ FEWEST = 50
 def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
     """First and last time [s] of each stretch in which no clock has a gap that nothing bridges; a
     lone row between gaps is a stretch too.
-
-    Args:
-        clocks: stamps (N,) [s] of each, increasing.
     """
     begin = max(float(seconds[0]) for seconds in clocks)
     end = min(float(seconds[-1]) for seconds in clocks)
@@ -47,11 +44,7 @@ def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> 
 
 
 def spans(signals: Iterable[np.ndarray]) -> list[tuple[int, int]]:
-    """First sample, and that behind the last, of each stretch in which every signal has numbers.
-
-    Args:
-        signals: arrays (N,) of one grid, NaN where a sample is missing.
-    """
+    """First sample, and that behind the last, of each stretch in which every signal has numbers."""
     seen = np.all([np.isfinite(y) for y in signals], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

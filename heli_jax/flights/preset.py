@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from heli_jax.errors import nearest
 from heli_jax.finding import Finding, note
-from heli_jax.flights.derived import DerivedLog, DerivedTable, sources
+from heli_jax.flights.derived import sources
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.table import Table, wrong
@@ -190,20 +190,18 @@ def _serves(log: ChannelLog, needed: Sequence[str], alternative: Alternative) ->
 
 
 def fitting_presets(log_format: str, names: Sequence[str]) -> list[str]:
-    """The presets for a format of which a log has the roll rate and the roll command."""
-    known = frozenset(names)
-    return [name for name in presets() if _fits(preset(name), log_format, known)]
-
-
-def _fits(table: Preset, log_format: str, names: frozenset[str]) -> bool:
-    if log_format not in table.formats:
-        return False
+    """Return the presets for a format of which a log has the roll rate and the roll command."""
     # Instances are told apart by the reader; here any will do.
-    bare = names | {re.sub(r"^(\w+)\[\d+\]\.", r"\1.", name) for name in names}
-    return all(
-        any(set(sources(a.channel, bare)) <= bare for a in table.signals[signal])
-        for signal in ("roll_rate", "cyclic_roll")
-    )
+    bare = {*names, *(re.sub(r"^(\w+)\[\d+\]\.", r"\1.", name) for name in names)}
+    return [
+        name
+        for name in presets()
+        if log_format in preset(name).formats
+        and all(
+            any(set(sources(a.channel, bare)) <= bare for a in preset(name).signals[signal])
+            for signal in ("roll_rate", "cyclic_roll")
+        )
+    ]
 
 
 # Which channels of a log become which columns, as a preset or a configuration names them.
@@ -219,7 +217,7 @@ class Named(NamedTuple):
     """whether a channel without a usable clock is an error; it is left out otherwise"""
 
 
-type NamedBy = Callable[[DerivedTable | DerivedLog], Named]
+type NamedBy = Callable[[Table | ChannelLog], Named]
 
 
 def by_preset(name: str) -> NamedBy:
@@ -230,7 +228,7 @@ def by_preset(name: str) -> NamedBy:
     """
     table = preset(name)
 
-    def named(log: DerivedTable | DerivedLog) -> Named:
+    def named(log: Table | ChannelLog) -> Named:
         chosen = {signal: choose(log, each) for signal, each in table.signals.items()}
         signals = {
             signal: Signal(

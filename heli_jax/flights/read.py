@@ -13,7 +13,6 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.finding import LEFT_OUT, Finding, note
 from heli_jax.flights.as_logged import measured
-from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
@@ -24,7 +23,7 @@ from heli_jax.flights.read_channels import clocks_of, on_all_the_time
 from heli_jax.flights.request import ReadOptions, Request
 from heli_jax.flights.resample import Timed
 from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opened
-from heli_jax.flights.table import wrong
+from heli_jax.flights.table import Table, wrong
 
 _DEFAULT = ReadOptions()
 _SHORTEST = 0.05
@@ -33,7 +32,7 @@ _STILL = 1e-100
 """SI: an output that moves by no more does not move"""
 
 
-type _Log = str | Path | ChannelLog | DerivedTable
+type _Log = str | Path | ChannelLog | Table
 type _Finish = Callable[[Flight], Flight]
 """adds what is in no log, and what the signals are in theirs"""
 
@@ -51,7 +50,7 @@ def read_flight(
 
     Args:
         path: the log: a table, arrays or what an autopilot wrote (docs/logs.md); or one that is
-            open, by `heli_jax.flights.derived.with_derived`.
+            open, by `heli_jax.flights.open_log.open_log`.
         time: the column of time stamps, in seconds where only its name is given; None for an
             autopilot's log, whose topics have clocks of their own.
         inputs: the log's signals by the model's names; two inputs may share a column. What one
@@ -229,11 +228,7 @@ def _with_notes(flight: Flight, notes: tuple[Finding, ...]) -> Flight:
 
 
 def require_some_time(flight: Flight) -> None:
-    """Refuse a flight in which no vehicle can have moved.
-
-    Raises:
-        InputError: with its length, and where to look.
-    """
+    """Refuse a flight in which no vehicle can have moved."""
     if flight.duration >= _SHORTEST:
         return
     path = flight.source.path if flight.source else flight.name or "flight"
@@ -242,11 +237,7 @@ def require_some_time(flight: Flight) -> None:
 
 
 def require_moving_outputs(flight: Flight) -> None:
-    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise.
-
-    Raises:
-        InputError: naming the outputs and the values they keep.
-    """
+    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise."""
     seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
     still = {n: y[0] for n, y in seen.items() if y.size and np.ptp(y) <= _STILL}
     if not still or len(still) < len(seen):

@@ -80,7 +80,7 @@ class TopicClock:
 
     @property
     def rounding(self) -> float:
-        """How coarsely the stamps are rounded [s]."""
+        """Rounding of the stamps [s]."""
         if self.topic.rows is None:
             return rounding_of(self.seconds)
         return rounding_of(self.topic.rows.stamps[self.rows]) * self.topic.rows.scale
@@ -92,7 +92,7 @@ class TopicClock:
         return replace(self, seconds=self.seconds[rows], rows=of_topic)
 
     def places(self, i: int) -> tuple[str, ...]:
-        """Where the i-th time stands: `line 12, column 't'`; of an autopilot's log the topic."""
+        """Place of the i-th time: `line 12, column 't'`, or the topic of an autopilot's log."""
         if self.topic.rows is None:
             return (f"topic {shown(self.name)}",)
         return self.topic.rows.table.place(self.rows.start + i), column(self.topic.clock)
@@ -118,11 +118,7 @@ class ClockedSignal:
 def rows_in_window(
     path: str, elapsed: np.ndarray, window: tuple[float, float] | None, *place: str
 ) -> slice:
-    """The rows of a clock (N,) [s] inside the window.
-
-    Raises:
-        InputError: they are too few.
-    """
+    """The rows of a clock (N,) [s] inside the window."""
     first, last = 0, elapsed.size
     where = ""
     if window is not None and elapsed.size > 1:
@@ -140,11 +136,7 @@ def rows_in_window(
 
 
 def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | None) -> TopicClock:
-    """Return the times of a topic inside the window [s], finite and increasing.
-
-    Raises:
-        InputError: they are no clock, or too few.
-    """
+    """Return the times of a topic inside the window [s], finite and increasing."""
     place = () if topic.rows else (f"topic {shown(topic.name)}",)
     elapsed = topic.times - log.first_time
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
@@ -175,11 +167,7 @@ def topic_clock(log: ChannelLog, topic: Topic, window: tuple[float, float] | Non
 def signals_of(
     log: ChannelLog, request: Request
 ) -> tuple[dict[Key, ClockedSignal], tuple[Finding, ...]]:
-    """Return the signals in SI inside the window, each on the clock of its topic, and notes.
-
-    Raises:
-        InputError: a channel is missing or holds no finite numbers, or a clock is none.
-    """
+    """Return the signals in SI inside the window, each on the clock of its topic, and notes."""
     clocks: dict[str, TopicClock] = {}
     numbers: dict[Key, np.ndarray] = {}
     topics: dict[str, list[Key]] = {}
@@ -215,7 +203,9 @@ def _in_si(
         problem = f"got {numbers[i]} at {clock.seconds[i]:.6g} s, expected a finite number{more}"
         raise wrong(log.path, problem, f"channel {shown(signal.name)}")
     table, row = clock.topic.rows.table, clock.rows.start + i
-    problem = f"got {table.cell_text(signal.name, row)}, expected a finite number{more}"
+    is_derived = signal.name not in table.names
+    cell = f"{numbers[i]:g}" if is_derived else table.cell_text(signal.name, row)
+    problem = f"got {cell}, expected a finite number{more}"
     raise wrong(log.path, problem, table.place(row), column(signal.name))
 
 
@@ -263,13 +253,6 @@ def flight_of_signals(
     Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
     their hold, outputs on straight lines where they are as fast as it; what is slower is missing
     between its samples.
-
-    Args:
-        signals: by key, in SI inside the window.
-        source: where they came from, with notes on it so far.
-
-    Raises:
-        InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
     clocks, rate = clocks_of(signals.values()), request.options.rate
     is_one = len(clocks) == 1 and (rate is None or clocks[0].topic.rows is not None)
@@ -416,9 +399,6 @@ def common_times(
         rate: of the times [Hz].
         on: a clock at a sample of which they begin: one of that rate. Samples that fall on the grid
             stay as they are; a mean of two neighbours has less noise, and that is not white.
-
-    Raises:
-        InputError: there are too few, or absurdly many.
     """
     # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
     # knows.

@@ -25,7 +25,7 @@ from heli_jax.flights.clock import (
     unit_notes,
     with_runs,
 )
-from heli_jax.flights.derived import DerivedTable
+from heli_jax.flights.derived import sources, with_derived
 from heli_jax.flights.describe import TimeInfo, describe_table
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.formats.arrays import SEGMENT, ArrayTable
@@ -45,58 +45,56 @@ _NAMED = 2
 
 
 def load_table(table: Table, request: Request) -> ChannelLog:
-    """Return the columns that are asked for, with their clock.
-
-    Raises:
-        InputError: a column is missing or holds no numbers, or the time is none.
-    """
+    """Return the columns that are asked for, with their clock."""
     time, runs = request.time, request.options.runs
     if time is None:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
-    derived = table if isinstance(table, DerivedTable) else None
-    file = derived.table if derived else table
-    of_stack = isinstance(file, ArrayTable) and SEGMENT in file.names
-    if of_stack and time.name == ROWS and not runs:
+    if isinstance(table, ArrayTable) and SEGMENT in table.names and time.name == ROWS and not runs:
         problem = f"its rows are of several runs, which {SEGMENT!r} numbers"
         remedy = f"expected time: {{rate: HZ, runs: {SEGMENT}}}, which makes a flight of each"
         raise wrong(table.path, f"{problem}; {remedy}")
-
-    def over(view: Table) -> Table:
-        return DerivedTable(view, derived.swashplate) if derived else view
-
-    if time.name == ROWS:
-        file = counted(file)
-        table = over(file)
-    numbers = table.numbers(request.columns)
+    names, known = [time.name, *([runs] if runs else [])], frozenset(table.names)
+    for signal in request.signals.values():
+        try:
+            names += sources(signal.name, known, request.options.swashplate)
+        except ValueError as e:
+            raise wrong(table.path, str(e), column(signal.name)) from e
+    names = list(dict.fromkeys(names))
+    table = counted(table) if time.name == ROWS else table
+    numbers = table.numbers(names)
     if request.options.split:
-        parted = with_runs(file, time.name, numbers, clock_scale(table, time), runs)
-        if parted is not file:
-            table = over(parted)
-            numbers = table.numbers(request.columns)
+        table = with_runs(table, time.name, numbers, clock_scale(table, time), runs)
+        numbers = table.numbers(names)
     stamps = numbers[time.name]
-    signals = {s.name: numbers[s.name] for s in request.signals.values()}
-    inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
-    # Stamps that are no clock are refused below, with their line.
+    # Stamps that are no clock are refused with their line.
     is_clock = stamps.size and np.isfinite(stamps).all() and np.all(np.diff(stamps) >= 0)
-    if is_clock and is_joined(stamps * clock_scale(table, time), signals, inputs):
-        return without_joins(_with_clock(table, numbers, time), joined=True)
+    log = None
+    if is_clock:
+        log = with_derived(_with_clock(table, numbers, time), request.options.swashplate)
+        columns = {s.name: log.channel(s.name).values for s in request.signals.values()}
+        inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
+        if is_joined(stamps * clock_scale(table, time), columns, inputs):
+            return without_joins(log, joined=True)
     said, cautions = _checked(table, time, stamps)
-    log = _with_clock(table, numbers, time)
+    # A counter that began anew is a clock once it goes on.
+    log = log or with_derived(_with_clock(table, numbers, time), request.options.swashplate)
     return replace(log, notes=(*log.notes, *said), cautions=cautions)
 
 
-def _with_clock(table: Table, numbers: Mapping[str, np.ndarray], time: Signal) -> ChannelLog:
+def _with_clock(
+    table: Table, numbers: Mapping[str, np.ndarray], time: Signal, name: str = ""
+) -> ChannelLog:
     """Return the columns (N,) as one topic, whose times count from the first row."""
     scale, stamps = clock_scale(table, time), without_overflow(numbers[time.name])
     columns = {n: x for n, x in numbers.items() if n != time.name}
     stated = {n: table.units[n] for n in columns if table.units.get(n)}
     rows = TableRows(table, stamps, scale)
     # Subtracted first, so that a calendar's digits do not cost any.
-    times = (stamps - stamps[0]) * scale
-    topic = Topic(Path(table.path).name, times, columns, stated, time.name, rows)
-    origin = float(stamps[0] * scale)
-    return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=origin)
+    first = float(stamps[0]) if stamps.size else 0.0
+    times = (stamps - first) * scale
+    topic = Topic(name or Path(table.path).name, times, columns, stated, time.name, rows)
+    return ChannelLog.of_table(table, (topic,), notes=table.notes, origin=first * scale)
 
 
 def _checked(
@@ -147,9 +145,6 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     Args:
         time: the clock, where it is named; else guessed.
         rate: samples a second [Hz] of a table without times.
-
-    Raises:
-        InputError: it has no clock, or two columns of one name.
     """
     info = describe_table(table, time, unit, rate)
     clock, notes = info.time, []
@@ -157,7 +152,9 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
     if clock is None or clock.problem:
         why = clock.problem if clock else "no column looks like a clock"
         remedy = "expected --time NAME, a column of increasing times, or "
-        remedy += "a file without the rows that go back" if clock else "--time-rate HZ"
+        remedy += (
+            "a file without the rows that go back" if clock else "--time-rate HZ, samples a second"
+        )
         if not clock and texts:
             why += f" ({shown(texts[0].name)} is text{texts[0].strays and ': ' + texts[0].strays})"
         raise wrong(table.path, f"{why}, {remedy}")
@@ -183,7 +180,7 @@ def guessed_log(table: Table, time: str | None, unit: str | None, rate: float | 
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
     table = counted(table) if clock.column == ROWS else in_runs(table, clock)
     numbers = table.numbers(list(dict.fromkeys([*names, clock.column])))
-    log = _with_clock(table, numbers, clock.signal)
+    log = _with_clock(table, numbers, clock.signal, "the table")
     return replace(log, notes=(*notes, *log.notes))
 
 

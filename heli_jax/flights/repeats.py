@@ -68,10 +68,6 @@ def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
     So a forward-filled join does it, whose rows lie anywhere between: its runs are of any length.
     What tells is the resolution. A signal that moves by many of its steps before a value and after
     it does not measure the same value twice in a row; and new values come at a clock of their own.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), NaN where one is missing.
     """
     lengths, jumps = _runs(values)
     if lengths.size < _SURE:
@@ -93,12 +89,6 @@ def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
     regular = np.abs(begins - usual) <= near
     double = np.abs(begins - 2 * usual) <= near
     return bool(np.mean(regular | double) >= _REGULAR)
-
-
-def _is_exact(values: np.ndarray, usual: int) -> bool:
-    """True if hardly any run has another length than the usual one, or a multiple of it."""
-    lengths, _ = _runs(values)
-    return lengths.size >= _SURE and bool(np.mean(lengths % usual == 0) >= _EXACT)
 
 
 def first_of_each(values: np.ndarray) -> np.ndarray:
@@ -136,7 +126,13 @@ def repeats_removed(
         if stated[name] == "keep":
             continue
         usual = runs[name]
-        exact = usual is not None and _is_exact(y, usual)
+        # Hardly any run has another length than the usual one, or a multiple of it.
+        lengths, _ = _runs(y)
+        exact = (
+            usual is not None
+            and lengths.size >= _SURE
+            and bool(np.mean(lengths % usual == 0) >= _EXACT)
+        )
         sure = exact or carried_on(seconds, y)
         if sure and not exact:
             made[name] = first_of_each(y)
@@ -148,7 +144,6 @@ def repeats_removed(
             notes.append(note("repeats.carried-on", words, name, value=hz))
             continue
         if stated[name] == "missing":
-            lengths, _ = _runs(y)
             # Stated by somebody who knows: then no further sign is asked for.
             usual = usual or round(float(np.median(lengths))) if lengths.size else None
             if usual is None or usual < 2:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from heli_jax import units
 from heli_jax.finding import Finding, note
+from heli_jax.flights.derived import Swashplate
 from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.origins import scale_problem
@@ -70,6 +71,8 @@ class ReadOptions:
     whether it does so at the very sample; such held inputs are low-passed as the output is"""
     runs: str = ""
     """the column of a table that numbers its runs"""
+    swashplate: Swashplate | None = None
+    """geometry of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`"""
     split: bool = False
     """whether runs are told by a time that begins anew, to become flights of their own"""
 
@@ -77,11 +80,7 @@ class ReadOptions:
 def require_rate_and_window(
     path: str, rate: float | None, window: tuple[float, float] | None
 ) -> None:
-    """Refuse a rate or a window of which a log has no part.
-
-    Raises:
-        InputError: with what was expected.
-    """
+    """Refuse a rate or a window of which a log has no part."""
     # NaN passes no comparison, so each bound is written as what has to hold.
     if rate is not None and not (rate > 0 and math.isfinite(rate)):
         raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
@@ -93,11 +92,7 @@ def require_rate_and_window(
 
 
 class Request:
-    """The signals, the rate and the window that a user wants from a log.
-
-    Raises:
-        InputError: a column has two uses, a unit does not fit, a number makes no sense.
-    """
+    """The signals, the rate and the window that a user wants from a log."""
 
     def __init__(
         self,
@@ -123,14 +118,10 @@ class Request:
         for use, signal in uses.items():
             if problem := _problem(use, signal):
                 raise wrong(path, problem, column(signal.name))
-        self._check_numbers()
-
-    @property
-    def columns(self) -> list[str]:
-        """The columns to read, each once, the time first."""
-        time = [] if self.time is None else [self.time.name]
-        runs = [self.options.runs] if self.options.runs else []
-        return list(dict.fromkeys([*time, *(s.name for s in self.signals.values()), *runs]))
+        require_rate_and_window(path, options.rate, options.window)
+        for name, value in self.known.items():
+            if not math.isfinite(value):
+                raise wrong(path, f"known {name!r} is {value:g}, expected a finite number")
 
     def of_kind[V](self, kind: str, samples: Mapping[tuple[str, str], V]) -> dict[str, V]:
         """The samples of all inputs or of all outputs by the model's name, in the user's order."""
@@ -155,13 +146,6 @@ class Request:
             if before != use and not before[0] == kind == "input":
                 problem = f"serves both as {before[1]} and as {use[1]}, expected one use"
                 raise wrong(self.path, problem, column(signal.name))
-
-    def _check_numbers(self) -> None:
-        require_rate_and_window(self.path, self.options.rate, self.options.window)
-        for name, value in self.known.items():
-            if not math.isfinite(value):
-                problem = f"known {name!r} is {value:g}, expected a finite number"
-                raise wrong(self.path, problem)
 
 
 def _problem(use: str, signal: Signal) -> str:
@@ -202,9 +186,6 @@ def _problem(use: str, signal: Signal) -> str:
 def with_file_units(log: ChannelLog, request: Request) -> Request:
     """Return the request with the file's units where none was asked for, and with those that
     contradict what was.
-
-    Raises:
-        InputError: the file's unit is of another kind than what is asked for.
     """
     made = copy.copy(request)
     made.signals = {

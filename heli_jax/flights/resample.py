@@ -1,4 +1,9 @@
-"""A flight's samples on another clock."""
+"""A flight's samples on another clock.
+
+Throughout, `seconds` (N,) [s] are stamps that increase, `values` (N,) the samples there, NaN where
+one is missing, and `times` (M,) [s] those of a grid, evenly spaced. Results are (M,), in the
+samples' unit, NaN where too much is missing. Holds take times from the first stamp on.
+"""
 
 import functools
 from dataclasses import dataclass
@@ -90,14 +95,6 @@ def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarr
 
     For modes and counters, of which no mean makes sense; what acts on a vehicle takes `held_mean`.
     A time that misses a stamp by rounding alone counts as at the stamp.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,).
-        times: (M,) [s], none before the first stamp.
-
-    Returns:
-        (M,), in the samples' unit.
     """
     tolerance = 1e-6 * float(np.median(np.diff(seconds)))
     return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
@@ -107,14 +104,6 @@ def held_until_jumps(seconds: np.ndarray, values: np.ndarray, times: np.ndarray)
     """A signal that is held until it jumps, and else follows straight lines.
 
     A jump comes to the time nearest to its own, so that it remains one on the grid.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), finite.
-        times: (M,) [s], evenly spaced, none before the first stamp.
-
-    Returns:
-        (M,), in the samples' unit.
     """
     stairs, rest = split(values)
     nearest = times + 0.5 * (times[1] - times[0])
@@ -157,16 +146,7 @@ def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
 
 
 def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A stepwise signal through the low-pass filter of `resampled`, at the times of a grid.
-
-    Args:
-        seconds: stamps (N,) [s], increasing; each sample stays until the next.
-        values: samples (N,), finite.
-        times: (M,) [s], evenly spaced, M >= 2, none before the first stamp.
-
-    Returns:
-        (M,), in the samples' unit.
-    """
+    """A stepwise signal through the low-pass filter of `resampled`, at the times of a grid."""
     step = float(times[1] - times[0])
     cell = step / _CELLS
     count = int(np.ceil((max(seconds[-1], times[-1]) - seconds[0]) / cell)) + 1
@@ -183,16 +163,7 @@ def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:
 
 
 def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal that is no step: on straight lines, or low-pass filtered where the rate goes down.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), NaN where one is missing.
-        times: (M,) [s], evenly spaced.
-
-    Returns:
-        (M,), in the samples' unit; NaN where too much is missing.
-    """
+    """A signal that is no step: on straight lines, or low-passed where the rate goes down."""
     # Where the rate hardly goes down there is nothing to fold, and straight lines keep the samples
     # as they are.
     if not goes_down(seconds, times):
@@ -201,16 +172,7 @@ def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
 
 
 def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The straight line between neighbouring samples.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,), NaN where one is missing.
-        times: (M,) [s]; beyond the last stamp its value holds.
-
-    Returns:
-        (M,), in the samples' unit; NaN beside a missing sample.
-    """
+    """The straight line between neighbouring samples."""
     i = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, seconds.size - 2)
     part = np.clip((times - seconds[i]) / (seconds[i + 1] - seconds[i]), 0.0, 1.0)
     # A weighted mean: the difference of two huge values would overflow.
@@ -281,9 +243,6 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     order, also where steps are uneven). So its value is right to that order, and its noise stays
     its own: the neighbours add 6 % of variance where the grid is hardly faster, and nothing to
     speak of where it is many times as fast.
-
-    Args:
-        times: (M,) [s], evenly spaced, M >= 2.
     """
     seen = ~np.isnan(signal.values)
     seconds, values = signal.seconds[seen], signal.values[seen]
@@ -343,12 +302,7 @@ def at_own_rate(signal: Timed, times: np.ndarray) -> np.ndarray:
 
 
 def slower_words(name: str, placed: Placed, signal: Timed, rate: float) -> str:
-    """Describe the treatment of a slow output, in one sentence.
-
-    Args:
-        placed: what `at_nearest` made of it.
-        rate: of the grid [Hz].
-    """
+    """Describe the treatment of a slow output, in one sentence."""
     there = int(np.count_nonzero(~np.isnan(placed.samples)))
     words = (
         f"{name} at about {1 / usual_step(own_clock(signal).seconds):.4g} Hz is slower than the "
@@ -401,16 +355,7 @@ _AT_ONCE = 1 << 22
 
 
 def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal at a lower rate.
-
-    Args:
-        seconds: stamps (N,) [s], increasing, with steps of at most a few usual ones.
-        values: samples (N,), NaN where one is missing.
-        times: (M,) [s], evenly spaced, M >= 2.
-
-    Returns:
-        (M,), in the samples' unit; NaN where more is missing than two new steps, or five old ones.
-    """
+    """A signal at a lower rate."""
     # A missing sample is taken out and not set to any value: the fit of even samples knows what to
     # do where none stands.
     known = np.isfinite(values)
@@ -430,13 +375,7 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
 
 
 def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple[float, np.ndarray]:
-    """Samples (K,) at even steps [s] from the first stamp to behind the last, and the step.
-
-    Args:
-        seconds: stamps (N,) [s], increasing, N >= 2.
-        values: samples (N,), all known.
-        usual: the usual step [s].
-    """
+    """Samples (K,) at even steps [s] from the first stamp to behind the last, and the step."""
     span = float(seconds[-1] - seconds[0])
     # Bounded whatever the stamps: four even samples for each that there is.
     step = max(usual, span / (4 * seconds.size))
@@ -466,12 +405,7 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
 
 
 def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
-    """The one of `_RIDGES` that predicts hidden samples best.
-
-    Args:
-        at: where the samples stand (N,), in steps.
-        values: the samples (N,).
-    """
+    """The one of `_RIDGES` that predicts hidden samples best."""
     # From the middle, where the vehicle is most likely at work; the ends are pulled to the line
     # whatever the ridge.
     first = max(0, (at.size - _TRIED) // 2)
@@ -535,10 +469,6 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) 
 def _equations(stamps: bytes, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the even samples that each sample is a sum of and their weights (N, taps), and the
     diagonals (taps, size) of the least-squares equations with the penalty.
-
-    Args:
-        stamps: where the samples stand (N,) in steps, float64.
-        size: how many even samples there are, with those that the taps reach behind both ends.
     """
     at = np.frombuffer(stamps)
     columns = np.floor(at).astype(np.int64)[:, None] + 1 + np.arange(_TAPS)

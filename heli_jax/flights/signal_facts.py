@@ -152,12 +152,7 @@ class SignalFacts:
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
-    """The facts of one signal by itself.
-
-    Args:
-        seconds: stamps (N,) [s], increasing.
-        x: samples (N,), NaN where one is missing.
-    """
+    """The facts of one signal by itself."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
     if not y.size:
@@ -180,11 +175,7 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 def facts_of_all[K: Hashable](
     signals: Mapping[K, tuple[np.ndarray, np.ndarray]], outputs: frozenset[K]
 ) -> dict[K, SignalFacts]:
-    """The facts of signals that were logged together, stuck outputs among them.
-
-    Args:
-        signals: stamps (N,) [s] and samples (N,) by key.
-    """
+    """The facts of signals that were logged together, stuck outputs among them."""
     # Differences of huge values overflow, and no more is known of such signals then.
     with np.errstate(over="ignore", invalid="ignore"):
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
@@ -318,13 +309,6 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
     return Rail(float(levels[k]), s[at])
 
 
-def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks of the samples (N,) at the lower and at the upper rail; none if there is no
-    rail."""
-    finite = x[np.isfinite(x)]
-    return _at_rails(x, finite, *np.unique(finite, return_counts=True))
-
-
 def _at_rails(
     x: np.ndarray, finite: np.ndarray, levels: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -335,27 +319,16 @@ def _at_rails(
 
 
 def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The samples at the largest value, where that is a rail.
-
-    Args:
-        x: samples (N,), NaN where one is missing.
-    """
+    """The samples at the largest value, where that is a rail."""
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
     piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * finite.size
-    if piled and _comes_and_goes(finite == top):
-        return x == top
-    return np.zeros(x.shape, bool)
-
-
-def _comes_and_goes(at: np.ndarray) -> bool:
-    """True if samples at an end of a range are visits, and not a signal at rest."""
-    if at[0] and at[-1]:
-        return False
-    edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    return bool(begins.size >= _VISITS and (ends - begins).max() >= _RUN)
+    # Visits to the end of the range, and not a signal at rest.
+    at = finite == top
+    edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
+    visits = len(edges) >= _VISITS and np.diff(edges).max() >= _RUN and not (at[0] and at[-1])
+    return x == top if piled and visits else np.zeros(x.shape, bool)
 
 
 def quantum(x: np.ndarray) -> float:

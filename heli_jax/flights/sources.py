@@ -10,7 +10,7 @@ from heli_jax.errors import InputError
 from heli_jax.finding import Finding, note, sentences
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
-from heli_jax.flights.derived import DerivedTable, with_derived
+from heli_jax.flights.derived import with_derived
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.formats.arrays import ArrayTable, by_clocks
 from heli_jax.flights.log import ChannelLog
@@ -52,9 +52,6 @@ class Opened(NamedTuple):
 def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Opened, Request]:
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
-
-    Raises:
-        InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
     request = with_file_units(first, request)
@@ -82,11 +79,7 @@ def clocked(logs: Opened, request: Request) -> tuple[dict[Key, ClockedSignal], t
 
 
 def flight_from(logs: Opened, request: Request) -> Flight:
-    """The flight inside the window.
-
-    Raises:
-        InputError: one sentence on what is wrong with a log, the window or the rate.
-    """
+    """The flight inside the window."""
     log, alongside = logs.log, tuple(one.note for one in logs.beside)
     notes = (*log.notes, *beyond(logs, request), *alongside)
     try:
@@ -115,40 +108,26 @@ def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
 
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
-    log = log or _of_file(request)
-    if request.time is None and not isinstance(log, ChannelLog):
-        log = _by_clocks(log)
+    log = log or open_log(request.path, request.options.number)
+    if request.time is None and isinstance(log, ArrayTable):
+        # Arrays may have clocks of their own beside them in the file.
+        log = by_clocks(log) or log
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
         problem = "its topics have clocks of their own, expected no time to be stated, got "
         raise wrong(log.path, problem + shown(request.time.name))
-    return log
+    return with_derived(log, request.options.swashplate)
 
 
-def _of_file(request: Request) -> ChannelLog | Table:
-    return with_derived(open_log(request.path, request.options.number))
-
-
-def _by_clocks(log: Table) -> ChannelLog | Table:
-    """Arrays whose clocks stand beside them in the file; any other table as it is."""
-    swashplate = log.swashplate if isinstance(log, DerivedTable) else None
-    table = log.table if isinstance(log, DerivedTable) else log
-    with_clocks = by_clocks(table) if isinstance(table, ArrayTable) else None
-    return log if with_clocks is None else with_derived(with_clocks, swashplate)
-
-
-def _only(request: Request, keys: frozenset[Key]) -> Request:
+def _only(request: Request, keys: frozenset[Key], whole: bool = False) -> Request:
+    """Return the request for some signals; over all of the log if `whole`: a lag is found from as
+    much as there is."""
     part = copy.copy(request)
     part.signals = {key: s for key, s in request.signals.items() if key in keys}
+    if whole:
+        part.options = dataclasses.replace(request.options, window=None)
     return part
-
-
-def _whole(request: Request) -> Request:
-    """The same over all of the log: a lag is found from as much as there is."""
-    request = copy.copy(request)
-    request.options = dataclasses.replace(request.options, window=None)
-    return request
 
 
 def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Request]:
@@ -157,7 +136,7 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Requ
     options = ReadOptions(number=also.number)
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already may be large.
-    file = also.log or _of_file(asked)
+    file = also.log or open_log(asked.path, asked.options.number)
     other = _open(asked, file)
     asked = with_file_units(other, asked)
     signals, _ = signals_of(other, asked)
@@ -168,7 +147,9 @@ def _beside(log: ChannelLog, request: Request, also: Also) -> tuple[Beside, Requ
     else:
         lag = float(other.begin - log.begin)
         theirs = _span(signals, other.begin)
-        ours = _span(signals_of(log, _whole(request))[0], log.begin)
+        ours = _span(
+            signals_of(log, _only(request, frozenset(request.signals), whole=True))[0], log.begin
+        )
         said = _as_one(request, also, ours, theirs, stated)
     return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, said), asked
 
@@ -185,7 +166,7 @@ def _aligned(
     # Apart from the others, since it may well be one of them.
     options = ReadOptions(number=also.number)
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    reference = signals_of(log, _only(_whole(request), frozenset({key})))[0][key].timed
+    reference = signals_of(log, _only(request, frozenset({key}), whole=True))[0][key].timed
     (twin,) = signals_of(_open(alone, file), alone)[0].values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
     # A scale does not matter for it, so that no unit is asked for.
@@ -205,11 +186,7 @@ def _as_one(
     theirs: tuple[float, float],
     name: str,
 ) -> Finding:
-    """A note that the times of two logs, from first to last [s], count alike.
-
-    Raises:
-        InputError: they hardly overlap, so that they have no clock in common.
-    """
+    """A note that the times of two logs, from first to last [s], count alike."""
     first, shared = Path(request.path).name, min(ours[1], theirs[1]) - max(ours[0], theirs[0])
     if not shared >= _SHARED * min(ours[1] - ours[0], theirs[1] - theirs[0]):
         raise wrong(

@@ -4,7 +4,6 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -104,11 +103,7 @@ MOST_COLUMNS = 10_000
 
 
 def require_few_columns(path: str, count: int, *place: str) -> None:
-    """Refuse more columns than any log has.
-
-    Raises:
-        InputError: naming the number.
-    """
+    """Refuse more columns than any log has."""
     if count > MOST_COLUMNS:
         raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
 
@@ -132,11 +127,7 @@ class Budget:
         """bytes"""
 
     def take(self, count: int) -> None:
-        """Count bytes that are to be filled.
-
-        Raises:
-            InputError: they and those before are more than the file may take.
-        """
+        """Count bytes that are to be filled."""
         self._taken += count
         self.require(self._taken)
 
@@ -162,11 +153,7 @@ _LONGEST_NAME = 1000
 
 
 def require_short_names(path: str, names: Sequence[str]) -> None:
-    """Refuse a column's name that is no name.
-
-    Raises:
-        InputError: naming the length.
-    """
+    """Refuse a column's name that is no name."""
     longest = max(map(len, names), default=0)
     if longest > _LONGEST_NAME:
         problem = f"expected names of columns of at most {_LONGEST_NAME} letters, got {longest}"
@@ -174,11 +161,7 @@ def require_short_names(path: str, names: Sequence[str]) -> None:
 
 
 def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
-    """Refuse a column that is missing or stands in the file twice.
-
-    Raises:
-        InputError: with the nearest name there is.
-    """
+    """Refuse a column that is missing or stands in the file twice."""
     for name in needed:
         count = have.count(name)
         # Which of the two is meant cannot be known, and pyarrow would return either.
@@ -190,36 +173,25 @@ def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> No
             raise wrong(path, f"no column {shown(name)}{nearest(name[:40], known)}")
 
 
-# A table with fewer rows, or with a column that its file lacks or has otherwise.
-
-_NONE: Mapping[str, np.ndarray | None] = MappingProxyType({})
-
-
 class TableView:
-    """A `Table` through which another is seen."""
+    """A `Table` with columns (N,) in place of another's, or beside them; None stands for the
+    numbers of its rows."""
 
     def __init__(
         self,
         table: Table,
-        rows: np.ndarray | None = None,
-        columns: Mapping[str, np.ndarray | None] = _NONE,
+        columns: Mapping[str, np.ndarray | None],
         note: Finding | None = None,
     ) -> None:
-        """
-        Args:
-            rows: those that are seen (n,), as numbers of the table's.
-            columns: that stand in place of the table's, or beside them (N,); None for the numbers
-                of the rows.
-        """
-        self.table, self._rows, self._columns = table, rows, columns
+        self.table, self._columns = table, columns
         self.path, self.format, self.size = table.path, table.format, table.size
-        self.names = tuple(dict.fromkeys((*table.names, *columns))) if columns else table.names
+        self.names = tuple(dict.fromkeys((*table.names, *columns)))
         self.units = table.units
         self.notes = (*table.notes, *([note] if note else []))
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of the file."""
+        """SHA-256 of the file."""
         return self.table.sha256
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -229,29 +201,23 @@ class TableView:
         count = columns[own[0]].size
         for name, values in self._columns.items():
             columns[name] = np.arange(count, dtype=np.float64) if values is None else values
-        return {n: columns[n] if self._rows is None else columns[n][self._rows] for n in names}
+        return {n: columns[n] for n in names}
 
     def survey(self) -> list[Survey]:
         """Every column of the file, in its order."""
         made = []
         for each in self.table.survey():
             values = self._columns.get(each.name)
-            values = each.values if values is None else values
-            filled = each.n_filled
-            if values is not None and self._rows is not None:
-                values, filled = values[self._rows], min(filled, self._rows.size)
-            made.append(dataclasses.replace(each, values=values, n_filled=filled))
+            made.append(each if values is None else dataclasses.replace(each, values=values))
         return made
 
     def place(self, row: int) -> str:
-        """Place of a row in the file."""
-        return self.table.place(row if self._rows is None else int(self._rows[row]))
+        """The place of a row in the file."""
+        return self.table.place(row)
 
     def cell_text(self, name: str, row: int) -> str:
-        """Text of a cell."""
-        if name not in self.table.names:
-            return str(row)
-        return self.table.cell_text(name, row if self._rows is None else int(self._rows[row]))
+        """The content of a cell, in words."""
+        return self.table.cell_text(name, row) if name in self.table.names else str(row)
 
     def time_unit(self, name: str) -> str | None:
         """The unit of a column of time stamps."""

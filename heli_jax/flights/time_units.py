@@ -10,18 +10,7 @@ from heli_jax.finding import Finding
 from heli_jax.flights.table import column, shown, wrong
 
 TIME_NAMES = {
-    *(
-        "t",
-        "time",
-        "timestamp",
-        "timestamps",
-        "seconds",
-        "sec",
-        "elapsed",
-        "clock",
-        "zeit",
-        "temps",
-    ),
+    *("t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock", "zeit", "temps")
 }
 """words in the names of clocks"""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
@@ -85,12 +74,6 @@ def require_likely(
 ) -> tuple[Finding, ...]:
     """Refuse stamps in seconds that are a flight's in another unit alone, where their name says
     that one or nobody stated seconds; a caution where somebody did.
-
-    Args:
-        stamps: (N,)
-
-    Raises:
-        InputError: with what to state.
     """
     named, likely = split_unit(name)[1], likely_unit(stamps)
     if unit != "s" or likely == "s":

@@ -52,18 +52,21 @@ def lines(
         dt: time between them [s].
         logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
     """
+    from scipy.ndimage import median_filter
+    from scipy.signal import detrend, welch
+
     n = min(x.size, max(64, round(SEGMENT / dt)))
     there = np.isfinite(x)
     if np.count_nonzero(there) < max(64, x.size // 2):
         return ()
     times = np.arange(x.size)
-    x = _detrended(np.interp(times, times[there], x[there])[None])[0]
-    hz, power = _welch(x, dt, n)
+    x = detrend(np.interp(times, times[there], x[there]))
+    hz, power = welch(x, 1.0 / dt, nperseg=n, detrend="linear")
     # Of the whole record: what is slower than a segment is part of the variance as well.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
         return ()
-    around = _running_median(power, _SURROUNDINGS)
+    around = median_filter(power, 2 * _SURROUNDINGS + 1, mode="nearest")
     peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
     peaks = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
     rate = 1.0 / dt if logged_hz is None else logged_hz
@@ -79,49 +82,13 @@ def lines(
 
 
 def line_words(line: Line, rotor_hz: float | None) -> str:
-    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`.
-
-    Args:
-        rotor_hz: turns per second of the rotor, where they are known.
-    """
+    """A line in words: `24.2 Hz has 12 % of its variance (1/rev of the rotor)`."""
     share = f"{line.hz:.3g} Hz has {100 * line.share:.2g} % of its variance"
     if line.aliased:
         return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
     if line.harmonic:
         return f"{share} ({line.harmonic}/rev of the rotor)"
     return f"{share} ({'no harmonic of the rotor' if rotor_hz else 'of unknown origin'})"
-
-
-# The next three by NumPy: scipy.signal takes a second to import, and `info` has 0.7 s.
-
-
-def _detrended(rows: np.ndarray) -> np.ndarray:
-    """Each row (k, n) without its straight line of least squares."""
-    t = np.arange(rows.shape[1]) - 0.5 * (rows.shape[1] - 1)
-    level = rows.mean(axis=1, keepdims=True)
-    return rows - level - np.outer(rows @ t / (t @ t), t)
-
-
-def _welch(x: np.ndarray, dt: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies [Hz] and power density of x (N,): the mean of detrended Hann segments of n
-    samples, each half over the one before (Welch, 1967)."""
-    # Strided and not copied: a long record has as many segments.
-    segments = np.lib.stride_tricks.sliding_window_view(x, n)[:: n - n // 2]
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
-    power = np.zeros(n // 2 + 1)
-    for segment in segments:
-        power += np.abs(np.fft.rfft(window * _detrended(segment[None])[0])) ** 2
-    power *= dt / (len(segments) * (window @ window))
-    # Of both signs of a frequency; zero and the Nyquist frequency have one.
-    power[1 : None if n % 2 else -1] *= 2.0
-    return np.fft.rfftfreq(n, dt), power
-
-
-def _running_median(x: np.ndarray, to_either_side: int) -> np.ndarray:
-    """Return the running median of the neighbours of each value; the ends are repeated."""
-    padded = np.pad(x, to_either_side, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * to_either_side + 1)
-    return np.median(windows, axis=1)
 
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
@@ -144,11 +111,7 @@ def folded(hz: float, rate: float) -> float:
 
 
 def settling(frequencies: Sequence[float], q: float) -> float:
-    """Return the settling time of notches to 5 % [s].
-
-    Args:
-        frequencies: centres of the notches [Hz].
-    """
+    """Return the settling time of notches to 5 % [s]."""
     # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
     return 3.0 * q / (np.pi * min(frequencies))
 
@@ -163,11 +126,6 @@ def slow_step(x: np.ndarray) -> int:
 def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """As `notched`, of a sensor that is slower than the grid: by its own samples, and without the
     frequencies that it has no more; they are folded, and stay where they are.
-
-    Args:
-        x: samples (N,), NaN between those that were taken.
-        dt: of the grid [s].
-        frequencies: centres of the notches [Hz].
     """
     step = slow_step(x)
     own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
@@ -213,14 +171,7 @@ def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) ->
 
 _TURNS = {"rpm": 1.0 / 60.0, "Hz": 1.0, "rad/s": 0.5 / np.pi}
 """turns per second of the units that presets have: pint takes a quarter of a second to load"""
-_SIGNALS = (
-    "roll_rate",
-    "pitch_rate",
-    "yaw_rate",
-    "forward_force",
-    "right_force",
-    "down_force",
-)
+_SIGNALS = (*("roll_rate", "pitch_rate", "yaw_rate", "forward_force", "right_force", "down_force"),)
 """of a preset, in which a rotor shows"""
 _RUNS = 0.5
 """part of the highest speed from which on the rotor is not just being started"""

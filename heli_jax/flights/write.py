@@ -11,9 +11,6 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     """Write columns of equal length as CSV, or as Parquet where the name ends so.
 
     A column is an array (N,) or a list of text; None in a list is an empty cell.
-
-    Raises:
-        OSError: the place cannot be written to.
     """
     import pyarrow as pa  # here, so that a fit without files does not wait for it
 

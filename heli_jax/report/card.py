@@ -53,7 +53,7 @@ class Gate(NamedTuple):
     """None where the line informs and nothing is asked"""
     remark: str = ""
     words: str = ""
-    """what is shown in place of a number"""
+    """text in place of a number"""
 
 
 def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:

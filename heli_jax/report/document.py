@@ -79,7 +79,7 @@ class VerdictContent(TypedDict):
     null_directions: list[dict[str, float]]
     """by parameter, in relative coordinates, along which nothing changes"""
     determined_combinations: Annotated[list[Combination], "combinations"]
-    """what is determined where not every parameter is"""
+    """combinations that the data determine, if not every parameter"""
     strong_pairs: Annotated[list[Pair], "pairs"]
     """parameters that the data hardly tell apart"""
     without_effect: list[str]
@@ -125,7 +125,7 @@ class Fixed(TypedDict):
     value: float | list[float] | None
     """the estimate; null where it is not determined; of what flights state a number of each"""
     fixed: Annotated[bool, lambda _: False]
-    """whether flights state it, and it was not free; then there is nothing else"""
+    """true if flights state it and it was not free; then there is nothing else"""
 
 
 class Residuals(TypedDict):
@@ -135,7 +135,7 @@ class Residuals(TypedDict):
     overconfident: bool
     """whether intervals count samples as news that repeat each other"""
     note: Annotated[str, lambda fit: _whiteness_note(fit)]
-    """what follows where they are not white"""
+    """consequence if they are not white"""
     by_output: Annotated[dict[str, Whiteness], "whiteness"]
     """by `flight/output`; under filter error of the innovations"""
 
@@ -211,7 +211,7 @@ class IntervalsContent(TypedDict, total=False):
     bootstrap_failures: Annotated[int, lambda i: i.bootstrap.failures if i.bootstrap else ABSENT]
     """refits of the bootstrap that did not converge"""
     nuts: Annotated[Nuts, lambda i: i.posterior or ABSENT]
-    """of NUTS"""
+    """samples of NUTS"""
 
 
 class Compatibility(TypedDict):
@@ -249,9 +249,9 @@ class BaselineContent(TypedDict):
     """real and imaginary part of each"""
     continuous: Annotated[Continuous, lambda b: b]
     combinations: dict[str, float]
-    """of the paper's equation 23"""
+    """ratios of the paper's equation 23"""
     metrics: Annotated[dict[str, Metrics], lambda b: {b.output: b.metrics}]
-    """of its simulation"""
+    """agreement of its simulation"""
     trusted: bool
     sentences: list[str]
 
@@ -323,7 +323,7 @@ class SignalSource(TypedDict, total=False):
     offset: float
     invert: bool
     origin: str
-    """what was made of it on the way, in words"""
+    """processing between log and signal, in words"""
 
 
 class SignalSources(TypedDict):
@@ -338,10 +338,10 @@ class FlightSource(TypedDict, total=False):
 
     path: str | None
     sha256: str | None
-    """of the whole file"""
+    """fingerprint of the whole file"""
     flight: str
     hold_out: bool
-    """whether it served for validation alone"""
+    """true if it served for validation alone"""
     n_samples: int
     dt: float
     """[s]"""
@@ -350,7 +350,7 @@ class FlightSource(TypedDict, total=False):
     log_first_time: float
     """[s] in the log's own count"""
     notes: list[Finding]
-    """what the reader of the log assumed or did"""
+    """assumptions and corrections of the reader"""
     signals: SignalSources
 
 
@@ -384,7 +384,7 @@ class FitFile(TypedDict):
     format: Annotated[int, lambda _: VERSION]
     """version of this format; missing in files of earlier versions of the program"""
     status: Annotated[Status, "fit.status"]
-    """whether the optimiser converged, and whether the data determine what was asked"""
+    """convergence and identifiability"""
     exit_code: Annotated[Literal[0, 3, 4], "fit.exit_code"]
     """0: the intervals may be used; 3: not identifiable, or not trusted; 4: not converged, or not
     adequate"""
@@ -446,7 +446,7 @@ class FitFile(TypedDict):
     distrust: Annotated[str, "fit.distrust"]
     """the same in a sentence; empty where all is trusted"""
     responses: Annotated[ResponseAgreement | None, "fit.responses"]
-    """of a fit of frequency responses"""
+    """result of a fit of frequency responses"""
     held_out_frequency: Annotated[HeldOutFrequency | None, "fit.held_out_frequency"]
     """of a fit in frequency what flights held out say there"""
     baseline_rls: Annotated[BaselineContent | None, "baseline"]
@@ -454,15 +454,15 @@ class FitFile(TypedDict):
     equation_error_start: Annotated[EquationErrorContent | None, _start(EquationErrorStart)]
     frequency_error_start: Annotated[FrequencyErrorContent | None, _start(FrequencyErrorStart)]
     starts: Annotated[list[StartRow], lambda a: _starts(a.fit)]
-    """where each start led"""
+    """end of each start"""
     steps: Annotated[int, "fit.steps"]
-    """of the optimiser, to the best optimum"""
+    """steps of the optimiser to the best optimum"""
     findings: Annotated[list[Finding], "fit.findings"]
     """about the record, the model and the fit, the most severe first"""
     timing_s: Annotated[dict[str, float], "fit.timing"]
-    """by what was done, and in all"""
+    """time of each stage, and in all"""
     versions: Annotated[dict[str, str], lambda _: versions()]
-    """of Python and the libraries"""
+    """versions of Python and the libraries"""
     data: Annotated[list[FlightSource], lambda a: map(_flight, a.problem.flights)]
     inputs: Annotated[list[dict[str, HoldContent]], lambda a: map(_holds, a.problem.flights)]
     """by flight and input"""

@@ -81,7 +81,8 @@ def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
     plate = Swashplate(
         ("n", "e", "d"), (-60, 60, 180), *((1.0,) * 3, (0.0,) * 3, (1.0,) * 3), (False,) * 3
     )
-    lift = with_derived(open_log(path), plate).numbers(["ccpm.collective"])["ccpm.collective"]
+    mixed = convert_log(path, Selection(["ccpm.collective"], swashplate=plate))
+    lift = mixed.columns["ccpm.collective"]
     assert np.flatnonzero(np.isnan(lift)).tolist() == [20]
 
 

@@ -3,10 +3,11 @@ blamed."""
 
 import numpy as np
 import pytest
+import scipy.signal
 
-from heli_jax import Free, Nuisance, Prior, Problem, fit
+from heli_jax import Flight, Free, Nuisance, Prior, Problem, fit
 from heli_jax.identification.validation.logging_rate import fast_modes
-from tests.identification.test_enough import DT, SWING, TRUTH, flight
+from tests.identification.test_enough import DT, SWING, TRUTH, flight, steps
 
 # The mode of the truth, seen one turn of the sampling further on.
 FAST = 2.0 * np.pi / DT - np.sqrt(35.0)
@@ -56,3 +57,19 @@ def test_a_swing_far_past_the_samples_is_not_excused_for_being_over_within_one()
     every = {n: Free(v) for n, v in ALIAS.items()}
     [mode] = fast_modes(problem(flight(), **every), far, SD)
     assert mode.undetermined == ("k",)
+
+
+def test_a_mode_near_nyquist_whose_alias_fits_as_well_is_not_determined():
+    # The truth swings at 1.15 times the Nyquist frequency; the samples show it at 0.85.
+    k, seen = ((part * np.pi / DT) ** 2 + 1.0 for part in (1.15, 0.85))
+    rng = np.random.default_rng(1)
+    u = steps(rng, 1000)
+    b, a, _ = scipy.signal.cont2discrete(([20.0 * k / 36.0], [1.0, 2.0, k]), DT)
+    phi = scipy.signal.lfilter(np.ravel(b), a, u) + 0.005 * rng.standard_normal(u.size)
+    inputs = {"u": u, "v": np.zeros(u.size)}
+    record = Flight(DT, inputs, {"phi": phi}, sd={"phi": 0.005})
+    free = {"k": Free(seen), "d": Free(2.0), "b": Free(20.0 * seen / 36.0)}
+    found = fit(problem(record, **free))
+    assert found.estimates["k"].value == pytest.approx(seen, rel=0.01)
+    assert found.not_identifiable == ("k",)
+    assert found.exit_code == 3

@@ -3,6 +3,7 @@
 Records are made by SciPy at 1 kHz and logged at 50 Hz.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.flights.holds import decide
+from heli_jax.identification.fit import context_of
+from heli_jax.identification.validation.shifts import shift_in_time
 from heli_jax.naming import Scalar
 from tests.identification.lag import LAG, Inputs, Params, response
 
@@ -86,21 +89,41 @@ ROLL = Model(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("late", [0, 3])
-def test_an_angle_that_is_logged_late_is_named_with_its_delay(late):
+def roll_and_angle(noise, *, late=0):
+    """Steps at 50 Hz by SciPy, from rest; the angle is logged late by so many samples."""
     rng = np.random.default_rng(8)
     stick = np.repeat(rng.uniform(-1.0, 1.0, 80), 20)
-    exact = {"A": [[-4.0, 0.0], [1.0, 0.0]], "B": [[30.0], [0.0]], "C": np.eye(2), "D": [[0.0]] * 2}
-    A, B, C, D, _ = scipy.signal.cont2discrete(tuple(map(np.array, exact.values())), LOGGED)
+    exact = [[-4.0, 0.0], [1.0, 0.0]], [[30.0], [0.0]], np.eye(2), [[0.0], [0.0]]
+    A, B, C, D, _ = scipy.signal.cont2discrete(tuple(map(np.array, exact)), LOGGED)
     _, y, _ = scipy.signal.dlsim((A, B, C, D, LOGGED), stick)
-    p, phi = (y + 0.05 * rng.standard_normal(y.shape)).T
+    p, phi = (y + noise * rng.standard_normal(y.shape)).T
     phi = np.concatenate([np.full(late, phi[0]), phi[: phi.size - late]])
-    flight = Flight(LOGGED, {"d": stick}, {"p": p, "phi": phi}, hold={"d": "zero-order"})
+    sd = {"p": noise, "phi": noise}
+    return Flight(LOGGED, {"d": stick}, {"p": p, "phi": phi}, hold={"d": "zero-order"}, sd=sd)
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_an_angle_that_is_logged_late_is_named_with_its_delay(late):
     free = {"Lp": Free(-2.0), "Ld": Free(15.0)}
+    flight = dataclasses.replace(roll_and_angle(0.05, late=late), sd={})
     found = fit(Problem(ROLL, Params(-2.0, 15.0), [flight], free))
     said = [(f.subjects, f.value) for f in found.findings if f.code == "timing.late-output"]
     assert said == ([(("phi",), pytest.approx(late * LOGGED))] if late else [])
     assert found.exit_code == (3 if late else 0)
+
+
+@pytest.mark.parametrize(("late", "lost"), [(0, 0), (0, 100), (5, 100)])
+def test_samples_that_move_out_of_the_record_are_no_gain(late, lost):
+    flight = roll_and_angle(1.0, late=late)
+    phi = flight.outputs["phi"].copy()
+    phi[phi.size - lost :] = np.nan
+    flight = dataclasses.replace(flight, outputs={**flight.outputs, "phi": phi})
+    free = {"Lp": Free(-4.0), "Ld": Free(30.0)}
+    c = context_of(Problem(ROLL, Params(-4.0, 30.0), [flight], free))
+    found = shift_in_time(c.problem, c.at, c.e, ["phi"])
+    assert (found and (found.names, found.seconds)) == (
+        (("phi",), pytest.approx(late * LOGGED, abs=LOGGED)) if late else None
+    )
 
 
 def in_a_loop(*, late=0, delayed=0, seed=1):

@@ -34,12 +34,7 @@ _AT_ONCE = 2 * 10**6
 
 
 def open_parquet(path: Path) -> "ColumnTable":
-    """Open a Parquet file and read its schema; only the columns asked for are read later.
-
-    Raises:
-        InputError: it is no Parquet file, it is broken, or larger than a log may be.
-        OSError: it cannot be read.
-    """
+    """Open a Parquet file and read its schema; only the columns asked for are read later."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -100,12 +95,7 @@ def _check_end(path: str, file: BinaryIO, size: int) -> None:
 
 
 def open_arrow(path: Path) -> "ColumnTable":
-    """Read a file or a stream of Arrow.
-
-    Raises:
-        InputError: it is none, it is broken, or larger than a log may be.
-        OSError: it cannot be read.
-    """
+    """Read a file or a stream of Arrow."""
     import pyarrow as pa
 
     where = str(path)
@@ -182,12 +172,7 @@ class ColumnTable:
             raise wrong(self.path, f"cannot be read ({e.strerror or type(e).__name__})") from e
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a value is null.
-
-        Raises:
-            InputError: a column is missing, there twice, or of a type that is no number; the
-                file is broken.
-        """
+        """The columns as float64 (N,), NaN where a value is null."""
         require_columns(self.path, self.names, names)
         for name in names:
             kind = self._schema.field(name).type

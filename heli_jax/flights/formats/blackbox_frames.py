@@ -87,13 +87,7 @@ def negative_14_bit(data: np.ndarray, at: np.ndarray) -> Decoded:
 
 
 def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
-    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag.
-
-    Args:
-        data: the bytes of the log (B,) uint8.
-        at: positions (M,) where the groups begin.
-        count: fields of each group, 1 to 8.
-    """
+    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag."""
     # The tag would take more room than it saves, so the firmware leaves it out.
     if count == 1:
         return signed_vb(data, at)
@@ -222,13 +216,7 @@ KNOWN = frozenset((*_ALONE, TAG8_8SVB))
 
 
 def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Decoded:
-    """All fields (M, F) of frames of one kind whose fields begin at `at` (M,).
-
-    Args:
-        data: the bytes of the log (B,) uint8.
-        at: positions (M,) of the frames' first fields.
-        encodings: of the F fields, each one of `KNOWN`.
-    """
+    """All fields (M, F) of frames of one kind whose fields begin at `at` (M,)."""
     values = np.empty((at.size, len(encodings)), np.int32)
     field = 0
     while field < len(encodings):
@@ -306,11 +294,7 @@ class Header:
 
 
 def read_header(path: str, data: bytes) -> Header:
-    """The header at the beginning of `data`, which is one flight of the file `path`.
-
-    Raises:
-        InputError: it is damaged, or of a version or with an encoding that cannot be read.
-    """
+    """The header at the beginning of `data`, which is one flight of the file `path`."""
     settings, at = {}, 0
     while data.startswith(b"H ", at):
         end = data.find(b"\n", at, at + _LONGEST_HEADER)
@@ -381,11 +365,7 @@ def _listed_numbers(path: str, settings: dict[str, str], name: str, count: int) 
 
 
 def narrowed(column: np.ndarray) -> np.ndarray:
-    """Whole numbers (N,) of 32 bits in the fewest bits that hold them.
-
-    Args:
-        column: int32 or uint32.
-    """
+    """Whole numbers (N,) of 32 bits in the fewest bits that hold them."""
     if not column.size:
         return column
     low, high = int(column.min()), int(column.max())
@@ -473,11 +453,7 @@ class Frames:
 
 
 def find_frames(data: bytes, start: int, layouts: dict[str, FrameLayout]) -> Frames:
-    """All frames of a flight.
-
-    Args:
-        start: where its frames begin.
-    """
+    """All frames of a flight."""
     return _Walk(data, start, layouts).run()
 
 

@@ -7,8 +7,10 @@ a row of another number of cells, a cell that is no number - cells are looked at
 
 import codecs
 import csv
+import functools
 import gzip
 import io
+import itertools
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 
 _LARGEST = 8 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
-_LARGEST_TEXT = 2 * 10**9
+_LARGEST_TEXT = 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
 _LOOKED_AT, _MOST_LINES = 1 << 20, 20_000
 """bytes and lines in which a table is sought"""
@@ -50,11 +52,8 @@ _FEWEST = 3
 """rows that make a table"""
 _FOREIGN = 0.1
 """part of the bytes that are none of ASCII, from which on they are no text of a log"""
-_FIRST = 100
-"""rows in which a column's first filled cell is looked for"""
 _SAMPLE = 1 << 20
 """bytes by which the decimal sign and the columns of numbers are told"""
-_CELLS_AT_ONCE = 1 << 16
 _DELIMITERS = ("\t", "|", ";", ",")
 """the surest first: a tab stands in no number and in hardly any name, a comma may be decimal"""
 _MARK = re.compile(r"\s*(?:#+|//+|%+(?=[\s%]|[^,;\t]*$))\s*")
@@ -65,6 +64,7 @@ MISSING = (
     *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NaT", "<NA>"),
 )
 """cells that say that there is no value, beside NaN, which is a number"""
+_NOTHING = frozenset(("", *MISSING))
 _SIGN = "[+\u2212-]?"
 _NUMBER = re.compile(
     rf"{_SIGN}(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD]{_SIGN}[0-9]+)?|{_SIGN}(?:nan|inf|infinity)",
@@ -108,22 +108,16 @@ class _Line(NamedTuple):
 
 
 def open_csv(path: Path) -> "CsvTable":
-    """Read a text file, find its delimiter and its header.
-
-    Raises:
-        InputError: it is no text, or holds no header or no rows.
-        OSError: it cannot be read.
-    """
+    """Read a text file, find its delimiter and its header."""
     where = str(path)
     packed = read_regular(path, "a log in CSV", _LARGEST)
     digest, size = Digest(packed), len(packed)
     data = as_text(where, unpacked(where, packed) if is_gzipped(path) else packed)
-    blanks = inner_ending(path) not in (".csv", ".tsv")
-    head = _find_head(where, data, blanks)
+    head = _find_head(where, data, blanks=inner_ending(path) not in (".csv", ".tsv"))
     line = f"line {head.number}"
-    rows = memoryview(data)[head.begin :]
-    if not data[head.begin : head.begin + _LOOKED_AT].strip() and not bytes(rows).strip():
+    if not data[head.begin : head.begin + _LOOKED_AT].strip() and not data[head.begin :].strip():
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
+    rows = memoryview(data)[head.begin :]
     if head.delimiter == " ":
         lines = (b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         head, rows = head._replace(delimiter="\t"), memoryview(b"\n".join(lines))
@@ -144,16 +138,12 @@ def is_gzipped(path: Path) -> bool:
 
 
 def inner_ending(path: Path) -> str:
-    """Return the ending of a file without its packing: `.csv` of `log.csv.gz` and of `log.csv`."""
+    """Return the ending of the unpacked file: `.csv` of `log.csv.gz`, of `log.csv` too."""
     return Path(path.stem if is_gzipped(path) else path.name).suffix.lower()
 
 
 def unpacked(path: str, data: bytes) -> bytes:
-    """The bytes that were packed by gzip (RFC 1952), of all members that follow each other.
-
-    Raises:
-        InputError: it is none of gzip, it is cut off or damaged, or it claims more than a log has.
-    """
+    """Unpack the bytes that were packed by gzip (RFC 1952)."""
     text, budget = bytearray(), Budget(path, len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
@@ -168,13 +158,10 @@ def unpacked(path: str, data: bytes) -> bytes:
 
 
 def as_text(path: str, data: bytes) -> bytes:
-    """A file's text in UTF-8 with `\\n` between its lines.
+    """Return a file's text in UTF-8 with `\\n` between its lines.
 
     Spreadsheets save "Unicode text" as UTF-16 with a mark, and older programs write one byte a
     letter, of which the degree sign in a header is the commonest.
-
-    Raises:
-        InputError: it is no text.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
@@ -185,19 +172,16 @@ def as_text(path: str, data: bytes) -> bytes:
     if (null := data.find(b"\0")) >= 0:  # valid in UTF-8, and in no log
         at = data.count(b"\n", 0, null) + 1
         raise wrong(path, "got binary data, expected text", f"line {at}")
-    if not data.isascii():
-        try:
+    try:
+        if not data.isascii():
             codecs.utf_8_decode(data, "strict", True)
-        except UnicodeDecodeError as e:
-            foreign = len(data) - len(data.decode("ascii", "ignore"))
-            try:
-                if foreign > _FOREIGN * len(data):
-                    raise e
-                data = data.decode("cp1252").encode()
-            except UnicodeDecodeError:
-                at = data.count(b"\n", 0, e.start) + 1
-                problem = f"got the byte 0x{data[e.start]:02x}, expected text in UTF-8"
-                raise wrong(path, problem, f"line {at}") from e
+    except UnicodeDecodeError as e:
+        foreign = len(data) - len(data.decode("ascii", "ignore"))
+        if foreign > _FOREIGN * len(data):
+            at = data.count(b"\n", 0, e.start) + 1
+            problem = f"got the byte 0x{data[e.start]:02x}, expected text in UTF-8"
+            raise wrong(path, problem, f"line {at}") from e
+        data = data.decode("cp1252", "replace").encode()
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
 
 
@@ -205,7 +189,7 @@ def as_text(path: str, data: bytes) -> bytes:
 
 
 def _find_head(path: str, data: bytes, blanks: bool) -> _Head:
-    """The header of the table in a text, below what stands above it: titles, settings, comments."""
+    """Find the header of the table, below what stands above it: titles, settings, comments."""
     lines = list(_lines(data))
     delimiters = (*_DELIMITERS, " ") if blanks else _DELIMITERS
     if lines and (separator := _SEPARATOR.fullmatch(lines[0].text)):
@@ -237,8 +221,8 @@ def _lines(data: bytes) -> Iterator[_Line]:
         text = data[at : min(after, at + _LOOKED_AT)].decode("utf-8", "ignore").rstrip("\n")
         at = after
         if text.strip():
-            bare = _MARK.sub("", text, count=1) if (mark := _MARK.match(text)) else text
-            yield _Line(number, bare, after, mark is not None)
+            mark = _MARK.match(text)
+            yield _Line(number, text[mark.end() :] if mark else text, after, mark is not None)
 
 
 def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
@@ -246,17 +230,18 @@ def _head(lines: Sequence[_Line], delimiter: str) -> _Head | None:
     if not any(delimiter in line.text for line in lines):
         return None
     cells = [_cells_of(line.text, delimiter) for line in lines]
-    at, count = 0, len(lines)
-    while at < count:
-        end = at
-        while end < min(count, at + _FEWEST) and _is_row(cells[end], lines[end], len(cells[at])):
-            end += 1
-        # A file may end before there are so many.
-        if (end - at == _FEWEST or (end == count and end > at)) and (
-            head := _above(lines, cells, at, delimiter)
-        ):
-            return head
-        at = end if end > at and end - at < _FEWEST else at + 1
+
+    @functools.cache
+    def width(i: int) -> int:
+        return 0 if lines[i].is_comment or not _is_row(cells[i]) else len(cells[i])
+
+    # A file may end before there are so many.
+    for at in range(1, len(lines)):
+        run = range(at, min(at + _FEWEST, len(lines)))
+        if width(at) > 1 and all(width(i) == width(at) for i in run):
+            head = _above(lines, cells, at, delimiter)
+            if head is not None:
+                return head
     return None
 
 
@@ -264,29 +249,25 @@ def _above(
     lines: Sequence[_Line], cells: Sequence[list[str]], row: int, delimiter: str
 ) -> _Head | None:
     """The header of rows that begin at a line; None where no names stand above them."""
-    width, at = len(cells[row]), row - 1
+    at = row - 1
     # A rule, or a word on what follows, between names and rows.
     at -= at > 0 and len(cells[at]) == 1
     near = [i for i in (at, at - 1) if i >= 0]
     fit = [i for i in near if _names_fit(cells[i], cells[row])]
-    if not fit:
-        return None
-    if len(near) == 1:
-        near = []  # no line beside the names; to know all units takes a quarter of a second
     # One of two lines of words has units, the other names; words that are units may be names too.
     stated = {i: made for i in near if len(cells[i]) > 1 and (made := row_of_units(cells[i]))}
-    found = next((i for i in fit if i not in stated), fit[0])
-    if at not in (found, *stated):
+    stated = stated if len(near) > 1 else {}
+    found = next((i for i in fit if i not in stated), fit[0] if fit else -1)
+    if found < 0 or at not in (found, *stated):
         return None
     beside = next((made for i, made in stated.items() if i != found), ())
-    names = [cell.strip() for cell in cells[found]]
     # A delimiter at the end of each row, or a column for comments that rows need not have.
-    names = (names + [""] * width)[:width]
-    units_of = (*beside, *[""] * width)[:width] if beside else ()
-    last = lines[row - 1]
-    return _Head(
-        tuple(names), lines[found].number, delimiter, last.after, last.number + 1, units_of
+    names, units_of = (
+        (*(cell.strip() for cell in one), *[""] * len(cells[row]))[: len(cells[row])]
+        for one in (cells[found], beside)
     )
+    last, number = lines[row - 1], lines[found].number
+    return _Head(names, number, delimiter, last.after, last.number + 1, units_of if beside else ())
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:
@@ -306,13 +287,11 @@ def _is_value(cell: str) -> bool:
     return number is not None or cell in MISSING or is_date(cell)
 
 
-def _is_row(cells: Sequence[str], line: _Line, width: int) -> bool:
+def _is_row(cells: Sequence[str]) -> bool:
     """True for the cells of a sample: the first is a number or a time, or most are."""
     filled = [cell.strip() for cell in cells if cell.strip()]
-    if line.is_comment or len(cells) != width or width < 2 or not filled:
-        return False
     values = sum(map(_is_value, filled))
-    return 2 * values > len(filled) or (_is_value(filled[0]) and 3 * values >= len(filled))
+    return 2 * values > len(filled) or (3 * values >= len(filled) > 0 and _is_value(filled[0]))
 
 
 def _names_fit(names: Sequence[str], row: Sequence[str]) -> bool:
@@ -337,21 +316,19 @@ def row_of_units(cells: Sequence[str]) -> tuple[str, ...]:
     words = [word for word in bare if word not in ("", "-", "1", "--", *MISSING)]
     if not words or any(map(_NUMBER.fullmatch, words)):
         return ()
-    spelled = {word: _unit(word) for word in words}
+    # As it is known, in small letters where it is by these alone, as of DEG/SEC. Of one letter
+    # there are too many: P is pressure, rate and pitch.
+    known = {}
+    for word in words:
+        small = word.casefold()
+        if time_unit(word) or units.is_unit(word) or small in _OF_NO_MODEL:
+            known[word] = word
+        elif len(word) > 1 and units.is_unit(small):
+            known[word] = small
     # One of them may be written as only its author does.
-    if 2 * sum(spelled[word] is not None for word in words) <= len(words):
+    if 2 * sum(word in known for word in words) <= len(words):
         return ()
-    return tuple(spelled.get(word) or word for word in bare)
-
-
-def _unit(word: str) -> str | None:
-    """A unit as it is known, in small letters where it is by these alone, as of DEG/SEC; None where
-    a word is none."""
-    if time_unit(word) or units.is_unit(word) or word.casefold() in _OF_NO_MODEL:
-        return word
-    # Of one letter there are too many: P is pressure, rate and pitch.
-    small = word.casefold()
-    return small if len(word) > 1 and units.is_unit(small) else None
+    return tuple(known.get(word, word) for word in bare)
 
 
 def _require_names(path: str, head: _Head) -> None:
@@ -414,26 +391,12 @@ class CsvTable:
         return self._digest.hex()
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """The columns as float64 (N,), NaN where a cell is empty.
-
-        Raises:
-            InputError: a column is missing or there twice, a row has more or fewer cells than
-                the header, a cell is no number.
-        """
+        """The columns as float64 (N,), NaN where a cell is empty."""
         require_columns(self.path, self.names, names)
         with progress.reading(self.path, self.size):
-            numbers = self._numbers(names)
+            columns = self._columns([self.names.index(name) for name in names])
         self._digest.begin()
-        return numbers
-
-    def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        indices = [self.names.index(name) for name in names]
-        plain = self._plain(indices)
-        if plain is not None:
-            return {n: plain[i][0] for n, i in zip(names, indices, strict=True)}
-        result = {}
-        for name, text in zip(names, self._texts(indices), strict=True):
-            values = self._values(name, text)
+        for name, (values, _, _) in zip(names, columns, strict=True):
             if isinstance(values, int):
                 cell = self.cell_text(name, values)
                 sign = " with a decimal comma" if self._sign == "," else ""
@@ -441,37 +404,25 @@ class CsvTable:
                 if ":" in cell:
                     problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
                 raise wrong(self.path, problem, self.place(values), column(name))
-            result[name] = values
-        return result
+        return {n: values for n, (values, _, _) in zip(names, columns, strict=True)}
 
     def survey(self) -> list[Survey]:
         """Every column, in the file's order."""
         with progress.reading(self.path, self.size):
-            plain = self._plain(self._likely_numbers()) or {}
-            rest = [i for i in range(len(self.names)) if i not in plain]
-            by_column = {i: Survey(self.names[i], x, filled) for i, (x, filled) in plain.items()}
-            for i, text in zip(rest, self._texts(rest) if rest else (), strict=True):
-                by_column[i] = self._surveyed(self.names[i], text)
-        # What stands behind a delimiter at the end of every row is no column.
-        surveys = [by_column[i] for i in range(len(self.names))]
-        return [s for s in surveys if s.name or s.n_filled]
-
-    def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
-        values, cells = self._values(name, text), _filled(text)
-        filled = len(cells) - cells.null_count
-        if not isinstance(values, int):
-            return Survey(name, values, filled)
-        odd = sum(
-            not _NUMBER.fullmatch(cell)
-            for piece in _pieces(cells)
-            for cell in piece.to_pylist()
-            if cell is not None
-        )
-        if 2 * odd >= filled:
-            return Survey(name, None, filled)
-        words = "is no number" if odd == 1 else "are no numbers, the first"
-        place = f"{self.cell_text(name, values)} in {self.place(values)}"
-        return Survey(name, None, filled, f"{odd} of {filled} {words}: {place}")
+            columns = self._columns(range(len(self.names)))
+        surveys = []
+        for name, (values, filled, odd) in zip(self.names, columns, strict=True):
+            strays = ""
+            if isinstance(values, int):
+                if 2 * odd < filled:
+                    words = "is no number" if odd == 1 else "are no numbers, the first"
+                    place = f"{self.cell_text(name, values)} in {self.place(values)}"
+                    strays = f"{odd} of {filled} {words}: {place}"
+                values = None
+            # What stands behind a delimiter at the end of every row is no column.
+            if name or filled:
+                surveys.append(Survey(name, values, filled, strays))
+        return surveys
 
     def place(self, row: int) -> str:
         """`line 12`, counted from the top of the file, comments and blank lines included."""
@@ -486,25 +437,45 @@ class CsvTable:
         """Seconds of a column of dates; else what a row of units says, where it is one of time."""
         return "s" if name in self._dates else time_unit(self.units.get(name, ""))
 
-    def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
-        """A column's numbers (N,), or the first row that holds none."""
+    def _columns(self, indices: Sequence[int]) -> list["_Column"]:
+        """Columns by index: those that look like numbers by pyarrow, the others cell by cell."""
         import pyarrow as pa
 
-        cells = _filled(text)
-        first = next((c for c in cells[:_FIRST].to_pylist() if c is not None), "")
-        if is_date(first):
+        # All at once where that will do, as nearly always where columns are asked for by name.
+        likely = list(dict.fromkeys(indices))
+        table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
+        if table is None:
+            likely = self._likely_numbers(likely)
+            table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
+        plain = {} if table is None else {i: table.column(str(i)) for i in likely}
+        made = {i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()}
+        rest = [i for i in dict.fromkeys(indices) if i not in made]
+        for i, cells in zip(rest, self._texts(rest) if rest else (), strict=True):
+            made[i] = self._parsed(self.names[i], cells)
+        return [made[i] for i in indices]
+
+    def _parsed(self, name: str, cells: list[str | None]) -> "_Column":
+        """A column of texts; None stands for a cell that says that there is no value."""
+        filled = [cell for cell in cells if cell is not None]
+        if filled and is_date(filled[0]):
             self._dates.add(name)
-            return seconds_of_dates(cells.to_pylist())
-        if self._sign == ",":
-            # A point would be one between thousands, or a slip.
-            row = _compute().index(_compute().match_substring(cells, "."), True).as_py()
-            if row >= 0:
-                return row
-            cells = _compute().replace_substring(cells, ",", ".")
-        try:
-            return floats(cells.cast(pa.float64()))
-        except pa.ArrowInvalid:  # it does not say which row
-            return _floats_one_by_one(cells)
+            seconds = seconds_of_dates(cells)
+            odd = sum(not _NUMBER.fullmatch(cell) for cell in filled)
+            return seconds, len(filled), odd if isinstance(seconds, int) else 0
+        values, wrong_row, odd = np.full(len(cells), np.nan), None, 0
+        for row, cell in enumerate(cells):
+            if cell is None:
+                continue
+            # A point beside decimal commas would be one between thousands, or a slip.
+            plain = cell.replace(",", ".") if self._sign == "," and "." not in cell else cell
+            if (self._sign == "," and "." in cell) or not _NUMBER.fullmatch(plain):
+                odd += 1
+                wrong_row = row if wrong_row is None else wrong_row
+            else:
+                # Fortran writes 1.0D+00, some a true minus.
+                plain = plain.replace("\u2212", "-").replace("D", "e").replace("d", "e")
+                values[row] = float(plain)
+        return values if wrong_row is None else wrong_row, len(filled), odd
 
     def _decimal_sign(self) -> str:
         """The decimal sign of the file, by its first rows.
@@ -519,30 +490,19 @@ class CsvTable:
         cells = (cell.strip() for line in lines for cell in _cells_of(line, delimiter))
         return "," if any(map(_WITH_COMMA.fullmatch, cells)) else "."
 
-    def _plain(self, indices: Sequence[int]) -> dict[int, tuple[np.ndarray, int]] | None:
-        """Columns of numbers by index, and how many of their cells are filled; None where anything
-        is not plain."""
-        import pyarrow as pa
-
-        table = self._arrow(self._rows, dict.fromkeys(indices, pa.float64()), self._sign)
-        if table is None:
-            return None
-        columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
-        return {i: (floats(c), len(c) - c.null_count) for i, c in columns.items()}
-
-    def _likely_numbers(self) -> list[int]:
+    def _likely_numbers(self, indices: Sequence[int]) -> list[int]:
         """The columns that hold numbers as far as the first rows tell."""
         import pyarrow as pa
 
         first = self._rows[:_SAMPLE]
         if len(self._rows) > len(first):
             first = first[: bytes(first).rfind(b"\n") + 1]
-        table = self._arrow(first, dict.fromkeys(range(len(self.names))), self._sign)
-        kinds = [] if table is None else table.schema.types
+        table = self._arrow(first, dict.fromkeys(indices))
+        types = () if table is None else table.schema.types
         is_number = (pa.types.is_integer, pa.types.is_floating)
-        return [i for i, kind in enumerate(kinds) if any(test(kind) for test in is_number)]
+        return [i for i, t in zip(indices, types, strict=False) if any(f(t) for f in is_number)]
 
-    def _arrow(self, rows: memoryview, kinds: Mapping[int, Any], sign: str) -> "pa.Table | None":
+    def _arrow(self, rows: memoryview, kinds: Mapping[int, Any]) -> "pa.Table | None":
         """Columns by index, in their types (None lets pyarrow guess); None where it cannot read
         them."""
         import pyarrow as pa
@@ -552,7 +512,6 @@ class CsvTable:
         # an option; either way the lines that it counts are not those of the file.
         if self._has_quotes or not kinds:
             return None
-        stated = {str(i): kind for i, kind in kinds.items() if kind is not None}
         ragged: list[Any] = []
 
         # Called for each row with other than the header's number of cells: so for blank lines too,
@@ -575,21 +534,19 @@ class CsvTable:
                     invalid_row_handler=skip,
                 ),
                 convert_options=arrow_csv.ConvertOptions(
-                    column_types=stated,
+                    column_types={str(i): k for i, k in kinds.items() if k is not None},
                     include_columns=[str(i) for i in kinds],
                     # Not its own list, which has words such as #N/A N/A.
                     null_values=["", *MISSING],
-                    decimal_point=sign,
+                    decimal_point=self._sign,
                 ),
             )
         except pa.ArrowException:  # such as a line longer than a block, or a cell that is no number
             return None
         return None if ragged or not table.num_rows else table
 
-    def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
-        """The cells of some columns as pyarrow string arrays (N,)."""
-        import pyarrow as pa
-
+    def _texts(self, indices: Sequence[int]) -> list[list[str | None]]:
+        """The cells of some columns, without the blanks around them, None where nothing is left."""
         if len(self._rows) > _LARGEST_TEXT:
             problem = (
                 "has quotes, a row of other than the header's number of cells, or a cell that is "
@@ -597,31 +554,16 @@ class CsvTable:
                 f"{size_words(_LARGEST_TEXT)}, got {size_words(len(self._rows))}"
             )
             raise wrong(self.path, problem)
-        table = self._arrow(self._rows, dict.fromkeys(indices, pa.string()), ".")
-        if table is not None:
-            return [table.column(str(i)) for i in indices]
-        # Row by row; packed as they come: as objects of Python cells take many times the file's
-        # size. large_string: an array of string() holds 2 GB of text at most.
-        pieces: list[list[Any]] = [[] for _ in indices]
-        rows: list[list[str]] = []
-
-        def pack() -> None:
-            for piece, i in zip(pieces, indices, strict=True):
-                piece.append(pa.array([cells[i] for cells in rows], pa.large_string()))
-            rows.clear()
-
-        count = 0
+        columns: list[list[str | None]] = [[] for _ in indices]
         for line, cells in self._records():
             if len(cells) != len(self.names):
                 raise wrong(self.path, self._ragged(len(cells)), f"line {line}")
-            rows.append(cells)
-            count += 1
-            if len(rows) * len(cells) >= _CELLS_AT_ONCE:
-                pack()
-        pack()
-        if not count:
+            for texts, i in zip(columns, indices, strict=True):
+                cell = cells[i].strip()
+                texts.append(None if cell in _NOTHING else cell)
+        if not columns[0]:
             raise wrong(self.path, "holds a header alone, expected rows of numbers")
-        return [pa.chunked_array(piece, pa.large_string()) for piece in pieces]
+        return columns
 
     def _ragged(self, count: int) -> str:
         problem = f"{count} cell{'' if count == 1 else 's'}, expected {len(self.names)}"
@@ -633,17 +575,10 @@ class CsvTable:
     def _record(self, row: int) -> tuple[int, list[str]]:
         # From the top each time: only a message asks for one, and an index of all rows would be as
         # large as the log.
-        for i, record in enumerate(self._records()):
-            if i == row:
-                return record
-        raise IndexError(row)
+        return next(itertools.islice(self._records(), row, None))
 
     def _records(self) -> Iterator[tuple[int, list[str]]]:
-        """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader.
-
-        Raises:
-            InputError: a quotation mark that closes nothing or is never closed.
-        """
+        """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader."""
         delimiter, first = self._head.delimiter, self._head.first_line
         # newline: what else Python takes for the end of a line, no spreadsheet and no pyarrow does.
         lines = io.TextIOWrapper(io.BytesIO(self._rows), "utf-8", newline="\n")
@@ -665,40 +600,10 @@ class CsvTable:
             raise wrong(self.path, problem, f"line {start}") from e
 
 
+type _Column = tuple[np.ndarray | int, int, int]
+"""numbers (N,), or the first row that holds none; cells that are filled, and those of no number"""
+
+
 def _is_blank(line: str, delimiter: str) -> bool:
     """True for a line without a cell; one of delimiters alone is a row of empty cells."""
     return not line.strip() and delimiter not in line
-
-
-def _compute() -> Any:
-    """pyarrow's functions on columns; they are made at run time, so no checker knows them."""
-    import pyarrow.compute
-
-    return pyarrow.compute
-
-
-def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
-    """Cells without the blanks around them, null where nothing or a mark for it is left."""
-    import pyarrow as pa
-
-    pc = _compute()
-    trimmed = pc.utf8_trim_whitespace(text)
-    is_empty = pc.is_in(trimmed, value_set=pa.array(["", *MISSING], trimmed.type))
-    return pc.if_else(is_empty, pa.nulls(1, trimmed.type)[0], trimmed)
-
-
-def _pieces(cells: "pa.ChunkedArray") -> Iterator["pa.ChunkedArray"]:
-    """As objects of Python all cells at once take many times the file's size."""
-    return (cells.slice(at, _CELLS_AT_ONCE) for at in range(0, len(cells), _CELLS_AT_ONCE))
-
-
-def _floats_one_by_one(cells: "pa.ChunkedArray") -> np.ndarray | int:
-    """Numbers (N,), or the first row that holds none. Fortran writes 1.0D+00, some a true minus."""
-    values = np.full(len(cells), np.nan)
-    for row, cell in enumerate(cell for piece in _pieces(cells) for cell in piece.to_pylist()):
-        if cell is None:
-            continue
-        if not _NUMBER.fullmatch(cell):
-            return row
-        values[row] = float(cell.replace("\u2212", "-").replace("D", "e").replace("d", "e"))
-    return values

@@ -29,19 +29,20 @@ _LONGEST_LIST = 16
 
 
 def open_json(path: Path) -> ArrayTable:
-    """A file of JSON, or of a record a line.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no columns of numbers.
-        OSError: it cannot be read.
-    """
+    """A file of JSON, or of a record a line."""
     where = str(path)
     data = read_regular(path, "a log in JSON", _LARGEST)
     sets = DataSets(Budget(where, len(data)))
     sets.budget.take(sum(size * data.count(mark) for mark, size in _OBJECTS.items()))
     content = _parsed(where, data)
+    if isinstance(content, list):
+        columns = _of_rows(where, content, sets.budget)
+    else:
+        columns = dict(_within(where, content, sets.budget)) if isinstance(content, dict) else {}
+    if not 0 < len(columns) <= _MOST_COLUMNS:
+        raise wrong(where, f"holds {len(columns)} columns, expected 1 to {_MOST_COLUMNS}")
     texts: list[str] = []
-    for name, values in _columns(where, content, sets.budget).items():
+    for name, values in columns.items():
         _add(sets, name, values, texts)
     if texts:
         words = f"left out, since they hold text: {listed(map(shown, texts))}"
@@ -73,17 +74,6 @@ def _parsed(where: str, data: bytes) -> Any:
             at = str(whole) if not records else str(e)
             raise wrong(where, f"{problem} ({at})", f"line {number}") from e
     return records
-
-
-def _columns(where: str, content: Any, budget: Budget) -> dict[str, Any]:
-    """Columns of a file, each a list or an array, by path."""
-    if isinstance(content, list):
-        columns = _of_rows(where, content, budget)
-    else:
-        columns = dict(_within(where, content, budget)) if isinstance(content, dict) else {}
-    if not 0 < len(columns) <= _MOST_COLUMNS:
-        raise wrong(where, f"holds {len(columns)} columns, expected 1 to {_MOST_COLUMNS}")
-    return columns
 
 
 def _within(where: str, content: Any, budget: Budget) -> Iterator[tuple[str, Any]]:

@@ -57,12 +57,7 @@ _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def open_mat(path: Path) -> ArrayTable:
-    """A MATLAB file, of version 7.3 too where h5py is installed.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no arrays of numbers.
-        OSError: it cannot be read.
-    """
+    """A MATLAB file, of version 7.3 too where h5py is installed."""
     data = read_regular(path, "a MATLAB file", LARGEST)
     # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
     is_hdf5 = data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3")
@@ -88,11 +83,7 @@ def open_hdf5(path: Path) -> ArrayTable:
 
 
 def _read_apart(path: Path, kind: str, data: bytes) -> ArrayTable:
-    """The file as `main` reads it in a process of its own.
-
-    Raises:
-        InputError: of that process, or it ended otherwise, or went on for too long.
-    """
+    """The file as `main` reads it in a process of its own."""
     what = _READERS[kind][0]
     if what == "HDF5 file" and importlib.util.find_spec("h5py") is None:
         problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
@@ -295,11 +286,7 @@ class _Hdf5:
                 sets.add(field, values, own)
 
     def content(self, item: Any) -> np.ndarray:
-        """All of a data set. Nothing else here reads one.
-
-        Raises:
-            InputError: it is kept in another file, any of which a log could name.
-        """
+        """All of a data set. Nothing else here reads one."""
         if item.is_virtual or item.external:
             problem = "is kept in another file, expected its numbers in this one"
             raise wrong(str(self.path), problem, f"data set {shown(str(item.name))}")

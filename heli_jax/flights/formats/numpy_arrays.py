@@ -27,10 +27,6 @@ def open_numpy(path: Path) -> ArrayTable:
     """A file of NumPy: one array (.npy), or several by name (.npz).
 
     Without pickle, which would run what a file says: arrays of Python's objects are passed over.
-
-    Raises:
-        InputError: it is none, it is damaged, or it holds no arrays of numbers.
-        OSError: it cannot be read.
     """
     where = str(path)
     data = read_regular(path, "a file of NumPy", LARGEST)

@@ -87,10 +87,6 @@ def open_ulog(path: Path) -> ChannelLog:
     A topic's times are `timestamp_sample`, of the sample itself, where there is one; otherwise
     `timestamp`, when it was published. So are those of commands, which act from then on: their
     `timestamp_sample` is that of the gyro's sample that they were computed from.
-
-    Raises:
-        InputError: it is no ULog file, or one that nothing can be read of.
-        OSError: it cannot be read.
     """
     data = read_regular(path, "a ULog file", _LARGEST)
     if len(data) < 16 or not data.startswith(MAGIC):

@@ -1,6 +1,6 @@
 """The manoeuvre to add to a record, by Fisher's information at the start values.
 
-Candidates of the same duration and amplitude as the record are flown, one input at a time: doublets,
+Candidates of the duration and amplitude of the record are flown, one input at a time: doublets,
 3-2-1-1 steps and a chirp, and the record once more for comparison (input design over a few
 manoeuvres that a pilot can fly: Mehra, 1974; Jategaonkar, 2006, chapter 2).
 """

@@ -1,4 +1,4 @@
-"""Do samples show the dynamics, and do signals stand in the log when they acted?"""
+"""Findings on rates of samples, and on signals at another time than their log has them."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +17,7 @@ from heli_jax.identification.validation.logging_rate import (
 from heli_jax.identification.validation.shifts import (
     LEAD,
     SHIFT,
+    Shift,
     leads,
     other_hold,
     shift_in_time,
@@ -46,7 +47,7 @@ def inputs_late(c: Context) -> Iterator[Finding]:
             return
     follow = {(one.flight, one.input) for one in c.feedback if one.present}
     for lead in leads(c.flights):
-        # Of an input that follows the response it is said that it may be late.
+        # The finding on feedback says that such an input may be late.
         if (lead.flight, lead.input) not in follow:
             yield found(
                 "timing.output-leads",
@@ -60,32 +61,36 @@ def inputs_late(c: Context) -> Iterator[Finding]:
 
 
 def signals_shifted(c: Context) -> Iterator[Finding]:
-    """Signals that the fitted model places at another time, or inputs of the other hold."""
+    """Signals at another time, or inputs of the other hold: what explains the record best."""
     if not c.arrived:
         return
-    one = None
+    shifts = [other_hold(c.problem, c.at, c.e)]
     if c.explains and not c.instruments and "time_shift" not in c.estimates:
-        one = shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c))
+        shifts.append(shift_in_time(c.problem, c.at, c.e, _outputs_in_doubt(c)))
+    one = max((s for s in shifts if s is not None), key=_gain, default=None)
     # A lag that is missing shows in the residual too, and more closely.
-    if one is not None and one.kind == "response" and _follows_input(c):
-        one = None
-    for shift in (one, other_hold(c.problem, c.at, c.e)):
-        if shift is not None:
-            parts = {n: v / c.named[n] for n, v in shift.moved.items() if c.named[n]}
-            most = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
-            shown = [n for n in most if n == most[0] or abs(parts[n]) >= _SEEN]
-            yield found(
-                _CODES[shift.kind],
-                "doubt",
-                *shift.names,
-                value=shift.seconds,
-                shifts=shift.moved,
-                names=shift.names,
-                ms=1e3 * shift.seconds,
-                gain=shift.gain,
-                moves=[f"{n} by {100 * parts[n]:+.2g} %" for n in shown],
-                limit=SHIFT.clear,
-            )
+    lags = any(x.drive.kind == "input" for x in c.unmodelled[0])
+    if one is None or (one.kind == "response" and lags):
+        return
+    parts = {n: v / c.named[n] for n, v in one.moved.items() if c.named[n]}
+    most = sorted(parts, key=lambda n: -abs(parts[n]))[:_NAMED]
+    shown = [n for n in most if n == most[0] or abs(parts[n]) >= _SEEN]
+    yield found(
+        _CODES[one.kind],
+        "doubt",
+        *one.names,
+        value=one.seconds,
+        shifts=one.moved,
+        names=one.names,
+        ms=1e3 * one.seconds,
+        gain=one.gain,
+        moves=[f"{n} by {100 * parts[n]:+.2g} %" for n in shown],
+        limit=SHIFT.clear,
+    )
+
+
+def _gain(shift: Shift) -> float:
+    return shift.gain
 
 
 def _outputs_in_doubt(c: Context) -> list[str]:
@@ -94,10 +99,6 @@ def _outputs_in_doubt(c: Context) -> list[str]:
     if len(c.metrics) < 2 or c.e.innovations or c.adequacy.denied:
         return []
     return sorted({key.rsplit("/", 1)[1] for key, w in c.whiteness.items() if not w.white})
-
-
-def _follows_input(c: Context) -> bool:
-    return any(one.drive.kind == "input" for one in c.unmodelled[0])
 
 
 def loop_between_samples(c: Context) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.frequency_lines import (
-    Machine,
+    Matrices,
     alike,
     first_machine,
     lines_of,
@@ -96,8 +96,7 @@ def whitening_alone(
     """
 
     def own(S: np.ndarray) -> np.ndarray:
-        roots = _positive(np.real(np.einsum("kii->ki", S))) ** -0.5
-        return roots[:, :, None] * np.eye(S.shape[1], dtype=complex)
+        return inverse_roots(S * np.eye(S.shape[1]))
 
     # The records of a bootstrap may have other outputs.
     made = {}
@@ -112,12 +111,7 @@ def knots_of(
     K: int, part: float = PART, least: float = LEAST
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
-    and how far it is on the way to the next.
-
-    Args:
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
-    """
+    and how far it is on the way to the next."""
     knots = [0]
     while knots[-1] < K - 1:
         width = max(least, part * (knots[-1] + 1))
@@ -157,8 +151,6 @@ def averages(
 
     Args:
         counts: lines of a record and how many there are of them, for each length.
-        part: sd of the Gaussian as a part of the frequency.
-        least: the same in lines, at least.
     """
     at, _ = knots_of(K, part, least)
     kernels = [(n, *_kernel(K, other, part, least)) for other, n in counts]
@@ -173,26 +165,7 @@ def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p
     Raises:
         numpy.linalg.LinAlgError: one is not positive definite.
     """
-    # Written out over the lines: for each matrix a routine would be called that takes longer to
-    # call.
-    p, at = S.shape[1], np.ascontiguousarray(S.transpose(1, 2, 0))
-    L, W = np.zeros_like(at), np.zeros_like(at)
-    for i in range(p):
-        left = np.real(at[i, i])
-        for j in range(i):
-            inner = sum((L[i, m] * np.conj(L[j, m]) for m in range(j)), start=0.0)
-            L[i, j] = np.real(W[j, j]) * (at[i, j] - inner)
-            left = left - np.real(L[i, j]) ** 2 - np.imag(L[i, j]) ** 2
-        W[i, i] = root = _positive(left) ** -0.5
-        for j in range(i):
-            W[i, j] = -root * sum((L[i, m] * W[m, j] for m in range(j, i)), start=0.0)
-    return np.ascontiguousarray(W.transpose(2, 0, 1))
-
-
-def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    if not (values > 0).all():
-        raise np.linalg.LinAlgError("a spectrum is not positive definite")
-    return values
+    return np.linalg.inv(np.linalg.cholesky(S))
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
@@ -200,9 +173,9 @@ def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]
     return np.sum(np.log(np.abs(np.diagonal(np.asarray(W), axis1=1, axis2=2))), axis=1)
 
 
-# The noise's spectrum by what the machine makes of gusts, and a mean over lines of what is left.
+# The noise's spectrum by what the vehicle makes of gusts, and a mean over lines of what is left.
 #
-# Gusts come out of a machine with its integrations and modes in them: outputs that are coherent
+# Gusts come out of a vehicle with its integrations and modes in them: outputs that are coherent
 # with a gain that changes from line to line. A mean over lines makes something else of that,
 # estimates lose most of what the record tells, and intervals are too narrow. So the spectrum is
 # first described as
@@ -237,18 +210,18 @@ _UNSEEN = 1e-20
 
 
 @eqx.filter_jit
-def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
+def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
     """That of the first flight: records of one length share a spectrum."""
     members = alike(layout, data)[0]
     return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
 
 
 def whitening_by(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
+    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array."""
     counts = Counter(len(e) for e in errors)
-    before = _prewhitening(machine, errors, list(counts))
+    before = _prewhitening(vehicle, errors, list(counts))
     left = smoothed(
         [np.einsum("kij,kj->ki", before[len(e)], e) for e in errors], GUST_PART, least=GUST_LEAST
     )
@@ -263,10 +236,10 @@ def whitening_by(
 
 
 def _prewhitening(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
+    vehicle: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
-    """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
-    Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
+    """By length of the record S0^(-1/2); ones where the vehicle says nothing of the errors."""
+    Ad, C = np.asarray(vehicle.Ad, float), np.asarray(vehicle.C, float)
     cells = []
     for K in lengths:
         of_length = np.stack([e for e in errors if len(e) == K])
@@ -331,11 +304,7 @@ def _powers_of_gusts(
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
-    """Powers of gusts, by state and shape, and of the outputs' own white noise.
-
-    Args:
-        shapes: spectra that a gust's is a sum of; the first is white.
-    """
+    """Powers of gusts, by state and shape, and of the outputs' own white noise."""
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
     gains = np.swapaxes(gains, 1, 2)
     # To begin with as much as the output that shows least of a state leaves room for.

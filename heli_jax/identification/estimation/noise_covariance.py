@@ -11,7 +11,7 @@ from heli_jax.finding import Finding, found
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
-from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
+from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_scales import own_changed, slopes_changed
 from heli_jax.identification.methods import objective_of
 from heli_jax.identification.problem import Free, Problem
@@ -23,8 +23,8 @@ _ROUNDS = 30
 """of the optimiser at most: in slow gusts a spectrum settles by a fifth a round"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
-_SETTLED = 1e-4
-"""move of the optimum, in squared joint standard deviations, below which it has ended as well"""
+_SETTLED = 0.01
+"""way that the optimum has still to go, in joint standard deviations, below which it has ended"""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -84,7 +84,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """
     layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]
-    moved, notes = np.inf, ()
+    moved, left, notes = np.inf, np.inf, ()
     for _ in range(_ROUNDS):
         z, new = objective.relax(layout, search.data, noise, best.z)
         change = _changed(noise, new)
@@ -97,17 +97,16 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where one stays so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
+        if change < _UNCHANGED or left < _SETTLED or not (moves and bool(best.converged)):
             break
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None])
         trace.append((int(best.steps), float(best.cost)))
-        moved = float(best.moved)
+        before, moved = moved, float(best.moved) ** 0.5
+        # Moves that shrink by about the same factor are a geometric series.
+        rest = moved / (before - moved) if moved < before else 1.0
+        left = moved * min(rest, 1.0) if np.isfinite(before) else moved
     else:
-        notes = (
-            found(
-                "search.noise-not-settled", value=moved**0.5, rounds=_ROUNDS, limit=_SETTLED**0.5
-            ),
-        )
+        notes = (found("search.noise-not-settled", value=moved, rounds=_ROUNDS, limit=_SETTLED),)
     best = best._replace(z=objective.finish(layout, search.data, noise, best.z))
     return RelaxedOptimum(best, noise, tuple(trace), notes=notes)
 
@@ -133,11 +132,7 @@ def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarra
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:
-    """The optimum that a search from z leads to, its noise relaxed from `noise`.
-
-    Args:
-        z: where to begin.
-    """
+    """The optimum that a search from z leads to, its noise relaxed from `noise`."""
     [best] = search.run(noise, z[None, :])
     return relax_noise_covariance(search, noise, best)
 
@@ -182,13 +177,17 @@ def gain_left(
         parameters -= len(at_bound)
     squares = float(np.sum(np.square(r)))
     least = squares * max(_SHARE, _PER_UNKNOWN * J.shape[1] / r.size)
-    # Negated: also what is not finite is none of this function's business.
-    if not gauss_newton_gain(r, J) > least:
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return None
     norms = np.linalg.norm(J, axis=0)
     units = np.where(norms > 0, norms, 1.0)
-    left, singular, right = np.linalg.svd(J / units, full_matrices=False)
-    along = left.T @ r
+    Q, R = np.linalg.qr(J / units)
+    along = Q.T @ r
+    # The whole of a Gauss-Newton step takes away the part of r in the span of J's columns.
+    if not np.sum(along**2) > least:
+        return None
+    left, singular, right = np.linalg.svd(R)
+    along = left.T @ along
     with np.errstate(divide="ignore", over="ignore"):
         steps = np.abs(along / singular)[:, None] * np.abs(right / units)[:, :parameters]
         # What the linear model promises for a step to far beyond where it holds is worth nothing:
@@ -201,11 +200,7 @@ def gain_left(
 def unless_stuck(
     layout: Layout, optimum: RelaxedOptimum, e: Evaluation, free: Mapping[str, Free]
 ) -> RelaxedOptimum:
-    """The optimum, no longer taken for one where its own slopes say that it is none.
-
-    Args:
-        optimum: where the search ended.
-    """
+    """The optimum, no longer taken for one where its own slopes say that it is none."""
     # A filter's rows hold the level of its variances too, and have no squares to take a share of.
     if not (bool(optimum.best.converged) and layout.noise_model == "white"):
         return optimum

@@ -1,6 +1,6 @@
 """Adequacy: does the model explain what was measured, beside noise and disturbance?
 
-That an optimiser arrived and that the data determine the parameters says nothing of it: the best
+That an optimiser converged and that the data determine the parameters says nothing of it: the best
 parameters of a wrong model are found and determined as well as those of the right one.
 
 What is judged is the simulated response of every fitted output. The acceptance card asks for a

@@ -102,7 +102,7 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
         outputs = [flight.outputs[n] for n in layout.outputs[record.flight]]
         signals = [*naming.asdict(flight.inputs).values(), *outputs]
         joint.append(lines_of(np.stack([np.asarray(v)[part] for v in signals], axis=1)))
-    moving = sum(np.sum(np.abs(v[:, : len(inputs)]) ** 2, axis=0) for v in joint) > 0
+    moving = np.sum([np.sum(np.abs(v[:, : len(inputs)]) ** 2, axis=0) for v in joint], axis=0) > 0
     by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
     direct = np.array([n not in by for n, moves in zip(inputs, moving, strict=True) if moves])
     if not direct.any():

@@ -308,7 +308,7 @@ def _in_bands(
     """
     size = np.ones((len(X), 1)) if size is None else size
     first, lines = 0, float(max(_FIRST, 4 * (inputs or X.shape[1])))
-    found: list[tuple[np.ndarray, ...]] = []
+    found = list[tuple[_Bands, np.ndarray]]()
     while first + int(lines) <= len(X):
         n, band = int(lines), slice(first, first + int(lines))
         first, lines = band.stop, lines * _GROWTH
@@ -324,11 +324,12 @@ def _in_bands(
         parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ v) ** 2, axis=1)
         scale = np.broadcast_to(np.mean(size[band] ** 2, axis=0), m.shape)
         density = np.mean(np.abs(X[band]) ** 2, axis=0)
-        found.append((np.array([n]), m, whole, parts, scale, density))
+        found.append((_Bands(np.array([n]), m, whole, parts, scale, np.array(False)), density))
     if not found:
         p, c = signals.shape[1:]
-        empty = [np.zeros((0, *shape)) for shape in ((1,), (p,), (p, c), (p, c), (p,))]
-        return _Bands(*empty, np.zeros(0, bool))
-    *made, density = (np.stack(v) for v in zip(*found, strict=True))
+        b1, bp, bpc = np.zeros((0, 1)), np.zeros((0, p)), np.zeros((0, p, c))
+        return _Bands(b1, bp, bpc, bpc, bp, np.zeros(0, bool))
+    bands, densities = zip(*found, strict=True)
+    density = np.stack(densities)
     excited = np.any(density >= _LEAST_POWER * np.max(density, axis=0, initial=0.0), axis=1)
-    return _Bands(*made, excited)
+    return _Bands(*(np.stack(v) for v in zip(*bands, strict=True)))._replace(excited=excited)

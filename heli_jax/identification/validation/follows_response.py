@@ -1,9 +1,9 @@
 """Feedback: do inputs follow the response, through a pilot or a controller?
 
-Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
+Innovations are what a record's own past cannot predict of its outputs: the residuals of a
 multivariable ARX model of the record itself, so that a poor model of the vehicle is no alarm.
 Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
-13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
+13.4 and 16.5); without it, it does not. Each input is freed of what its own past predicts, and the
 rest is correlated with sums of past innovations. The variance of such a correlation between two
 autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
@@ -100,7 +100,7 @@ def _products_over_lags(x: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "N p"]
     return np.fft.irfft(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: len(x)]
 
 
-# What the past of a record does not foretell of it: the residuals of ARX models.
+# What the past of a record does not predict of it: the residuals of ARX models.
 #
 # The order is the one that BIC takes; where samples are missing, no row is used in which one
 # stands.
@@ -140,7 +140,7 @@ def arx_residuals(
     factor = np.linalg.cholesky(x.T @ x + _RIDGE * m * np.eye(sizes[-1]))
     along = scipy.linalg.solve_triangular(factor, x.T @ at, lower=True)
     unexplained = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
-    # What rounding leaves of a signal that its past foretells exactly may be below zero.
+    # What rounding leaves of a signal that its past predicts exactly may be below zero.
     criteria = [
         m * np.sum(np.log(np.maximum(unexplained[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
         for k in sizes
@@ -267,7 +267,7 @@ class _View(NamedTuple):
     """Signals of a flight at one rate, of which the past is compared with inputs."""
 
     free: dict[str, np.ndarray]
-    """by input what its own past does not foretell (N,)"""
+    """by input what its own past does not predict (N,)"""
     innovations: Float[np.ndarray, "N p"]
     outputs: tuple[str, ...]
     inputs: int
@@ -295,7 +295,7 @@ def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
-    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # From the past of all signals together. What one output alone cannot predict may well be the
     # answer to an input, and would pass for feedback. A sample's own inputs stand beside the
     # outputs before it.
     now = np.concatenate(list(parts.values()), axis=1)

@@ -143,7 +143,7 @@ def lines_of(
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
-    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    """The samples (size,) to which the filter of `whitening` brings samples from before a hole."""
     after = np.zeros(size, bool)
     for first in holes:
         after[first : first + ORDER] = True
@@ -363,7 +363,8 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
-    """That a gain is one of the others, which are maxima of about exponential numbers."""
+    """The probability that a gain is one of the others, which are maxima of about exponential
+    numbers."""
     scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
     if not scale > 0:
         return 1.0

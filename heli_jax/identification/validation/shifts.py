@@ -13,11 +13,10 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
@@ -56,9 +55,9 @@ SHIFT = _ShiftLimits()
 class Shift(NamedTuple):
     """Signals at another time."""
 
-    kind: Literal["input", "output", "response", "hold"]
-    """an input or an output is logged late, the response to an input comes later than the model
-    makes it, or inputs are held and were taken as linear"""
+    kind: str
+    """input or output: it is logged late; response: that to an input comes later than the model
+    makes it; hold: inputs are held that were taken as linear"""
     names: tuple[str, ...]
     seconds: float
     """by which the first of them is late"""
@@ -83,14 +82,14 @@ def shift_in_time(
         return None
     inputs = naming.names(problem.model.Inputs)
     moving = [n for n in inputs if any(np.ptp(f.inputs[n]) > 0 for f in problem.training)]
-    signals: list[tuple[Literal["input", "output"], str]] = [("input", n) for n in moving]
-    signals += [("output", n) for n in outputs]
-    found = {one: _best_place(problem, at, e, *one) for one in signals}
+    signals = [*(("input", n) for n in moving), *(("output", n) for n in outputs)]
+    found = {one: _best_place(at, e, *one) for one in signals}
     found = {one: best for one, best in found.items() if best[1] > SHIFT.clear}
     if not found:
         return None
     kind, surest = max(found, key=lambda one: found[one][1])
-    places = {n: p for (k, n), (p, _) in found.items() if k == kind == "input" or n == surest}
+    together = {one for one in found if one[0] == kind == "input"} | {(kind, surest)}
+    places = {one[1]: found[one][0] for one in found if one in together}
     dt, there = float(at.data.flights[0].dt), at.data
     for name, place in places.items():
         there = _moved(there, kind, name, place * dt)
@@ -114,7 +113,8 @@ def other_hold(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
         }
         for f in problem.training
     ]
-    if not any(moving) or _feeds_through(problem):
+    # At the start values and zero inputs: a term that vanishes there is taken for none.
+    if not any(moving) or np.any(jacobians(problem.model, problem.start_params()).D):
         return None
     # Other inputs to the same program: compiling another one costs far more than an evaluation.
     r, J = _rows(at, _held(at, moving))
@@ -130,9 +130,7 @@ def other_hold(problem: Problem, at: Solution, e: Evaluation) -> Shift | None:
     return Shift("hold", names, 0.5 * dt, gain, _change(at, e, r, J))
 
 
-def _best_place(
-    problem: Problem, at: Solution, e: Evaluation, kind: str, name: str
-) -> tuple[float, float]:
+def _best_place(at: Solution, e: Evaluation, kind: str, name: str) -> tuple[float, float]:
     """Return by how many samples a signal has to come later to fit best (below zero: earlier), and
     what twice the log-likelihood gains there."""
     dt = float(at.data.flights[0].dt)
@@ -157,15 +155,14 @@ def _best_place(
     for step in (1, -1):
         while place and abs(place + step) <= farthest and gained(place + step) > gained(place):
             place += step
-    within = kind == "input" and place <= 0 and _is_logged(problem, name)
-    if not (within and place + 1 in left and place - 1 in left):
+    if kind == "output" or place > 0 or not {place - 1, place + 1} <= left.keys():
         return float(place), gains[place]
     # A logger stamps a step at the sample after it: within a sample the slope tells by how much.
     slope, rest = 0.5 * (left[place + 1] - left[place - 1]), left[place]
     part = float(slope @ rest) / max(float(slope @ slope), 1e-300)
-    if not (abs(part) <= 1.0 and part > place):
-        return float(place), gains[place]
     gain = part**2 * float(slope @ slope) / _correlated(_block(dt), slope, rest)
+    if not (gain > SHIFT.clear and abs(part) <= 1.0 and part > place):
+        return float(place), gains[place]
     return place - part, gains[place] + gain
 
 
@@ -218,19 +215,6 @@ def _change(at: Solution, e: Evaluation, r: np.ndarray, J: np.ndarray) -> dict[s
         for n, v in zip(at.layout.of_interest, change, strict=True)
         if n in at.layout.free and n not in at.layout.disturbance
     }
-
-
-def _is_logged(problem: Problem, name: str) -> bool:
-    """True for an input as a log has it, whose time within a sample nobody knows."""
-    logged = any(f.source or name in f.hold_reason for f in problem.training)
-    filtered = any(is_low_passed(f, name) for f in problem.training)
-    return logged and not filtered and not _feeds_through(problem)
-
-
-def _feeds_through(problem: Problem) -> bool:
-    """True if an input acts on an output at once, without the dynamics."""
-    # At the start values and zero inputs: a term that vanishes there is taken for none.
-    return bool(np.any(np.asarray(jacobians(problem.model, problem.start_params()).D)))
 
 
 def _moved(data: Data, kind: str, name: str, seconds: float) -> Data:
@@ -364,28 +348,22 @@ def _of_future(y: np.ndarray, drives: Mapping[str, np.ndarray], name: str, step:
     past += [column(u, k) for u in drives.values() for k in range(lags + 1)]
     # A step within a mean shows in full in the next one: that is no lead yet.
     past += [column(u, -1) for u in drives.values()]
-    known = _basis(np.stack(past, axis=1))
+    known = directions(np.stack(past, axis=1))
     future = np.stack([column(drives[name], -k) for k in range(2, lags + 1)], axis=1)
     size = float(np.linalg.norm(future - future.mean(axis=0), axis=0).max())
-    new = _basis(future - known @ (known.T @ future), size)
+    beside = future - known @ (known.T @ future)
+    # What the past determines of the future is left as rounding.
+    beside = beside[:, np.linalg.norm(beside, axis=0) > 1e-6 * size]
+    if not beside.size:
+        return 0.0
+    new = directions(beside)
     rest = column(y, 0) - known @ (known.T @ column(y, 0))
     freedom = rest.size - known.shape[1] - new.shape[1]
     power = float(rest @ rest)
-    if not (new.shape[1] and power > 0):
+    if not power > 0:
         return 0.0
     share = min(float(np.sum((new.T @ rest) ** 2)) / power, 1.0)
     F = share / new.shape[1] / max((1.0 - share) / freedom, 1e-300)
     if scipy.special.fdtrc(new.shape[1], freedom, F) > LEAD.chance:
         return 0.0
     return max(0.0, 1.0 - (1.0 - share) * (freedom + new.shape[1]) / freedom)
-
-
-def _basis(X: np.ndarray, size: float | None = None) -> np.ndarray:
-    """Return orthonormal columns (N, rank) that span those of X (N, m) but for rounding, which is
-    relative to the columns, or to `size`."""
-    norms = np.linalg.norm(X, axis=0) if size is None else np.full(X.shape[1], size)
-    scaled = X / np.maximum(norms, 1e-300)
-    parts: Any = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
-    Q, R = parts[:2]
-    values = np.abs(np.diag(R))
-    return Q[:, values > (1e-8 * values[0] if size is None else 1e-6)]
