@@ -240,7 +240,7 @@ def test_chance_makes_no_answer_whatever_the_spectrum(noise):
 
 
 def test_wild_samples_that_happen_to_follow_the_stick_are_no_answer():
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(0)
     u = steps(rng)
     e = rng.standard_normal(N)
     wild = rng.choice(N, 8, replace=False)
