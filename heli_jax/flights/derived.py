@@ -165,7 +165,12 @@ def derivation(
         groups = (_quaternion(q, known), (north, east, down))
         return Derivation(groups, _row(body_velocity, BODY.index(part)))
     if function == "unwrap" and len(arguments) == 2 and not part:
-        period = _period(arguments[1], expected)
+        try:
+            period = float(arguments[1])
+        except ValueError:
+            raise ValueError(expected) from None
+        if not 0 < period < np.inf:
+            raise ValueError(f"expected a positive period, got {arguments[1]!r:.40}")
         return Derivation(((arguments[0],),), lambda values: _unwrapped(values[0], period))
     if function not in ("euler", "body_velocity", "unwrap"):
         hint = nearest(function, ("euler", "body_velocity", "unwrap"))
@@ -190,16 +195,6 @@ def _quaternion(arguments: Sequence[str], known: Collection[str]) -> tuple[str, 
     indexed = tuple(f"{arguments[0]}[{i}]" for i in range(4))
     numbered = tuple(f"{arguments[0]}{i}" for i in range(1, 5))
     return numbered if numbered[0] in known else indexed
-
-
-def _period(text: str, expected: str) -> float:
-    try:
-        period = float(text)
-    except ValueError:
-        raise ValueError(expected) from None
-    if not 0 < period < np.inf:
-        raise ValueError(f"expected a positive period, got {text!r:.40}")
-    return period
 
 
 def _row(of: Callable[..., np.ndarray], row: int) -> Callable[..., np.ndarray]:

@@ -103,7 +103,8 @@ def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
     """
     steps = np.diff(elapsed)
     # Never the first step or the median one: stamps in milliseconds at 300 Hz are 3 or 4 ms apart.
-    slope = _least_squares_step(elapsed)
+    i = np.arange(elapsed.size) - 0.5 * (elapsed.size - 1)
+    slope = float(i @ (elapsed - elapsed.mean()) / (i @ i))  # of the line of least squares
     dt = _plain(slope, 2 * rounding / float(elapsed[-1] - elapsed[0]))
     jitter = float(np.abs(steps - dt).max() / dt)
     # Half the band's width: the stamps leave the line in its middle by no more.
@@ -126,12 +127,6 @@ def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
 def _spread(elapsed: np.ndarray, dt: float) -> float:
     """Width [s] of the band of slope `dt` that holds all stamps (N,)."""
     return float(np.ptp(elapsed - dt * np.arange(elapsed.size)))
-
-
-def _least_squares_step(elapsed: np.ndarray) -> float:
-    """Slope [s] of the line of least squares through the stamps (N,)."""
-    i = np.arange(elapsed.size) - 0.5 * (elapsed.size - 1)
-    return float(i @ (elapsed - elapsed.mean()) / (i @ i))
 
 
 def _step_of_least_spread(elapsed: np.ndarray, dt: float) -> float:
@@ -183,12 +178,7 @@ def rounding_of(stamps: np.ndarray) -> float:
         # Close to the resolution of float64 every number is a multiple of anything.
         if unit > 100 * resolved and error <= max(1e-9, 4 * resolved / unit):
             return unit
-    return max(resolved, _single_precision(size))
-
-
-def _single_precision(size: np.ndarray) -> float:
-    """Return the resolution of float32 if all stamps are float32, otherwise 0."""
     # A logger that counts seconds in float32 since boot steps by 1 ms after some hours.
     with np.errstate(over="ignore", under="ignore"):
         single = size.astype(np.float32)
-    return float(np.spacing(single.max())) if np.all(single == size) else 0.0
+    return max(resolved, float(np.spacing(single.max())) if np.all(single == size) else 0.0)

@@ -49,7 +49,10 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     if not (absurd.any() or known.any()):
         return none
     # Known marks at any share: of a slow sensor, most rows of a table hold nothing else.
-    at = known | absurd if _is_mark(numbers, absurd & ~known) else known
+    others = numbers[absurd & ~known]
+    # Of these few are none, or nearly always the same.
+    few = others.size <= _MOST * np.count_nonzero(np.isfinite(numbers) | (absurd & ~known))
+    at = known | absurd if few or np.unique(others).size <= _FEW else known
     rest = numbers[np.isfinite(numbers) & ~at]
     # Of a switch between a few values any of them may be one.
     if rest.size < _FEWEST or np.unique(rest).size < _LEVELS:
@@ -72,14 +75,6 @@ def is_absurd(numbers: np.ndarray) -> np.ndarray:
     """Return a mask of the numbers (N,) of a log that nothing measures, in any unit."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) > _ABSURD
-
-
-def _is_mark(numbers: np.ndarray, absurd: np.ndarray) -> bool:
-    """True if absurd numbers are few, or nearly always the same."""
-    count = np.count_nonzero(absurd)
-    if count <= _MOST * np.count_nonzero(np.isfinite(numbers) | absurd):
-        return True
-    return np.unique(numbers[absurd]).size <= _FEW
 
 
 def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -213,7 +208,11 @@ def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.
     motion leads there and back, and their distance in ranges."""
     seen, none = np.flatnonzero(np.isfinite(numbers)), np.zeros(numbers.shape, bool)
     x = numbers[seen]
-    if x.size < _MOTION or _is_within(x):
+    if x.size < _MOTION:
+        return none, _FAR
+    # All samples are nearly always near to most, and that is soon told.
+    low, high = np.quantile(x[:: max(1, x.size // _SOME)], [2 * _MOST_STRAYS, 1 - 2 * _MOST_STRAYS])
+    if max(x.max() - high, low - x.min()) <= _FAR * (high - low):
         return none, _FAR
     # What a sensor holds until its next sample is one. A stick that stays was moved there.
     new = np.r_[True, x[1:] != x[:-1]] if kind == "output" else np.ones(x.size, bool)
@@ -244,13 +243,6 @@ def _lonely(y: np.ndarray, far: float, most: int) -> tuple[np.ndarray, float]:
         far = max(far, _FARTHER)
         out &= _beyond(y, low, high, far) & (levels >= _FEW_LEVELS)
     return out, far
-
-
-def _is_within(x: np.ndarray) -> bool:
-    """True if all samples (N,) are surely near to most of them, by a quick test."""
-    some = x[:: max(1, x.size // _SOME)]
-    low, high = np.quantile(some, [2 * _MOST_STRAYS, 1 - 2 * _MOST_STRAYS])
-    return bool(max(x.max() - high, low - x.min()) <= _FAR * (high - low))
 
 
 def _beyond(y: np.ndarray, low: float, high: float, far: float) -> np.ndarray:

@@ -190,20 +190,18 @@ def _serves(log: ChannelLog, needed: Sequence[str], alternative: Alternative) ->
 
 
 def fitting_presets(log_format: str, names: Sequence[str]) -> list[str]:
-    """The presets for a format of which a log has the roll rate and the roll command."""
-    known = frozenset(names)
-    return [name for name in presets() if _fits(preset(name), log_format, known)]
-
-
-def _fits(table: Preset, log_format: str, names: frozenset[str]) -> bool:
-    if log_format not in table.formats:
-        return False
+    """Return the presets for a format of which a log has the roll rate and the roll command."""
     # Instances are told apart by the reader; here any will do.
-    bare = names | {re.sub(r"^(\w+)\[\d+\]\.", r"\1.", name) for name in names}
-    return all(
-        any(set(sources(a.channel, bare)) <= bare for a in table.signals[signal])
-        for signal in ("roll_rate", "cyclic_roll")
-    )
+    bare = {*names, *(re.sub(r"^(\w+)\[\d+\]\.", r"\1.", name) for name in names)}
+    return [
+        name
+        for name in presets()
+        if log_format in preset(name).formats
+        and all(
+            any(set(sources(a.channel, bare)) <= bare for a in preset(name).signals[signal])
+            for signal in ("roll_rate", "cyclic_roll")
+        )
+    ]
 
 
 # Which channels of a log become which columns, as a preset or a configuration names them.

@@ -40,9 +40,15 @@ class Digest:
 
     @functools.cached_property
     def _made(self) -> Future[str]:
+        def made() -> str:
+            if isinstance(self._source, bytes):
+                return hashlib.sha256(self._source).hexdigest()
+            with self._source.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+
         pool = ThreadPoolExecutor(1)
         try:
-            return pool.submit(_sha256, self._source)
+            return pool.submit(made)
         finally:
             pool.shutdown(wait=False)
 
@@ -53,10 +59,3 @@ class Digest:
     def hex(self) -> str:
         """The fingerprint, once it is there."""
         return self._made.result()
-
-
-def _sha256(source: bytes | Path) -> str:
-    if isinstance(source, bytes):
-        return hashlib.sha256(source).hexdigest()
-    with source.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -91,12 +91,6 @@ def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
     return bool(np.mean(regular | double) >= _REGULAR)
 
 
-def _is_exact(values: np.ndarray, usual: int) -> bool:
-    """True if hardly any run has another length than the usual one, or a multiple of it."""
-    lengths, _ = _runs(values)
-    return lengths.size >= _SURE and bool(np.mean(lengths % usual == 0) >= _EXACT)
-
-
 def first_of_each(values: np.ndarray) -> np.ndarray:
     """An output (N,) with the first sample of each value alone, the others missing."""
     seen = np.flatnonzero(~np.isnan(values))
@@ -132,7 +126,13 @@ def repeats_removed(
         if stated[name] == "keep":
             continue
         usual = runs[name]
-        exact = usual is not None and _is_exact(y, usual)
+        # Hardly any run has another length than the usual one, or a multiple of it.
+        lengths, _ = _runs(y)
+        exact = (
+            usual is not None
+            and lengths.size >= _SURE
+            and bool(np.mean(lengths % usual == 0) >= _EXACT)
+        )
         sure = exact or carried_on(seconds, y)
         if sure and not exact:
             made[name] = first_of_each(y)
@@ -144,7 +144,6 @@ def repeats_removed(
             notes.append(note("repeats.carried-on", words, name, value=hz))
             continue
         if stated[name] == "missing":
-            lengths, _ = _runs(y)
             # Stated by somebody who knows: then no further sign is asked for.
             usual = usual or round(float(np.median(lengths))) if lengths.size else None
             if usual is None or usual < 2:

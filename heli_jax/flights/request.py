@@ -115,7 +115,10 @@ class Request:
         for use, signal in uses.items():
             if problem := _problem(use, signal):
                 raise wrong(path, problem, column(signal.name))
-        self._check_numbers()
+        require_rate_and_window(path, options.rate, options.window)
+        for name, value in self.known.items():
+            if not math.isfinite(value):
+                raise wrong(path, f"known {name!r} is {value:g}, expected a finite number")
 
     @property
     def columns(self) -> list[str]:
@@ -147,13 +150,6 @@ class Request:
             if before != use and not before[0] == kind == "input":
                 problem = f"serves both as {before[1]} and as {use[1]}, expected one use"
                 raise wrong(self.path, problem, column(signal.name))
-
-    def _check_numbers(self) -> None:
-        require_rate_and_window(self.path, self.options.rate, self.options.window)
-        for name, value in self.known.items():
-            if not math.isfinite(value):
-                problem = f"known {name!r} is {value:g}, expected a finite number"
-                raise wrong(self.path, problem)
 
 
 def _problem(use: str, signal: Signal) -> str:

@@ -309,13 +309,6 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Rail | None:
     return Rail(float(levels[k]), s[at])
 
 
-def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks of the samples (N,) at the lower and at the upper rail; none if there is no
-    rail."""
-    finite = x[np.isfinite(x)]
-    return _at_rails(x, finite, *np.unique(finite, return_counts=True))
-
-
 def _at_rails(
     x: np.ndarray, finite: np.ndarray, levels: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -331,18 +324,11 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
     piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * finite.size
-    if piled and _comes_and_goes(finite == top):
-        return x == top
-    return np.zeros(x.shape, bool)
-
-
-def _comes_and_goes(at: np.ndarray) -> bool:
-    """True if samples at an end of a range are visits, and not a signal at rest."""
-    if at[0] and at[-1]:
-        return False
-    edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    return bool(begins.size >= _VISITS and (ends - begins).max() >= _RUN)
+    # Visits to the end of the range, and not a signal at rest.
+    at = finite == top
+    edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
+    visits = len(edges) >= _VISITS and np.diff(edges).max() >= _RUN and not (at[0] and at[-1])
+    return x == top if piled and visits else np.zeros(x.shape, bool)
 
 
 def quantum(x: np.ndarray) -> float:

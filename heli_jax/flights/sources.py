@@ -110,7 +110,11 @@ def beyond(logs: Opened, request: Request) -> tuple[Finding, ...]:
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog:
     log = log or _of_file(request)
     if request.time is None and not isinstance(log, ChannelLog):
-        log = _by_clocks(log)
+        # Arrays may have clocks of their own beside them in the file.
+        table = log.table if isinstance(log, DerivedTable) else log
+        grouped = by_clocks(table) if isinstance(table, ArrayTable) else None
+        if grouped is not None:
+            return with_derived(grouped, log.swashplate if isinstance(log, DerivedTable) else None)
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
@@ -121,14 +125,6 @@ def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog
 
 def _of_file(request: Request) -> ChannelLog | Table:
     return with_derived(open_log(request.path, request.options.number))
-
-
-def _by_clocks(log: Table) -> ChannelLog | Table:
-    """Arrays whose clocks stand beside them in the file; any other table as it is."""
-    swashplate = log.swashplate if isinstance(log, DerivedTable) else None
-    table = log.table if isinstance(log, DerivedTable) else log
-    with_clocks = by_clocks(table) if isinstance(table, ArrayTable) else None
-    return log if with_clocks is None else with_derived(with_clocks, swashplate)
 
 
 def _only(request: Request, keys: frozenset[Key]) -> Request:

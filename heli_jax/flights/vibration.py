@@ -52,18 +52,21 @@ def lines(
         dt: time between them [s].
         logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
     """
+    from scipy.ndimage import median_filter
+    from scipy.signal import detrend, welch
+
     n = min(x.size, max(64, round(SEGMENT / dt)))
     there = np.isfinite(x)
     if np.count_nonzero(there) < max(64, x.size // 2):
         return ()
     times = np.arange(x.size)
-    x = _detrended(np.interp(times, times[there], x[there])[None])[0]
-    hz, power = _welch(x, dt, n)
+    x = detrend(np.interp(times, times[there], x[there]))
+    hz, power = welch(x, 1.0 / dt, nperseg=n, detrend="linear")
     # Of the whole record: what is slower than a segment is part of the variance as well.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
         return ()
-    around = _running_median(power, _SURROUNDINGS)
+    around = median_filter(power, 2 * _SURROUNDINGS + 1, mode="nearest")
     peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
     peaks = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
     rate = 1.0 / dt if logged_hz is None else logged_hz
@@ -86,38 +89,6 @@ def line_words(line: Line, rotor_hz: float | None) -> str:
     if line.harmonic:
         return f"{share} ({line.harmonic}/rev of the rotor)"
     return f"{share} ({'no harmonic of the rotor' if rotor_hz else 'of unknown origin'})"
-
-
-# The next three by NumPy: scipy.signal takes a second to import, and `info` has 0.7 s.
-
-
-def _detrended(rows: np.ndarray) -> np.ndarray:
-    """Each row (k, n) without its straight line of least squares."""
-    t = np.arange(rows.shape[1]) - 0.5 * (rows.shape[1] - 1)
-    level = rows.mean(axis=1, keepdims=True)
-    return rows - level - np.outer(rows @ t / (t @ t), t)
-
-
-def _welch(x: np.ndarray, dt: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies [Hz] and power density of x (N,): the mean of detrended Hann segments of n
-    samples, each half over the one before (Welch, 1967)."""
-    # Strided and not copied: a long record has as many segments.
-    segments = np.lib.stride_tricks.sliding_window_view(x, n)[:: n - n // 2]
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
-    power = np.zeros(n // 2 + 1)
-    for segment in segments:
-        power += np.abs(np.fft.rfft(window * _detrended(segment[None])[0])) ** 2
-    power *= dt / (len(segments) * (window @ window))
-    # Of both signs of a frequency; zero and the Nyquist frequency have one.
-    power[1 : None if n % 2 else -1] *= 2.0
-    return np.fft.rfftfreq(n, dt), power
-
-
-def _running_median(x: np.ndarray, to_either_side: int) -> np.ndarray:
-    """Return the running median of the neighbours of each value; the ends are repeated."""
-    padded = np.pad(x, to_either_side, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * to_either_side + 1)
-    return np.median(windows, axis=1)
 
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:

@@ -25,7 +25,7 @@ docs/onboard.md"""
 
 
 def filtered_noise(low_passes: Sequence[LowPass], flights: Sequence[Flight]) -> tuple[LowPass, ...]:
-    """Those low-passes above whose cut-off the flights have samples, where these bear it out.
+    """The low-passes above whose cut-off the flights have samples, where the samples show them.
 
     Args:
         low_passes: `Model.low_passes`.
@@ -54,7 +54,7 @@ _ROUNDING = 1e-8
 def offset_inputs(
     model: Model, params: Any, flight: Flight, free: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The sticks of a machine in free flight: those whose constant offset no initial state and no
+    """The sticks of a vehicle in free flight: those whose constant offset no initial state and no
     bias can take the place of, in the order of the model.
 
     Throttle and collective have no centre, and where a free parameter is a constant term of the
@@ -82,7 +82,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
     """The inputs whose constant offset moves a model to another equilibrium, where a bias of the
     outputs shows it like the one before.
 
-    Of a machine in free flight there is no such equilibrium, or it is farther off than the weak
+    Of a vehicle in free flight there is no such equilibrium, or it is farther off than the weak
     prior of a bias lets it be: a slow mode (the spiral of an aeroplane) goes far in the end, though
     not in the record. The model is linearised at the flight's mean inputs.
     """
@@ -121,7 +121,7 @@ def _taken_up(model: Model, params: Any, flight: Flight) -> set[str]:
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:
-    """Whether a free parameter is added to the rates whatever the state and the inputs are."""
+    """True if a free parameter is added to the rates whatever the state and the inputs are."""
     rng = np.random.default_rng(11)
     dtype = jnp.result_type(float)
 

@@ -1,6 +1,6 @@
 """A first guess of a problem's parameters by frequency error, for a fit in time.
 
-The misfit in time has valleys and plateaus far from its optimum, and an unstable machine's
+The misfit in time has valleys and plateaus far from its optimum, and an unstable vehicle's
 simulation overflows there; the one in frequency simulates nothing.
 """
 
@@ -13,8 +13,6 @@ from heli_jax.identification.equation_error.start import StartValue, reasons_of
 from heli_jax.identification.fit import fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Status
-
-METHOD = "frequency-error"
 
 
 class FrequencyErrorStart(NamedTuple):
@@ -50,24 +48,15 @@ def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> Frequenc
     Gains and time shifts are not among them: a fit in time searches these by itself.
 
     Args:
-        problem: with starts of its own; its method and its windows do not matter. Without a
-            disturbance, whose states a spectrum of the noise stands for.
+        problem: of frequency error, without a disturbance, whose states a spectrum of the noise
+            stands for.
 
     Raises:
         ValueError: frequency error cannot solve it; the sentence says why.
     """
     began = time.perf_counter()
-    in_frequency = dataclasses.replace(
-        problem,
-        # Flights held out are predicted by the fit that follows.
-        flights=problem.training,
-        method=METHOD,
-        fixed_noise=(),
-        window=None,
-        continuity=None,
-        first_guess=None,
-    )
-    first = fit(in_frequency, max_steps=max_steps)
+    # Flights held out are predicted by the fit that follows.
+    first = fit(dataclasses.replace(problem, flights=problem.training), max_steps=max_steps)
     # Any of several solutions is as good a start as the only one would be.
     of_several = {n for other in first.verdict.second for n in other.changed}
     values = {

@@ -58,7 +58,7 @@ class Nuisance(NamedTuple):
     logged) are shared by all flights.
 
     `input_offset` is a constant that is added to the logged input, since no stick is centred: True
-    for all inputs, or their names; None leaves it to the machine: on for the sticks of one in free
+    for all inputs, or their names; None leaves it to the vehicle: on for the sticks of one in free
     flight, where an offset is integrated (`heli_jax.identification.defaults`).
     """
 
@@ -199,7 +199,7 @@ class Problem:
     @functools.cached_property
     def filtered_noise(self) -> dict[str, Free]:
         """By output the start of the sd of its sensor's noise where that came through on-board
-        low-passes and the samples bear it out; filter error estimates it by itself."""
+        low-passes and the samples show it; filter error estimates it by itself."""
         if self.noise_model != "disturbance" or self.noise_is_fixed:
             return {}
         # A model's own parameter of that name is its own noise of that sensor.
@@ -220,10 +220,10 @@ class Problem:
     @functools.cached_property
     def offset_inputs(self) -> tuple[str, ...]:
         """The inputs whose offset is estimated, in the order of the model: as
-        `nuisance.input_offset` says, or the sticks of a machine in free flight."""
+        `nuisance.input_offset` says, or the sticks of a vehicle in free flight."""
         inputs, requested = naming.names(self.model.Inputs), self.nuisance.input_offset
         if requested is None:
-            # The first flight alone: all are of one machine.
+            # The first flight alone: all are of one vehicle.
             first = self.training[0]
             return offset_inputs(self.model, self.start_params(), first, tuple(self.free))
         if isinstance(requested, bool):

@@ -224,7 +224,7 @@ class Fit:
 
     @property
     def denials(self) -> tuple[str, ...]:
-        """Why the model is not adequate, each in a few words."""
+        """Reasons why the model is not adequate, each in a few words."""
         return tuple(dict.fromkeys(f.brief for f in self.findings if f.denies))
 
     @property

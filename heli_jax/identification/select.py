@@ -74,21 +74,21 @@ def alternatives(
 
     Args:
         model: the model without disturbance.
-        without_stand: the same machine without its stand, where that is in question too; it is
+        without_stand: the same vehicle without its stand, where that is in question too; it is
             fitted without the stand's kappa and zeta.
     """
     problems: dict[str, Problem] = {}
     nested = []
-    machines = {"": (model, dict(problem.free))}
+    vehicles = {"": (model, dict(problem.free))}
     if without_stand is not None:
         free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
-        machines[", no stand"] = (without_stand, free)
-    for ending, (machine, free) in machines.items():
+        vehicles[", no stand"] = (without_stand, free)
+    for ending, (vehicle, free) in vehicles.items():
         # Without the stand's own parameters nothing may be left to estimate.
         if not free:
             continue
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            disturbed = with_disturbance(machine, axis, max(poles, 1))
+            disturbed = with_disturbance(vehicle, axis, max(poles, 1))
             problems[words + ending] = _by_filter_error(
                 replace(problem, free=free), disturbed, silent=not poles
             )
@@ -191,7 +191,7 @@ def choose(
     candidates = {name: _candidate(name, fits[name]) for name in fits}
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
     tests = [t for t in compared if t.degrees > 0]
-    # A fit that has not arrived has a likelihood too, of no optimum: it comes last, whatever it is.
+    # A fit that has not converged has a likelihood too, of no optimum: it comes last in any case.
     # Rounded, since a disturbance that does not show leaves the same model: the one named first.
     ranked = tuple(
         sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))

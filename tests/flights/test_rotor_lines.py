@@ -4,11 +4,8 @@ import json
 
 import numpy as np
 import pytest
-import scipy.ndimage
-import scipy.signal
 
 from heli_jax.cli import main
-from heli_jax.flights import vibration
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.vibration import rotor_lines
 
@@ -69,14 +66,3 @@ def test_a_rotor_that_is_not_steady_is_said(tmp_path, capsys):
     assert main(["info", str(path), "--json"]) == 0
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
     assert flight["vibration"]["hz"] is None
-
-
-@pytest.mark.parametrize(("size", "segment"), [(3000, 400), (777, 101), (64, 64)])
-def test_spectra_are_scipys(size, segment):
-    x = np.random.default_rng(0).normal(size=size) + 0.01 * np.arange(size)
-    expected = scipy.signal.welch(x, 50.0, "hann", nperseg=segment, detrend="linear")
-    np.testing.assert_allclose(vibration._welch(x, 0.02, segment), expected, atol=1e-14)
-    detrended = scipy.signal.detrend(x)
-    np.testing.assert_allclose(vibration._detrended(x[None])[0], detrended, atol=1e-9)
-    median = scipy.ndimage.median_filter(x, 31, mode="nearest")
-    np.testing.assert_array_equal(vibration._running_median(x, 15), median)

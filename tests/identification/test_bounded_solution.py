@@ -6,7 +6,7 @@ import numpy as np
 
 from heli_jax import Flight
 from heli_jax.flights.flight import own_instruments
-from heli_jax.identification.estimation.frequency_lines import Matrices, Signals, orthonormal
+from heli_jax.identification.estimation.frequency_lines import Driving, Matrices, orthonormal
 from heli_jax.identification.estimation.frequency_response import (
     bounded_outputs,
     resolved,
@@ -21,7 +21,7 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add():
     B, C, D = (rng.standard_normal(s) for s in ((3, 2), (2, 3), (2, 2)))
     U, x = rng.standard_normal((samples, 2)), rng.standard_normal(3)
     machine = Matrices(*(jnp.asarray(v) for v in (A, B, C, D)))
-    signals = Signals(jnp.asarray(U), jnp.asarray(U))
+    signals = Driving(jnp.asarray(U), jnp.asarray(U))
     y = np.zeros((2, samples))
     for k in range(samples):
         y[:, k] = C @ x + D @ U[k]
@@ -57,7 +57,7 @@ def test_slopes_of_the_bounded_solution_are_those_of_the_whole_expression():
     z = np.exp(1j * np.pi * (2 * np.arange(60) + 1) / 60)
 
     def outputs(*v):
-        m, signals = Matrices(*v[:4]), Signals(*v[4:])
+        m, signals = Matrices(*v[:4]), Driving(*v[4:])
         return bounded_outputs(m, signals, resolved(m, 60), ends)
 
     def plain(A, B, C, D, U, acting):

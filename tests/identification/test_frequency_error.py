@@ -63,7 +63,7 @@ def lines_of_a_machine(A: jax.Array) -> tuple[jax.Array, jax.Array]:
     m = Matrices(A, jnp.ones((n, 1)), jnp.eye(n)[:2], jnp.zeros((2, 1)))
     white = jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2))
     at = resolved(m, record, white)
-    return at.H, states(at, 0, jnp.ones((1, record.lines, n), complex))
+    return at.H, states(at, at.z[0], jnp.ones((1, record.lines, n), complex))
 
 
 def test_lines_without_a_triangle_are_the_same(monkeypatch):

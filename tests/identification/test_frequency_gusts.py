@@ -8,8 +8,8 @@ import scipy.linalg
 import scipy.signal
 
 from heli_jax.identification.diagnostics.loop import moved_by_feedback
+from heli_jax.identification.estimation.frequency_lines import Matrices
 from heli_jax.identification.estimation.frequency_noise import (
-    Machine,
     inverse_roots,
     smoothed,
     whitening_by,
@@ -30,6 +30,10 @@ def discrete(A: list, B: list) -> tuple[np.ndarray, np.ndarray]:
     M[:n, :n], M[:n, n:] = A, B
     E = scipy.linalg.expm(M * DT)
     return E[:n, :n], E[:n, n:]
+
+
+def machine(Ad: np.ndarray, C: np.ndarray) -> Matrices:
+    return Matrices(Ad, np.zeros((len(Ad), 0)), C, np.zeros((len(C), 0)))
 
 
 def gust(rng: np.random.Generator, size: float) -> np.ndarray:
@@ -56,7 +60,7 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
         covariance = (W @ S @ np.conj(np.swapaxes(W, 1, 2)))[: round(10.0 * N * DT)]
         return np.linalg.eigvalsh(covariance)
 
-    by = sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0])
+    by = sizes(whitening_by(machine(Ad, np.eye(3)), errors)[0])
     plain = sizes(inverse_roots(smoothed(errors)[0]))
     assert np.mean(by) == pytest.approx(1.0, abs=0.1)
     # What an integration shows twice is known far better than a mean over lines has it.
@@ -77,10 +81,10 @@ def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
     errors = [
         colour * (rng.standard_normal((K, 2)) + 1j * rng.standard_normal((K, 2))) for _ in range(2)
     ]
-    alone = whitening_by(Machine(Ad[:2, :2], np.eye(2)), errors)[0]
+    alone = whitening_by(machine(Ad[:2, :2], np.eye(2)), errors)[0]
     for rounding in (0.0, 1e-17, -1e-16):
         Ad[:2, 2] = rounding
-        by = whitening_by(Machine(Ad, np.eye(3)[:2]), errors)[0]
+        by = whitening_by(machine(Ad, np.eye(3)[:2]), errors)[0]
         assert np.max(np.abs(by - alone)) < 1e-9 * np.max(np.abs(alone))
 
 

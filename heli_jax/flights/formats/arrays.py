@@ -13,7 +13,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -298,7 +298,10 @@ def _named_columns(
 
 def _belonging(own: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequence[str]:
     """The list that belongs to an array: the one called most alike; empty where several might."""
-    shared = {leaf: _alike(own, leaf) for leaf in lists}
+    shared = {}
+    for leaf in lists:
+        pairs = zip(own, leaf, strict=False)
+        shared[leaf] = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
     # The whole name of an array may be a letter: y and y_names.
     shared = {p: max(n, _FEWEST_SHARED) if n == len(own) else n for p, n in shared.items()}
     most = max(shared.values(), default=0)
@@ -306,12 +309,6 @@ def _belonging(own: str, count: int, lists: Mapping[str, Sequence[str]]) -> Sequ
     # A vector's own name says as much as a single text that happens to stand beside it.
     different = {tuple(texts) for texts in near or (() if count == 1 else lists.values())}
     return different.pop() if len(different) == 1 else ()
-
-
-def _alike(one: str, other: str) -> int:
-    """Letters with which two names begin alike."""
-    pairs = zip(one, other, strict=False)
-    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 class Packing(ValueError):
@@ -403,7 +400,12 @@ def _unstacked(
     cubes = {n: x for n, x in numeric.items() if x.ndim == _DEEPEST and x.size}
     if not cubes:
         return dict(arrays), ()
-    times = {n: x for n, x in numeric.items() if _is_time(n, x)}
+    # One time for each sample of one or more runs.
+    times = {
+        n: x
+        for n, x in numeric.items()
+        if _is_called_time(n) and 1 <= x.ndim <= 2 and max(x.shape) >= _FEWEST
+    }
     shapes = {x.shape[:2] for x in cubes.values()}
     shape = shapes.pop() if len(shapes) == 1 else None
     # Images and rotation matrices, (sample, row, column), stand beside times or signals of one run.
@@ -436,12 +438,9 @@ def _unstacked(
     return kept, tuple(notes)
 
 
-def _is_time(name: str, values: np.ndarray) -> bool:
-    """True for an array that is called a time and holds one for each sample of one or more runs."""
+def _is_called_time(name: str) -> bool:
     words = words_in(split_unit(_LEVEL.split(name)[-1])[0])
-    if not words or not TIME_NAMES & {words[0], words[-1]}:
-        return False
-    return 1 <= values.ndim <= 2 and max(values.shape) >= _FEWEST
+    return bool(words and TIME_NAMES & {words[0], words[-1]})
 
 
 def _without_padding(
@@ -468,46 +467,57 @@ def _shapes(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> str:
 # `log.imu.gx` and `log.rc.t` that of `log.rc.aileron`.
 
 
-class _Clock(NamedTuple):
-    """An array of times: its name, the group that it stands in, and its samples."""
-
-    name: str
-    group: tuple[str, ...]
-    size: int
-
-
 def by_clocks(table: ArrayTable) -> ChannelLog | None:
-    """Arrays as topics, each with the times of its group or of the nearest above that has some of
-    its length; None where all have one clock.
-    """
+    """Return arrays as topics, each with the times of its group or of the nearest above that has
+    some of its length; None where all have one clock."""
     arrays = {s.name: s.values for s in table.survey() if s.values is not None}
-    clocks = [c for name, x in arrays.items() if (c := _clock(name, x)) is not None]
-    seconds = {c.name: _seconds(table, c.name, arrays[c.name]) for c in clocks}
-    matched = {n: _clock_of(n, x.size, clocks, seconds) for n, x in arrays.items()}
+    clocks: dict[str, np.ndarray] = {}
+    for name, stamps in arrays.items():
+        if _is_called_time(name) and stamps.size > 1 and np.all(stamps[1:] > stamps[:-1]):
+            leaf = _LEVEL.split(name)[-1]
+            unit = table.time_unit(name) or split_unit(leaf)[1] or likely_unit(stamps)
+            with np.errstate(over="ignore"):  # of a damaged file
+                clocks[name] = stamps * SECONDS[unit]
     of_clock: dict[str, list[str]] = {}
-    for name, clock in matched.items():
-        if clock is not None and name not in {c.name for c in clocks}:
-            of_clock.setdefault(clock.name, []).append(name)
+    without = []
+    for name, x in arrays.items():
+        clock = _clock_of(name, x.size, clocks)
+        if clock is None and x.size > 1:
+            without.append(name)
+        elif clock is not None and name not in clocks:
+            of_clock.setdefault(clock, []).append(name)
     if len(of_clock) < 2:
         return None
-    topics = tuple(_topic(table, arrays, c, seconds[c], names) for c, names in of_clock.items())
-    without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
-    notes = (*table.notes, *_left_out(without, arrays))
-    steps = [float(np.median(np.diff(t.times))) for t in topics]
-    cautions = [
-        caution
-        for t, step in zip(topics, steps, strict=True)
-        for caution in contradicted_rate(table, t.clock, 1.0 / step)
-    ]
-    return ChannelLog(
-        table.path,
-        table.format,
-        table.size,
-        table.sha256,
-        topics,
-        notes=notes,
-        cautions=tuple(cautions),
-    )
+    notes, topics, cautions = table.notes, [], []
+    for clock, names in of_clock.items():
+        units_of = {n: table.units.get(n, "") for n in names}
+        columns = {n: arrays[n] for n in names}
+        topics.append(Topic(clock, clocks[clock], columns, units_of, clock))
+        cautions += contradicted_rate(table, clock, 1.0 / float(np.median(np.diff(clocks[clock]))))
+    if without:
+        each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in without)
+        words = "no time of their length, or several, stand in their groups"
+        notes = (*notes, note(LEFT_OUT, f"left out, since {words}: {each}", *without))
+    return ChannelLog.of_table(table, tuple(topics), notes=notes, cautions=tuple(cautions))
+
+
+def _clock_of(name: str, size: int, clocks: Mapping[str, np.ndarray]) -> str | None:
+    """The clock of an array; None where its group has none of its length, or several of which not
+    one alone shares the other groups' time."""
+    group = _LEVEL.split(name)[:-1]
+    groups = {c: _LEVEL.split(c)[:-1] for c in clocks}
+    for depth in range(len(group), -1, -1):
+        near = [c for c, g in groups.items() if g == group[:depth] and clocks[c].size == size]
+        others = [clocks[c] for c, g in groups.items() if g != group[:depth]]
+        if len(near) > 1 and others:
+            # GPS time of week beside the board's time.
+            times = max(others, key=lambda x: x.size)
+            shared = (float(times[0]), float(times[-1]))
+            on_it = sharing_clocks({c: clocks[c] for c in near}, shared)
+            near = [c for c in near if c in on_it]
+        if near:
+            return near[0] if len(near) == 1 else None
+    return None
 
 
 def clock_notes(table: Table) -> tuple[Finding, ...]:
@@ -518,57 +528,3 @@ def clock_notes(table: Table) -> tuple[Finding, ...]:
     topics = listed(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics)
     words = f"arrays have clocks of their own, read where no time is stated: {topics}"
     return (note("clock.of-arrays", words, value=len(log.topics)),)
-
-
-def _clock(name: str, values: np.ndarray) -> _Clock | None:
-    *group, leaf = _LEVEL.split(name)
-    words = words_in(split_unit(leaf)[0])
-    increases = values.size > 1 and bool(np.all(values[1:] > values[:-1]))
-    if not words or not TIME_NAMES & {words[0], words[-1]} or not increases:
-        return None
-    return _Clock(name, tuple(group), values.size)
-
-
-def _clock_of(
-    name: str, size: int, clocks: Sequence[_Clock], seconds: Mapping[str, np.ndarray]
-) -> _Clock | None:
-    """The clock of an array; None where its group has none of its length, or several of which not
-    one alone shares the other groups' time."""
-    group = tuple(_LEVEL.split(name)[:-1])
-    for depth in range(len(group), -1, -1):
-        near = [c for c in clocks if c.group == group[:depth] and c.size == size]
-        others = [c for c in clocks if c.group != group[:depth]]
-        if len(near) > 1 and others:
-            # GPS time of week beside the board's time.
-            times = seconds[max(others, key=lambda c: c.size).name]
-            shared = (float(times[0]), float(times[-1]))
-            on_it = sharing_clocks({c.name: seconds[c.name] for c in near}, shared)
-            near = [c for c in near if c.name in on_it]
-        if near:
-            return near[0] if len(near) == 1 else None
-    return None
-
-
-def _seconds(table: ArrayTable, clock: str, stamps: np.ndarray) -> np.ndarray:
-    unit = table.time_unit(clock) or split_unit(clock)[1] or likely_unit(stamps)
-    with np.errstate(over="ignore"):  # of a damaged file
-        return stamps * SECONDS[unit]
-
-
-def _topic(
-    table: ArrayTable,
-    arrays: Mapping[str, np.ndarray],
-    clock: str,
-    times: np.ndarray,
-    names: Sequence[str],
-) -> Topic:
-    units = {n: table.units.get(n, "") for n in names}
-    return Topic(clock, times, {n: arrays[n] for n in names}, units, clock)
-
-
-def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[Finding, ...]:
-    if not names:
-        return ()
-    each = listed(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names)
-    words = "no time of their length, or several, stand in their groups"
-    return (note(LEFT_OUT, f"left out, since {words}: {each}", *names),)

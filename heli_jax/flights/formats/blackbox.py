@@ -5,6 +5,7 @@ those that its firmware writes. The channels keep the firmware's own numbers and
 """
 
 import hashlib
+import re
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class MainFrames:
 def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
     """The flights of a blackbox file, without those that hold no frame."""
     data = read_regular(path, "a blackbox log", _LARGEST)
-    starts = _flight_starts(data)
+    starts = [match.start() for match in re.finditer(re.escape(MARK), data)]
     if not starts:
         raise wrong(str(path), "is no blackbox log, expected one that begins with its header")
     if len(starts) > _MOST_FLIGHTS:
@@ -81,14 +82,6 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
     if not flights:
         raise problems[0] if problems else wrong(str(path), "holds no frames, expected a flight")
     return tuple(flights)
-
-
-def _flight_starts(data: bytes) -> list[int]:
-    starts, at = [], data.find(MARK)
-    while at >= 0:
-        starts.append(at)
-        at = data.find(MARK, at + len(MARK))
-    return starts
 
 
 def _flight(
@@ -216,7 +209,9 @@ def _numbers(frames: Frames, i: int, runs: Runs, is_first: np.ndarray, head: Hea
     names, told = head.layouts["I"].names, np.zeros_like(numbers)
     # A motor that is told from itself, as no firmware writes, stays as it is.
     motor = names.index("motor[0]") if "motor[0]" in names else i
-    if motor != i and _uses_motor(i, head):
+    if motor != i and any(
+        head.layouts[letter].predictors[i] == frames_of.MOTOR_0 for letter in "IP"
+    ):
         told = _numbers(frames, motor, runs, is_first, head)
     add_predictions(numbers, i, runs, is_first, told, head)
     return numbers
@@ -243,7 +238,11 @@ def _plausible(
     """The frames whose times go on from the last one's, None where all do, and these times
     [us]."""
     resumed = set(np.searchsorted(starts, np.asarray(frames.resumes, np.int64)).tolist())
-    inside = _inside(runs, stamps.size)
+    # In a run.
+    edges = np.zeros(stamps.size + 1, np.int8)
+    edges[runs.begin] += 1
+    np.subtract.at(edges, runs.begin + runs.length, 1)
+    inside = np.cumsum(edges[:-1], dtype=np.int8) > 0
     rows = None if inside.all() else np.flatnonzero(inside)
     kept = stamps if rows is None else stamps[rows]
     # Modulo 2^32, so that the turn of the counter is a small step like any other, and a step back
@@ -286,14 +285,6 @@ def _plausible(
     if not keep:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(keep), np.concatenate(times)
-
-
-def _inside(runs: Runs, count: int) -> np.ndarray:
-    """Return a mask of the `count` frames that are in a run."""
-    edges = np.zeros(count + 1, np.int8)
-    edges[runs.begin] += 1
-    np.subtract.at(edges, runs.begin + runs.length, 1)
-    return np.cumsum(edges[:-1], dtype=np.int8) > 0
 
 
 def _goes_on(before: int, stamp: int) -> bool:
@@ -350,11 +341,6 @@ def add_predictions(
         case frames_of.INCREMENT:
             ahead = _iterations_ahead(head)
             _step(values, runs, lambda last, _: ahead[last.view(np.uint32) % ahead.size] + last)
-
-
-def _uses_motor(i: int, head: Header) -> bool:
-    """True if the numbers of a field are differences from the first motor's."""
-    return any(head.layouts[letter].predictors[i] == frames_of.MOTOR_0 for letter in "IP")
 
 
 def _add_up(values: np.ndarray, runs: Runs) -> None:

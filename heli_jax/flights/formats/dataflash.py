@@ -6,6 +6,7 @@ never lets it end, and it reads one message at a time.
 """
 
 import array
+import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,6 @@ import numpy as np
 from heli_jax.finding import note
 from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples, sharing_clocks
-from heli_jax.flights.progress import Digest
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
@@ -101,7 +101,6 @@ class _Table(NamedTuple):
     form: Format
     rows: np.ndarray
     units: Mapping[str, str]
-    descriptions: int
 
 
 def open_dataflash(path: Path) -> ChannelLog:
@@ -219,25 +218,31 @@ def make_log(
     for name in dict.fromkeys(p.form.name for p in parts):
         if name not in _OF_LOG:
             tables += _tables(name, [p for p in parts if p.form.name == name], units, scaled)
-    reference = _board_time(tables)
+    board = _board_time(tables)
     topics = []
     for table in tables:
-        of_message, lost = _topics(table, _clock(table, reference), scaled)
-        topics += of_message
-        damaged += lost
+        clock = _clock(table, board)
+        for called, rows in _by_instance(table).items():
+            kept = _in_order(clock, rows)
+            damaged += rows.size - kept.size
+            topics.append(_topic(called, table, kept, clock, scaled))
     require_samples(path, topics)
     notes = []
     if damaged:
         words = f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped"
         notes.append(note("damage.skipped", words, value=damaged))
+    # The firmware names itself when it begins to log; messages of the flight may quote anything.
+    said = alone["MSG"].rows
+    texts = map(_text, said["Message"][:50] if "Message" in (said.dtype.names or ()) else ())
+    settings = _pairs(alone["PARM"].rows, "Name", "Value")
     return ChannelLog(
         path=path,
         format="dataflash",
         size=len(data),
-        sha256=Digest(data).hex(),
+        sha256=hashlib.sha256(data).hexdigest(),
         topics=tuple(topics),
-        firmware=_firmware(alone["MSG"].rows),
-        parameters=_parameters(alone["PARM"].rows),
+        firmware=next((t for t in texts if t.startswith(("Ardu", "APM:", "Blimp", "Rover"))), ""),
+        parameters={name: value for name, value in settings.items() if isinstance(value, float)},
         notes=tuple(notes),
     )
 
@@ -258,11 +263,11 @@ def _tables(
                 break
         else:
             groups.append(([part], dict(said)))
-    return [
-        _Table(name if not i else f"{name}#{i + 1}", joined.form, joined.rows, said, len(group))
-        for i, (group, said) in enumerate(groups)
-        for joined in (_joined(group, scaled),)
-    ]
+    made = []
+    for i, (group, said) in enumerate(groups):
+        joined = _joined(group, scaled)
+        made.append(_Table(f"{name}#{i + 1}" if i else name, joined.form, joined.rows, said))
+    return made
 
 
 def _joined(parts: Sequence[Part], scaled: bool) -> Part:
@@ -315,27 +320,23 @@ def _multiplied(values: np.ndarray, factor: float | None) -> np.ndarray:
     return values / round(1.0 / factor) if factor < 1.0 else values * factor
 
 
-def _topics(table: _Table, clock: str, scaled: bool) -> tuple[list[Topic], int]:
-    """A message's topics, one for each instance where the log says which field counts them, and
-    how many messages are damaged by their times."""
-    tables = _by_instance(table)
-    kept = {name: _in_order(clock, rows) for name, rows in tables.items()}
-    lost = sum(tables[name].size - rows.size for name, rows in kept.items())
-    form, units = table.form, table.units
-    return [_topic(name, form, rows, units, clock, scaled) for name, rows in kept.items()], lost
-
-
 def _by_instance(table: _Table) -> dict[str, np.ndarray]:
+    """The rows of each instance, where the log says which field counts them."""
     instance = next((c for c, unit in table.units.items() if unit == "#"), None)
+    if instance is None:
+        return {table.name: table.rows}
+    numbers = table.rows[instance]
     # In text a count is read as any number is.
-    if instance is None or not _are_counts(table.rows[instance]):
+    whole = numbers.dtype.kind in "iu" or (
+        numbers.dtype.kind == "f"
+        and np.all(np.isfinite(numbers) & (np.abs(numbers) < 256.0))
+        and np.all(numbers == np.rint(numbers))
+    )
+    counts = np.unique(numbers).astype(np.int64) if whole else ()
+    # A name without an index is what the user of a single sensor expects.
+    if not len(counts) or (len(counts) == 1 and not counts[0]):
         return {table.name: table.rows}
-    counts = np.unique(table.rows[instance]).astype(np.int64)
-    # A vehicle with one sensor has instance 0 alone; a name without an index is what its user
-    # expects.
-    if len(counts) == 1 and not counts[0]:
-        return {table.name: table.rows}
-    return {f"{table.name}[{i}]": table.rows[table.rows[instance] == i] for i in counts}
+    return {f"{table.name}[{i}]": table.rows[numbers == i] for i in counts}
 
 
 def _in_order(clock: str, table: np.ndarray) -> np.ndarray:
@@ -386,24 +387,10 @@ def _clock(table: _Table, board: tuple[float, float] | None) -> str:
     return next(iter(sharing_clocks({c: table.rows[c] * _CLOCKS[c] for c in clocks}, board)), "")
 
 
-def _are_counts(values: np.ndarray) -> bool:
-    if values.dtype.kind in "iu":
-        return True
-    whole = values.dtype.kind == "f" and np.isfinite(values) & (np.abs(values) < 256.0)
-    return bool(np.all(whole)) and bool(np.all(values == np.rint(values)))
-
-
-def _topic(
-    name: str,
-    form: Format,
-    table: np.ndarray,
-    units: Mapping[str, str],
-    clock: str,
-    scaled: bool,
-) -> Topic:
-    columns, named = {}, {}
-    for column, kind in zip(form.columns, form.kinds, strict=True):
-        values, factor = table[column], FIELDS[kind][1]
+def _topic(name: str, table: _Table, rows: np.ndarray, clock: str, scaled: bool) -> Topic:
+    columns, named, units = {}, {}, table.units
+    for column, kind in zip(table.form.columns, table.form.kinds, strict=True):
+        values, factor = rows[column], FIELDS[kind][1]
         # Text is no signal: a mode that is written as its name cannot be an input or an output.
         if values.dtype.kind == "S":
             continue
@@ -414,7 +401,7 @@ def _topic(
             if units.get(column, "#") != "#":
                 named[f"{name}.{column}{end}"] = units[column]
     # Without a clock the rows have their order alone, which `clock` says by being empty.
-    times = table[clock] * _CLOCKS[clock] if clock else np.arange(len(table), dtype=np.float64)
+    times = rows[clock] * _CLOCKS[clock] if clock else np.arange(len(rows), dtype=np.float64)
     return Topic(name, times, columns, named, clock)
 
 
@@ -481,23 +468,6 @@ def _pairs(table: np.ndarray, key: str, value: str) -> dict[str, object]:
             continue
         pairs[mark] = _text(entry) if isinstance(entry, bytes) else float(entry)
     return pairs
-
-
-def _parameters(rows: np.ndarray) -> dict[str, str | int | float]:
-    return {
-        name: value
-        for name, value in _pairs(rows, "Name", "Value").items()
-        if isinstance(value, float)
-    }
-
-
-def _firmware(rows: np.ndarray) -> str:
-    """The first message that names an ArduPilot."""
-    if "Message" not in (rows.dtype.names or ()):
-        return ""
-    # The firmware names itself when it begins to log; messages of the flight may quote anything.
-    texts = [_text(text) for text in rows["Message"][:50]]
-    return next((t for t in texts if t.startswith(("Ardu", "APM:", "Blimp", "Rover"))), "")
 
 
 _FMT_PARTS = 5

@@ -1,4 +1,4 @@
-"""Which windows of a record say most of the free parameters, by Fisher's information.
+"""The windows of a record with most information on the free parameters, by Fisher's information.
 
 The record is cut into windows side by side, each with an initial state of its own, as multiple
 shooting does; with filter error a window is its part of the one filter. One Jacobian at the start

@@ -48,7 +48,7 @@ def outputs_explained(c: Context) -> Iterator[Finding]:
 
 
 def _advice(c: Context, output: OutputAdequacy) -> str:
-    """What to do about an output that is not explained: the most telling that is not done yet."""
+    """Advice on an output that is not explained: the most telling that is not followed yet."""
     problem, name = c.problem, output.output
     filtered = problem.noise_model == "disturbance"
     diverged = any(
@@ -89,7 +89,7 @@ def _why(output: OutputAdequacy, ahead: float | None) -> str:
 
 
 def simulation_as_expected(c: Context) -> Iterator[Finding]:
-    """What looks bad and is what the estimated disturbance makes."""
+    """Agreement that looks bad because of the estimated disturbance."""
     if not c.fitted or c.adequacy.by_chance:
         return
     if c.adequacy.ahead is not None:
@@ -129,8 +129,8 @@ def outputs_unmoved(c: Context) -> Iterator[Finding]:
 
 
 def responses_explained(c: Context) -> Iterator[Finding]:
-    """Whether fitted frequency responses are explained: by the squared errors over their variance,
-    which gusts do not change."""
+    """Fitted frequency responses that are not explained, by their squared errors over the
+    variance."""
     if c.responses is None or c.unrelated:
         return
     if c.responses.misfit:
@@ -155,7 +155,7 @@ WRONG_OPTIMUM = "search.wrong-optimum"
 
 
 def residual_follows_excitation(c: Context) -> Iterator[Finding]:
-    """Whether what is left of a record in frequency still follows what excites the vehicle."""
+    """Residuals in frequency that still follow the excitation."""
     if not c.fitted or c.unrelated:
         return
     level, failed = LEVEL / max(len(c.followed), 1), c.failed
@@ -181,8 +181,7 @@ def residual_follows_excitation(c: Context) -> Iterator[Finding]:
 
 
 def outputs_follow_excitation(c: Context) -> Iterator[Finding]:
-    """Whether any output follows what excites the vehicle: residuals that do not are no merit where
-    the outputs do not either."""
+    """Outputs that do not follow the excitation, so that their residuals do not either."""
     if not c.unrelated:
         return
     least = min(c.unrelated.values())
@@ -229,7 +228,7 @@ def held_out_predicted(c: Context) -> Iterator[Finding]:
 
 
 def _contradicted(flight: HeldOutFlight) -> Iterator[Finding]:
-    """What a flight held out of a fit in frequency says against the fit."""
+    """A flight held out of a fit in frequency that contradicts it."""
     label, furthest = flight.flight, flight.furthest
     if flight.worse:
         code = "held-out.worse-than-none"

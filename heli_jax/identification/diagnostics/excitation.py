@@ -85,7 +85,7 @@ def excited_bands(c: Context) -> Iterator[Finding]:
 
 
 def inputs_together(c: Context) -> Iterator[Finding]:
-    """Inputs that move together, so that their effects cannot be told apart."""
+    """Inputs that move together, so that their effects cannot be separated."""
     for names, coherence in () if _explained(c) else c.excitation.pairs:
         if coherence >= LIMITS.together:
             yield found(

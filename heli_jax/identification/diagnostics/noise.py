@@ -78,7 +78,7 @@ def _at_ends(c: Context) -> Iterator[Finding]:
 
 
 def noise_as_stated(c: Context) -> Iterator[Finding]:
-    """Whether residuals are as large as the stated noise."""
+    """Residuals that are larger or smaller than the stated noise."""
     for label, flight in c.flights if c.fitted else ():
         for name, stated in flight.sd.items():
             ratio = c.noise[f"{label}/{name}"] / stated

@@ -1,4 +1,4 @@
-"""Do samples show the dynamics, and do signals stand in the log when they acted?"""
+"""Findings on rates of samples, and on signals at another time than their log has them."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,7 +47,7 @@ def inputs_late(c: Context) -> Iterator[Finding]:
             return
     follow = {(one.flight, one.input) for one in c.feedback if one.present}
     for lead in leads(c.flights):
-        # Of an input that follows the response it is said that it may be late.
+        # The finding on feedback says that such an input may be late.
         if (lead.flight, lead.input) not in follow:
             yield found(
                 "timing.output-leads",

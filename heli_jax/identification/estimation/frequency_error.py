@@ -35,13 +35,15 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrumented_inputs,
 )
 from heli_jax.identification.estimation.frequency_lines import (
+    Driving,
     FlightFacts,
     Matrices,
     Record,
     Resolved,
-    Signals,
     alike,
     at_lines,
+    basis_of,
+    by_block,
     by_flight,
     by_real,
     cut_notes,
@@ -98,17 +100,12 @@ class FrequencyError(Objective):
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """A row for each unknown of interest, and one for what is left of the errors.
-
-        Args:
-            u: the unknowns, in the units of the model.
-        """
+        """A row for each unknown of interest, and one for what is left of the errors."""
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
         """Flights of other outputs, without a part in which every output is there, or without a
-        trim.
-        """
+        trim."""
         flights = problem.training
         refused = other_outputs(flights) or without_parts(flights) or absent_instrument(problem)
         return refused or cannot_linearise(problem)
@@ -150,10 +147,7 @@ class FrequencyError(Objective):
     def relax(
         self, layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
-        """The spectrum that the errors show, smoothed over frequency and flights.
-
-        Args:
-        """
+        """The spectrum that the errors show, smoothed over frequency and flights."""
         errors, machine = jax.device_get(errors_of_lines(layout, data, noise, z))
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
@@ -206,8 +200,7 @@ class FrequencyError(Objective):
         self, at: Solution, e: Evaluation, names: Sequence[str], ill: bool
     ) -> list[Finding]:
         """How much of flights with missing samples is used, where models were linearised, and what
-        there is not by instrument.
-        """
+        there is not by instrument."""
         return [
             *cut_notes(at.layout, at.data, names),
             *linearisation_notes(at, e),
@@ -215,12 +208,7 @@ class FrequencyError(Objective):
         ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: what disturbs them is in the noise.
-
-        Args:
-            reached: where the fit ended.
-            runs: how many records; one simulation serves them all.
-        """
+        """The simulated flights: what disturbs them is in the noise."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
@@ -274,7 +262,6 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
 
     Args:
         noise: with the whitening of each record, and whether instruments are used.
-        u: the unknowns, in the units of the model.
     """
     v = shared_of(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
@@ -339,7 +326,7 @@ def products_of_lines(
             ]
             return jax.tree.map(lambda *v: sum(v), *made)
 
-        direct = (machines.signals, slopes.signals)
+        direct = (machines.driving, slopes.driving)
         by = None if machines.by is None else (machines.by, slopes.by)
         each = (direct, by, measured(layout, data, members))
         common = (machines.matrices, slopes.matrices)
@@ -353,8 +340,8 @@ def _of_record(
     matrices: tuple[Matrices, Matrices],
     record: Record,
     by_instrument: Array,
-    direct: tuple[Signals, Signals],
-    by: tuple[Signals, Signals] | None,
+    direct: tuple[Driving, Driving],
+    by: tuple[Driving, Driving] | None,
     y: Float[Array, "f N p"],
 ) -> Products:
     """Of one record of a few flights, with a leading axis.
@@ -363,21 +350,22 @@ def _of_record(
         direct: what drives the machines, and its derivatives by the unknowns.
         by: the same by instrument.
     """
-    (m, dm), blocks = matrices, at.blocks
+    m, dm = matrices
     e = errors_of_some(at, m, record, direct[0], y)
 
-    def by_block(v: Array) -> Array:
+    def blocks(v: Array) -> Array:
         lines = at_lines(record, v.reshape(*v.shape[:2], -1))
-        return blocks.cut(lines.reshape(*lines.shape[:2], *v.shape[2:]), axis=1)
+        return by_block(lines.reshape(*lines.shape[:2], *v.shape[2:]), len(at.z), axis=1)
 
-    own = (e.rows, e.X, *jax.tree.map(by_block, (direct, by)))
+    own = (e.rows, e.X, *jax.tree.map(blocks, (direct, by)))
     # What passes a machine by, without its states, hangs on no unknown of most.
-    passes = any(v is not None for v in (dm.C, dm.D, direct[1].acting))
+    passes = any(v is not None for v in (dm.C, dm.D, direct[1].held))
 
     # Block by block: the derivatives at all lines would leave every cache.
-    def gram(b: Any) -> Float[Array, "f r c"]:
-        H, W = real(at.H[b]), real(at.W[b]) if passes else None
-        Q = at.basis(b)
+    def gram(of: Any) -> Float[Array, "f r c"]:
+        (z, W, H, ends), own = of
+        Q = basis_of(H, ends)
+        H, W = real(H), real(W) if passes else None
 
         def of_one(one: tuple[Array, Array, Any, Any]) -> Array:
             e, X, direct, by = one
@@ -394,7 +382,7 @@ def _of_record(
 
             def with_instruments() -> Array:
                 # The states are those of the inputs alone: such a record has no ends.
-                X = states(at, b, by_real(by[0].U, m.B.T)[None])[0]
+                X = states(at, z, by_real(by[0].U, m.B.T)[None])[0]
                 Z = _slopes(H, W, matrices, X, by)
                 return products(Z, J, Z)
 
@@ -403,10 +391,9 @@ def _of_record(
             # One program for both: the direct estimate is where the search begins.
             return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
 
-        return jax.lax.map(of_one, jax.tree.map(lambda v: v[b], own))
+        return jax.lax.map(of_one, own)
 
-    shape = jax.eval_shape(gram, 0)
-    G = blocks.over(lambda b, total: total + gram(b), jnp.zeros(shape.shape, shape.dtype))
+    G = jnp.sum(jax.lax.map(gram, ((at.z, at.W, at.H, at.ends), own)), axis=0)
     return jax.vmap(lambda one: projected(one, at.S))(G)
 
 
@@ -430,7 +417,7 @@ def _slopes(
     W: Float[Array, "k p2 p2"] | None,
     matrices: tuple[Matrices, Matrices],
     X: Complex[Array, "k n"],
-    driven: tuple[Signals, Signals],
+    driven: tuple[Driving, Driving],
 ) -> Float[Array, "s q"]:
     """The derivatives of the whitened response, real parts and imaginary ones.
 
@@ -440,7 +427,7 @@ def _slopes(
     """
     (m, dm), (lines, slopes) = matrices, driven
     driving = _moved(X, lines.U, (dm.Ad, dm.B), (m.B, slopes.U))
-    passing = _moved(X, lines.acting, (dm.C, dm.D), (m.D, slopes.acting))
+    passing = _moved(X, lines.held, (dm.C, dm.D), (m.D, slopes.held))
     pairs = ((H, driving), (W, passing))
     made = sum(M @ v for M, v in pairs if M is not None and v is not None)
     return made.reshape(-1, made.shape[-1])  # pyright: ignore
@@ -475,11 +462,7 @@ def _moved(
 
 def differentiated[T](make: Callable[[Array], T], v: Float[Array, " q"]) -> tuple[T, T]:
     """Arrays in tuples and their derivatives by v, a last axis; None in place of those that are
-    zero.
-
-    Args:
-        v: where.
-    """
+    zero."""
 
     moving: list[bool] = []
 

@@ -70,8 +70,7 @@ def instrumented_inputs(
     problem: Problem, flights: Sequence[Flight]
 ) -> tuple[dict[str, np.ndarray], ...] | None:
     """By flight and input what of it follows the instruments (N,), SI; the input itself where it
-    has none. None where no input has one.
-    """
+    has none. None where no input has one."""
     names = instruments_of(problem)
     if not names or any(n not in f.instruments for f in flights for n in names):
         return None
@@ -93,8 +92,7 @@ def following(
 def as_instruments_have_it(data: Data) -> Data:
     """The same flights as if nothing but the instruments moved them: inputs by instrument, and what
     of the outputs follows those. Of gusts and noise chance's part alone is in them, and nothing of
-    what feedback makes of both: to begin a search with.
-    """
+    what feedback makes of both: to begin a search with."""
     inputs = [naming.asdict(f.by_instrument) for f in data.flights]
     moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
     names = list(data.flights[0].outputs)

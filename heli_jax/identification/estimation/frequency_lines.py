@@ -156,7 +156,7 @@ def cut_notes(layout: Layout, data: Data, names: Sequence[str]) -> list[Finding]
 
 
 class Matrices(NamedTuple):
-    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
+    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D held[k]; n states, p measured outputs."""
 
     Ad: Float[Array, "... n n"]
     B: Float[Array, "... n r"]
@@ -164,20 +164,13 @@ class Matrices(NamedTuple):
     D: Float[Array, "... p m"]
 
 
-class Machine(NamedTuple):
-    """What turns gusts into outputs."""
-
-    Ad: Float[Array, "n n"]
-    C: Float[Array, "p n"]
-
-
-class Signals(NamedTuple):
+class Driving(NamedTuple):
     """What drives a machine, in time or at the lines."""
 
     U: Array
     """what B multiplies, (N, r)"""
-    acting: Array
-    """the inputs that act at the samples, (N, m)"""
+    held: Array
+    """the inputs that act at the samples, (N, m): what D multiplies"""
 
 
 class Machines(NamedTuple):
@@ -185,9 +178,9 @@ class Machines(NamedTuple):
 
     matrices: Matrices
     """of all of them, or with a leading axis where parameters are known of each flight"""
-    signals: Signals
+    driving: Driving
     """with a leading axis"""
-    by: Signals | None
+    by: Driving | None
     """likewise with the inputs by instrument; None without"""
 
 
@@ -205,11 +198,7 @@ def alike(layout: Layout, data: Data) -> list[list[int]]:
 
 
 def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> Machines:
-    """Those of one group.
-
-    Args:
-        u: the unknowns, in the units of the model.
-    """
+    """Those of one group."""
     first = members[0]
     own = [(data.flights[i], u.states[i], u.offsets[i]) for i in members]
 
@@ -219,12 +208,12 @@ def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> 
         here = u._replace(
             states=_with(u.states, first, state), offsets=_with(u.offsets, first, offset)
         )
-        matrices, signals = _machine(layout, data, here, (first, flight))
+        matrices, driving = _machine(layout, data, here, (first, flight))
         if flight.by_instrument is None:
-            return Machines(matrices, signals, None)
+            return Machines(matrices, driving, None)
         # A point to linearise about knows means alone, which inputs by instrument have as well.
         by = flight._replace(inputs=flight.by_instrument)
-        return Machines(matrices, signals, _machine(layout, data, here, (first, by))[1])
+        return Machines(matrices, driving, _machine(layout, data, here, (first, by))[1])
 
     axes = Machines(None if _one_machine(data, members) else 0, 0, 0)  # pyright: ignore
     return jax.vmap(of_one, out_axes=axes)(*jax.tree.map(lambda *v: jnp.stack(v), *own))
@@ -240,7 +229,7 @@ def _one_machine(data: Data, members: list[int]) -> bool:
 
 def _machine(
     layout: Layout, data: Data, u: Unknowns, of: tuple[int, Any]
-) -> tuple[Matrices, Signals]:
+) -> tuple[Matrices, Driving]:
     i, flight = of
     data = data._replace(flights=_with(data.flights, i, flight))
     condition = layout.flight_facts[i].condition if layout.flight_facts else None
@@ -249,7 +238,7 @@ def _machine(
     Ad, B, U, acting = held_columns(model, drive.params, inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)
+    return Matrices(Ad, B, C[rows], D[rows]), Driving(U, acting)
 
 
 def by_flight(
@@ -267,7 +256,6 @@ def by_flight(
         prepared: what of it is the same for flights that have one machine.
         body: of a few flights, which have a leading axis in what it is given and what it returns.
         common: of the machine; with a leading axis where each flight has its own.
-        together: flights of one machine side by side at most.
     """
     count = len(members)
     one_machine = _one_machine(data, members)
@@ -283,14 +271,13 @@ def by_flight(
     return jax.tree.map(lambda v: v.reshape(count, *v.shape[2:]), made)
 
 
-def first_machine(m: Matrices) -> Machine:
-    """That of the first flight of a group: records of one length share a spectrum.
+def first_machine(m: Matrices) -> Matrices:
+    """The spectrum of the first flight of a group: records of one length share it.
 
     Args:
         m: of all of them, or with a leading axis.
     """
-    Ad, C = (v[0] if v.ndim == 3 else v for v in (m.Ad, m.C))
-    return Machine(Ad, C)
+    return jax.tree.map(lambda v: v[0] if m.Ad.ndim == 3 else v, m)
 
 
 def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
@@ -311,11 +298,7 @@ def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f 
 
 
 def shared_of(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
-    """Parameters, gains and the time shift: all but initial states, biases and offsets.
-
-    Args:
-        u: the unknowns, in the units of the model.
-    """
+    """Parameters, gains and the time shift: all but initial states, biases and offsets."""
     params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
     shift = [] if u.shift is None else [u.shift]
     return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
@@ -344,44 +327,6 @@ _NUMBERS = 20_000
 record of a small machine, whose blocks would take longer to begin than to go through"""
 
 
-class Blocks(NamedTuple):
-    """Those of a record; the last one is filled up."""
-
-    lines: int
-    """of the record"""
-    count: int
-    size: int
-
-    def cut(self, v: Array, axis: int = 0) -> Array:
-        """An array with an axis of lines, the blocks as its first axis; padded with zeros."""
-        widths = [(0, 0)] * v.ndim
-        widths[axis] = (0, self.count * self.size - self.lines)
-        v = jnp.pad(v, widths)
-        v = v.reshape(*v.shape[:axis], self.count, self.size, *v.shape[axis + 1 :])
-        return jnp.moveaxis(v, axis, 0)
-
-    def joined(self, v: Array, axis: int = 0) -> Array:
-        """The inverse of `cut`."""
-        v = jnp.moveaxis(v, 0, axis)
-        v = v.reshape(*v.shape[:axis], self.count * self.size, *v.shape[axis + 2 :])
-        return jax.lax.slice_in_dim(v, 0, self.lines, axis=axis)
-
-    def within(self, b: Array | int) -> Array:
-        """(size,) True for the lines of a block that are the record's."""
-        return b * self.size + jnp.arange(self.size) < self.lines
-
-    def over(self, step: Callable[[Any, Any], Any], first: Any) -> Any:
-        """`step(b, so far)` for one block after another."""
-        return step(0, first) if self.count == 1 else jax.lax.fori_loop(0, self.count, step, first)
-
-
-def blocks_of(record: Record, numbers: int) -> Blocks:
-    """Those of a record."""
-    K = record.lines
-    count = -(-K * numbers // _NUMBERS)
-    return Blocks(K, count, -(-K // count))
-
-
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
 _ROUNDING = 1e-12
@@ -396,13 +341,12 @@ _SPARED = 0.1
 class Resolved(NamedTuple):
     """What a machine does at the lines of a record, by block (b, ...); without a derivative."""
 
-    blocks: Blocks
     z: Complex[Array, "b k"]
     T: Complex[Array, "n n"]
     """Ad = V T V^H, triangular"""
     V: Complex[Array, "n n"]
     W: Complex[Array, "b k p p"]
-    """the whitening; zero beyond the lines that are used"""
+    """the whitening; zero beyond the record's lines"""
     H: Complex[Array, "b k p n"]
     """W C (zI - Ad)^-1"""
     ends: Complex[Array, "b k e"]
@@ -412,70 +356,70 @@ class Resolved(NamedTuple):
     """a basis of what the ends may add to whitened rows, times this, is orthonormal: columns are
     zero where a state leaves no trace"""
 
-    def basis(self, b: Array | int) -> Float[Array, "s m"]:
-        """What the ends' states, and behind these the gusts', add to the rows of a block."""
-        # Together with what takes a block out of all of them the products would be several times
-        # slower.
-        return _basis(*jax.lax.optimization_barrier((self.H[b], self.ends[b])))
-
 
 class Errors(NamedTuple):
     """Of one record of each of a few flights, with what they came of; the first two by block."""
 
     rows: Float[Array, "b f s"]
-    """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines
-    that are used"""
+    """measured less simulated, whitened, the ends of the record taken off; zero beyond the lines"""
     X: Complex[Array, "b f k n"]
-    """the states; zero beyond the blocks that are used"""
+    """the states"""
     beyond: Complex[Array, "f K p"]
     """measured less what the inputs add to the outputs past the states"""
 
 
+def by_block(v: Array, count: int, axis: int = 0) -> Array:
+    """An array with an axis of lines cut into blocks, its first axis; the last is filled up with
+    zeros."""
+    lines = v.shape[axis]
+    size, widths = -(-lines // count), [(0, 0)] * v.ndim
+    widths[axis] = (0, count * size - lines)
+    v = jnp.pad(v, widths)
+    return jnp.moveaxis(v.reshape(*v.shape[:axis], count, size, *v.shape[axis + 1 :]), axis, 0)
+
+
 def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
     """A machine at the lines of a record."""
-    blocks = blocks_of(record, m.C.size)
+    (p, n), K = m.C.shape, record.lines
+    W = by_block(whitening, -(-K * m.C.size // _NUMBERS))
+    count, size = W.shape[:2]
     # Beyond the last line those that would follow it, so that nothing is singular there.
-    k = np.arange(1, blocks.count * blocks.size + 1).reshape(blocks.count, blocks.size)
-    z = np.exp(2j * np.pi * k / (record.samples + 2 * blocks.size))
-    z[k <= record.lines] = np.exp(2j * np.pi * k[k <= record.lines] / record.samples)
+    k = np.arange(1, count * size + 1).reshape(count, size)
+    z = np.exp(2j * np.pi * k / (record.samples + 2 * size))
+    z[k <= K] = np.exp(2j * np.pi * k[k <= K] / record.samples)
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
     # A gust that ends elsewhere than it began has its leap at all lines: taken for noise of each
     # line by itself it moves slow modes by several standard deviations. Above its corner it is an
     # integrated push. Over the length, so that it is no larger than the states' own ends.
     ends = np.stack([z, z / (z - 1.0) / record.samples], axis=2)
-    (p, n), K = m.C.shape, record.lines
     if 2 * n > _SPARED * 2 * p * K:
         ends = ends[:, :, :1]
-    z, ends, W = jnp.asarray(z), jnp.asarray(ends), blocks.cut(whitening)
+    z, ends = jnp.asarray(z), jnp.asarray(ends)
     T, V = _triangle(m.Ad)
     C, back = m.C.astype(z.dtype) @ V, jnp.conj(V.T)
 
-    def more(b: Any, made: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        white, H, gram = made
-        W_b = W[b] * blocks.within(b)[:, None, None].astype(z.dtype)
-        H_b = W_b @ (_solved(z[b], T, C[None], left=False) @ back)
-        basis = _basis(*jax.lax.optimization_barrier((H_b, ends[b])))
-        return white.at[b].set(W_b), H.at[b].set(H_b), gram + basis.T @ basis
+    def of_block(of: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        z, ends, W = of
+        H = W @ (_solved(z, T, C[None], left=False) @ back)
+        basis = basis_of(H, ends)
+        return H, basis.T @ basis
 
-    m_ends = n * ends.shape[2]
-    nothing = (
-        jnp.zeros_like(W),
-        jnp.zeros((*z.shape, p, n), z.dtype),
-        jnp.zeros((m_ends, m_ends), m.Ad.dtype),
-    )
-    W, H, gram = blocks.over(more, nothing)
-    return Resolved(blocks, z, T, V, W, H, ends, orthonormal(gram))
+    H, grams = jax.lax.map(of_block, (z, ends, W))
+    return Resolved(z, T, V, W.astype(z.dtype), H, ends, orthonormal(jnp.sum(grams, axis=0)))
 
 
-def _basis(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Array, "s m"]:
+def basis_of(H: Complex[Array, "k p n"], ends: Complex[Array, "k e"]) -> Float[Array, "s m"]:
+    """What the ends' states, and behind these the gusts', add to the rows of a block."""
+    # Together with what takes a block out of all of them the products would be several times
+    # slower.
+    H, ends = jax.lax.optimization_barrier((H, ends))
     made = stacked(H[:, :, None, :] * ends[:, None, :, None])
     return made.reshape(2 * H.shape[0] * H.shape[1], -1)
 
 
 def orthonormal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """S with S^T G S the identity, but for directions without effect, which are zero: for columns
-    with the products G, those times S are orthonormal.
-    """
+    with the products G, those times S are orthonormal."""
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(gram), 0.0))
     # A state that no output shows has a column of rounding: that would make some direction of it,
     # another at each step, and what is taken off by it makes the sum of squares rough.
@@ -536,52 +480,46 @@ def errors_of_some(
     at: Resolved,
     m: Matrices,
     record: Record,
-    signals: Signals,
+    acting: Driving,
     y: Float[Array, "f N p"],
 ) -> Errors:
     """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
-        signals: over the whole flights.
+        acting: over the whole flights.
     """
-    blocks, f = at.blocks, y.shape[0]
+    f, count = y.shape[0], len(at.z)
     # In time, where these numbers are real ones and half as many.
-    beyond = at_lines(record, y - signals.acting @ m.D.T)
-    inputs, left = (blocks.cut(v, axis=1) for v in (at_lines(record, signals.U), beyond))
+    beyond = at_lines(record, y - acting.held @ m.D.T)
+    inputs, left = (by_block(v, count, axis=1) for v in (at_lines(record, acting.U), beyond))
 
-    def unprojected(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
-        white, along = made
-        e = _times(at.W[b], left[b]) - _times(at.H[b], by_real(inputs[b], m.B.T))
+    def unprojected(of: Any) -> tuple[Array, Array]:
+        W, H, ends, inputs, left = of
+        e = _times(W, left) - _times(H, by_real(inputs, m.B.T))
         e = jnp.stack([jnp.real(e), jnp.imag(e)], axis=2).reshape(f, -1)
-        return white.at[b].set(e), along + e @ at.basis(b)
+        return e, e @ basis_of(H, ends)
 
-    size, m_ends, real_type = 2 * at.H.shape[1] * at.H.shape[2], len(at.S), m.Ad.dtype
-    nothing = (
-        jnp.zeros((blocks.count, f, size), real_type),
-        jnp.zeros((f, m_ends), real_type),
-    )
-    white, along = blocks.over(unprojected, nothing)
+    white, along = jax.lax.map(unprojected, (at.W, at.H, at.ends, inputs, left))
     # The ends' states of each flight, by linear least squares.
-    d = (along @ at.S) @ at.S.T
+    d = (jnp.sum(along, axis=0) @ at.S) @ at.S.T
     of_ends = d.reshape(f, at.ends.shape[2], -1).astype(at.z.dtype)
 
-    def without_ends(b: Any, made: tuple[Array, Array]) -> tuple[Array, Array]:
-        rows, X = made
-        driven = by_real(inputs[b], m.B.T) + at.ends[b][None] @ of_ends
-        return rows.at[b].add(-(d @ at.basis(b).T)), X.at[b].set(states(at, b, driven))
+    def without_ends(of: Any) -> tuple[Array, Array]:
+        white, z, H, ends, inputs = of
+        driving = by_real(inputs, m.B.T) + ends[None] @ of_ends
+        return white - d @ basis_of(H, ends).T, states(at, z, driving)
 
-    X = jnp.zeros((*inputs.shape[:-1], len(m.Ad)), at.z.dtype)
-    rows, X = blocks.over(without_ends, (white, X))
+    rows, X = jax.lax.map(without_ends, (white, at.z, at.H, at.ends, inputs))
     return Errors(rows, X, beyond)
 
 
 def states(
-    at: Resolved, b: Array | int, driving: Complex[Array, "f k n"]
+    at: Resolved, z: Complex[Array, " k"], driving: Complex[Array, "f k n"]
 ) -> Complex[Array, "f k n"]:
-    """(zI - Ad)^-1 of what drives them."""
+    """(zI - Ad)^-1 of what drives them, at the lines of one block."""
     # Flights are columns of the same substitutions.
     seen = jnp.moveaxis(driving @ jnp.conj(at.V), 0, 2)
-    return jnp.moveaxis(_solved(at.z[b], at.T, seen, left=True), 2, 0) @ at.V.T
+    return jnp.moveaxis(_solved(z, at.T, seen, left=True), 2, 0) @ at.V.T
 
 
 def _solved(z: Complex[Array, " k"], T: Array, b: Array, *, left: bool) -> Array:
@@ -626,7 +564,7 @@ class LineErrors(NamedTuple):
 
     errors: list[Complex[Array, "K p"]]
     """by record, its ends taken off, not whitened"""
-    machine: Machine
+    machine: Matrices
     """of the first flight"""
 
 
@@ -646,11 +584,12 @@ def errors_of_lines(layout: Layout, data: Data, noise: Noise, z: Float[Array, " 
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 e = errors_of_some(at, m, record, *some)
-                made.append(e.beyond - by_real(at.blocks.joined(e.X, axis=1), m.C.T))
+                X = jnp.moveaxis(e.X, 0, 1).reshape(len(e.beyond), -1, len(m.Ad))
+                made.append(e.beyond - by_real(X[:, : record.lines], m.C.T))
             return made
 
         first = first_machine(machines.matrices) if first is None else first
-        each = (machines.signals, y)
+        each = (machines.driving, y)
         made = by_flight(data, members, ready, of_some, machines.matrices, each)
         for k, i in enumerate(members):
             errors[i] = [left[k] for left in made]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.frequency_lines import (
-    Machine,
+    Matrices,
     alike,
     first_machine,
     lines_of,
@@ -96,8 +96,7 @@ def whitening_alone(
     """
 
     def own(S: np.ndarray) -> np.ndarray:
-        roots = _positive(np.real(np.einsum("kii->ki", S))) ** -0.5
-        return roots[:, :, None] * np.eye(S.shape[1], dtype=complex)
+        return inverse_roots(S * np.eye(S.shape[1]))
 
     # The records of a bootstrap may have other outputs.
     made = {}
@@ -173,26 +172,7 @@ def inverse_roots(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p
     Raises:
         numpy.linalg.LinAlgError: one is not positive definite.
     """
-    # Written out over the lines: for each matrix a routine would be called that takes longer to
-    # call.
-    p, at = S.shape[1], np.ascontiguousarray(S.transpose(1, 2, 0))
-    L, W = np.zeros_like(at), np.zeros_like(at)
-    for i in range(p):
-        left = np.real(at[i, i])
-        for j in range(i):
-            inner = sum((L[i, m] * np.conj(L[j, m]) for m in range(j)), start=0.0)
-            L[i, j] = np.real(W[j, j]) * (at[i, j] - inner)
-            left = left - np.real(L[i, j]) ** 2 - np.imag(L[i, j]) ** 2
-        W[i, i] = root = _positive(left) ** -0.5
-        for j in range(i):
-            W[i, j] = -root * sum((L[i, m] * W[m, j] for m in range(j, i)), start=0.0)
-    return np.ascontiguousarray(W.transpose(2, 0, 1))
-
-
-def _positive(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    if not (values > 0).all():
-        raise np.linalg.LinAlgError("a spectrum is not positive definite")
-    return values
+    return np.linalg.inv(np.linalg.cholesky(S))
 
 
 def log_determinants(W: Complex[np.ndarray, "K p p"]) -> Float[np.ndarray, " K"]:
@@ -237,14 +217,14 @@ _UNSEEN = 1e-20
 
 
 @eqx.filter_jit
-def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
+def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Matrices:
     """That of the first flight: records of one length share a spectrum."""
     members = alike(layout, data)[0]
     return first_machine(machines_of(layout, data, unpack(layout, data, z), members).matrices)
 
 
 def whitening_by(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
+    machine: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]]
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record what makes its errors white; of records of one length the same array."""
     counts = Counter(len(e) for e in errors)
@@ -263,7 +243,7 @@ def whitening_by(
 
 
 def _prewhitening(
-    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
+    machine: Matrices, errors: Sequence[Complex[np.ndarray, "K p"]], lengths: list[int]
 ) -> dict[int, Complex[np.ndarray, "K p p"]]:
     """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
     Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
@@ -331,11 +311,7 @@ def _powers_of_gusts(
     power: Complex[np.ndarray, "c p p"],
     lines: Float[np.ndarray, " c"],
 ) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
-    """Powers of gusts, by state and shape, and of the outputs' own white noise.
-
-    Args:
-        shapes: spectra that a gust's is a sum of; the first is white.
-    """
+    """Powers of gusts, by state and shape, and of the outputs' own white noise."""
     own, gains = (np.real(np.einsum("...ii->...i", v)) for v in (power, ways))
     gains = np.swapaxes(gains, 1, 2)
     # To begin with as much as the output that shows least of a state leaves room for.

@@ -37,8 +37,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.frequency_lines import (
+    Driving,
     Matrices,
-    Signals,
     alike,
     by_flight,
     machines_of,
@@ -111,23 +111,23 @@ def resolved(m: Matrices, samples: int) -> Resolved:
 
 
 def bounded_outputs(
-    m: Matrices, signals: Signals, at: Resolved, ends: Float[Array, " n"] | None
+    m: Matrices, driving: Driving, at: Resolved, ends: Float[Array, " n"] | None
 ) -> Float[Array, "p N"]:
     """The outputs over a record by the bounded solution.
 
     Args:
         ends: of the states, factors of `Resolved.ends`; zero unless given.
     """
-    z, turns = _lines(len(signals.U))
-    driving = _at_lines(signals.U, turns) @ m.B.T.astype(z.dtype)
+    z, turns = _lines(len(driving.U))
+    U = _at_lines(driving.U, turns) @ m.B.T.astype(z.dtype)
     if ends is not None:
-        driving = driving + z[:, None] * ends.astype(z.dtype)[None]
-    # Products in place of the derivative of an inverse: dY = H (dAd X + d driving) + dC X. What is
+        U = U + z[:, None] * ends.astype(z.dtype)[None]
+    # Products in place of the derivative of an inverse: dY = H (dAd X + dU) + dC X. What is
     # subtracted here is zero but for its derivative.
-    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", at.R, driving))
+    X = jax.lax.stop_gradient(jnp.einsum("kij,kj->ki", at.R, U))
     dA, dC = ((v - jax.lax.stop_gradient(v)).astype(z.dtype) for v in (m.Ad, m.C))
-    lines = jnp.einsum("kpn,kn->pk", at.H, driving + X @ dA.T) + dC @ X.T
-    return _in_time(lines, turns) + m.D @ signals.acting.T
+    lines = jnp.einsum("kpn,kn->pk", at.H, U + X @ dA.T) + dC @ X.T
+    return _in_time(lines, turns) + m.D @ driving.held.T
 
 
 def _lines(N: int) -> tuple[np.ndarray, np.ndarray]:
@@ -231,13 +231,13 @@ def _by_flight(
     def of_some(of: tuple[Matrices, Resolved, Array], some: Any) -> Any:
         m, at, effects = of
 
-        def of_one(signals: Signals, measured: _Measured, ends: Any) -> Any:
-            left = measured.y[group.outputs] - bounded_outputs(m, signals, at, ends)
+        def of_one(driving: Driving, measured: _Measured, ends: Any) -> Any:
+            left = measured.y[group.outputs] - bounded_outputs(m, driving, at, ends)
             return body(windows(left), effects, measured)
 
         return jax.vmap(of_one)(*some)
 
-    each = (machines.signals, _measured(data, w, group.members), ends)
+    each = (machines.driving, _measured(data, w, group.members), ends)
     # One at a time: what is made of a flight's windows for each unknown fills the caches.
     return by_flight(data, group.members, ready, of_some, machines.matrices, each, together=1)
 
@@ -265,11 +265,7 @@ def _whitened(weights: ResponseWeights, S: Complex[Array, "k p m c"]) -> Float[A
 def rows_of_responses(
     layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
 ) -> Float[Array, " r"]:
-    """Whitened errors of all responses, without what the ends of the records may add.
-
-    Args:
-        u: the unknowns, in the units of the model.
-    """
+    """Whitened errors of all responses, without what the ends of the records may add."""
     rest, groups = jax.lax.stop_gradient(u), _groups(layout, data, weights)
 
     def sums(v: Array, ends: Sequence[Array | None], body: Callable[..., Any]) -> list[Any]:
@@ -357,11 +353,7 @@ class FrequencyResponse(Objective):
         return untagged(count)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The whitened errors of all responses, real and imaginary parts.
-
-        Args:
-            u: the unknowns, in the units of the model.
-        """
+        """The whitened errors of all responses, real and imaginary parts."""
         return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
@@ -415,12 +407,7 @@ class FrequencyResponse(Objective):
         return int(noise.whitening.numbers_of_noise) + layout.determined
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: what disturbs them is in the noise.
-
-        Args:
-            reached: where the fit ended.
-            runs: how many records; one simulation serves them all.
-        """
+        """The simulated flights: what disturbs them is in the noise."""
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
     def errors_in_windows(

@@ -352,7 +352,6 @@ def optimise_many(
     Args:
         reached: that optimum; its Jacobian gives the units of all runs.
         data: makes the numbers of one run out of its slice of `each`.
-        k: how many.
         each: what differs between the runs, a pytree of arrays (k, ...).
         say: called with a sentence where many runs are no programs of machine code.
     """

@@ -204,8 +204,7 @@ def named_values(
 
 def table(layout: Layout, data: Data, runs: list[Run], chosen: Run) -> tuple[StartRow, ...]:
     """Start, end and cost of every run: the chosen one first, then by reason, best first; equal
-    optima of one reason share a number.
-    """
+    optima of one reason share a number."""
     reasons = list(dict.fromkeys(run.reason for run in runs))
     rows, optimum, last = [], 0, None
     for run in sorted(runs, key=lambda run: (reasons.index(run.reason), rank(run.optimum))):

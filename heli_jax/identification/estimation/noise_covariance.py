@@ -23,8 +23,8 @@ _ROUNDS = 30
 """of the optimiser at most: in slow gusts a spectrum settles by a fifth a round"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
-_SETTLED = 1e-4
-"""move of the optimum, in squared joint standard deviations, below which it has ended as well"""
+_SETTLED = 0.01
+"""way that the optimum has still to go, in joint standard deviations, below which it has ended"""
 
 
 class RelaxedOptimum(NamedTuple):
@@ -84,7 +84,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """
     layout, objective = search.layout, search.layout.objective
     trace = [(int(best.steps), float(best.cost))]
-    moved, notes = np.inf, ()
+    moved, left, notes = np.inf, np.inf, ()
     for _ in range(_ROUNDS):
         z, new = objective.relax(layout, search.data, noise, best.z)
         change = _changed(noise, new)
@@ -97,17 +97,16 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where one stays so does the other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or moved < _SETTLED or not (moves and bool(best.converged)):
+        if change < _UNCHANGED or left < _SETTLED or not (moves and bool(best.converged)):
             break
         [best] = search.run(noise, _without_nuisances(layout, best.z)[None])
         trace.append((int(best.steps), float(best.cost)))
-        moved = float(best.moved)
+        before, moved = moved, float(best.moved) ** 0.5
+        # Moves that shrink by about the same factor are a geometric series.
+        rest = moved / (before - moved) if moved < before else 1.0
+        left = moved * min(rest, 1.0) if np.isfinite(before) else moved
     else:
-        notes = (
-            found(
-                "search.noise-not-settled", value=moved**0.5, rounds=_ROUNDS, limit=_SETTLED**0.5
-            ),
-        )
+        notes = (found("search.noise-not-settled", value=moved, rounds=_ROUNDS, limit=_SETTLED),)
     best = best._replace(z=objective.finish(layout, search.data, noise, best.z))
     return RelaxedOptimum(best, noise, tuple(trace), notes=notes)
 
@@ -133,11 +132,7 @@ def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[np.ndarra
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:
-    """The optimum that a search from z leads to, its noise relaxed from `noise`.
-
-    Args:
-        z: where to begin.
-    """
+    """The optimum that a search from z leads to, its noise relaxed from `noise`."""
     [best] = search.run(noise, z[None, :])
     return relax_noise_covariance(search, noise, best)
 
@@ -201,11 +196,7 @@ def gain_left(
 def unless_stuck(
     layout: Layout, optimum: RelaxedOptimum, e: Evaluation, free: Mapping[str, Free]
 ) -> RelaxedOptimum:
-    """The optimum, no longer taken for one where its own slopes say that it is none.
-
-    Args:
-        optimum: where the search ended.
-    """
+    """The optimum, no longer taken for one where its own slopes say that it is none."""
     # A filter's rows hold the level of its variances too, and have no squares to take a share of.
     if not (bool(optimum.best.converged) and layout.noise_model == "white"):
         return optimum

@@ -24,11 +24,7 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknown
 
 
 def free_scales(model_scales: tuple[str, ...], free: Container[str]) -> tuple[str, ...]:
-    """Return those of a model's `input_scales` that are estimated.
-
-    Args:
-        model_scales: `Model.input_scales`.
-    """
+    """Return those of a model's `input_scales` that are estimated."""
     return tuple(n for n in model_scales if n in free)
 
 
@@ -37,7 +33,6 @@ def not_attenuating(layout: Layout, noise: Noise, u: Unknowns) -> Array | float:
 
     Args:
         noise: with the derivatives of the last relaxation; none yet: zero.
-        u: the unknowns, in the units of the model.
     """
     names = free_scales(layout.model.input_scales, u.params)
     if not names or not len(noise.scale_slopes):
@@ -50,7 +45,6 @@ def slopes_at(layout: Layout, noise: Noise, e: Evaluation, last: int) -> Any:
 
     Args:
         noise: that `e` was evaluated with.
-        e: anywhere.
         last: which row it is whose square is that sum, but for a constant and what is taken off.
     """
     names = free_scales(layout.model.input_scales, layout.of_interest)
@@ -94,8 +88,7 @@ _TOLD = 0.1
 
 def with_own_noise(problem: Problem, noise: Noise) -> Noise:
     """The noise with no derivative yet by each parameter of the model's own process noise that is
-    unknown: of models whose inputs are sensors, all of whose noise is such.
-    """
+    unknown: of models whose inputs are sensors, all of whose noise is such."""
     names = _own(problem) if problem.model.input_scales else ()
     if not names:
         return noise
@@ -128,11 +121,7 @@ def _own(problem: Problem) -> tuple[str, ...]:
 
 
 def taken_up(noise: Noise, u: Unknowns) -> Array | float:
-    """Return the term log det J'J of minus twice the restricted log-likelihood, to first order.
-
-    Args:
-        u: the unknowns, in the units of the model.
-    """
+    """Return the term log det J'J of minus twice the restricted log-likelihood, to first order."""
     if not noise.own:
         return 0.0
     return sum(at[0] * (jnp.log(u.params[n]) - at[1]) for n, at in noise.own.items())

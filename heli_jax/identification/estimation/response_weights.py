@@ -80,30 +80,22 @@ class Averages(NamedTuple):
 
 def averages(w: Windowed) -> Averages:
     """Of flights in windows."""
-    p, m, k = len(w.outputs), len(w.inputs), len(w.numbers)
-    P, share, V = [], [], np.zeros((p, p, k, m, m), complex)
     turns = np.outer(w.lines, np.arange(w.length)) / w.length
     g = hann(w.length) * np.exp(-2j * np.pi * turns)
     g = g - np.mean(g, axis=1, keepdims=True)
-    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, k))]
+    near = [_correlations(g, d, w.step) for d in range(min(_NEIGHBOURS + 1, len(g)))]
     # Most outputs miss samples in the same windows, or nowhere: each case once.
-    inverses: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-    spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
-    keys = [w.seen[:, j].tobytes() for j in range(p)]
-    for i, first in enumerate(keys):
-        seen = w.seen[:, i]
-        for j, second in enumerate(keys):
-            if (first, second) not in spreads:
-                spreads[first, second] = _spread(w, seen, w.seen[:, j], near[0])
-            V[i, j] = spreads[first, second]
-        if first not in inverses:
-            S = _cross(seen, w.Z, w.U)
-            z, u = (_cross(seen, v, v) for v in (w.Z, w.U))
-            of_case = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
-            inverses[first] = of_case, _share(w, seen, np.nan_to_num(of_case), near)
-        P.append(inverses[first][0])
-        share.append(inverses[first][1])
-    return Averages(np.stack(P), V, np.stack(share), np.real(near[0][0]))
+    cases, case = np.unique(w.seen, axis=1, return_inverse=True)
+    masks, case = cases.T, case.reshape(-1)
+    V = np.array([[_spread(w, a, b, near[0]) for b in masks] for a in masks])
+    P, share = [], []
+    for seen in masks:
+        S = _cross(seen, w.Z, w.U)
+        z, u = (np.real(np.einsum("kaa->ka", _cross(seen, v, v))) for v in (w.Z, w.U))
+        P.append(inverse(S, z, u))
+        share.append(_share(w, seen, np.nan_to_num(P[-1]), near))
+    power = np.real(near[0][0])
+    return Averages(np.stack(P)[case], V[case][:, case], np.stack(share)[case], power)
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -275,8 +267,7 @@ def whitening(
     at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
 ) -> Complex[np.ndarray, "k r r"]:
     """What makes rows of variance 1 of the errors of the responses that are used, independent of
-    one another at a line; the rows of the others are zero. r = p m.
-    """
+    one another at a line; the rows of the others are zero. r = p m."""
     k, p, m = used.shape
     taken = used.reshape(k, -1)
     C = covariance(at, S).reshape(k, p * m, p * m)

@@ -87,9 +87,6 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
 
     Outputs of one sample are taken one after another, as in `kalman.innovations`: the error of each
     is what the samples before and the outputs before it leave.
-
-    Args:
-        records: m of them, no sample missing.
     """
     N, m, p = records.y.shape
     n, count = records.x0.shape[1], -(-N // _CHUNK)
@@ -174,8 +171,6 @@ def riccati(Ad: Array, C: Array, Q: Array, R: Array, P: Array) -> tuple[Array, _
     """The covariance of the state one sample on, and how the sample between is used.
 
     Args:
-        Ad: (n, n).
-        C: (p, n).
         Q: (n, n), covariance that the step adds.
         R: (p,), variances of the measurement noise.
         P: (n, n), covariance of the state predicted for the sample.
@@ -227,9 +222,7 @@ def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
     """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all of them.
 
     Args:
-        F: (n, n).
         forcing: (K, m, n), of m records.
-        x0: (m, n).
     """
     return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
@@ -246,12 +239,7 @@ def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
 def innovations_together(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, group: tuple[int, ...]
 ) -> list[Innovations]:
-    """The innovations of flights that share their covariances, flight after flight.
-
-    Args:
-        u: the unknowns, in the units of the model.
-        group: the numbers of the flights, one of `Layout.one_covariance`.
-    """
+    """The innovations of flights that share their covariances, flight after flight."""
     names = layout.outputs[group[0]]
     measured = [{n: data.flights[i].outputs[n] - u.biases[i][n] for n in names} for i in group]
     drives = [driven(layout, data, u, i) for i in group]

@@ -260,7 +260,6 @@ def measurement_sd(u: Unknowns, output: str, sd: Array) -> Array:
     """The sd of an output's white measurement noise.
 
     Args:
-        u: the unknowns, in the units of the model.
         sd: the guess of it, or what is stated.
     """
     sd = sd * u.scales[output] if output in u.scales else sd

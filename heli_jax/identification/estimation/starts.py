@@ -35,11 +35,7 @@ def noise_guess_at(
     layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
 ) -> Float[Array, " q"]:
     """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it; of several
-    disturbances first all together, then each by itself.
-
-    Args:
-        z0: where the grid has its middle.
-    """
+    disturbances first all together, then each by itself."""
     z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
     # A grid over all at once would have 18 to the power of their number.
     several = [d for d in disturbances_of(layout.model) if d.sigma in layout.disturbance]
@@ -60,7 +56,6 @@ def one_noise_guess(
     sigma and of every tau, to the greatest likelihood on a coarse grid about it.
 
     Args:
-        z0: where the grid has its middle.
         names: of the parameters; those that are no unknowns stay.
     """
     # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
@@ -116,8 +111,7 @@ def coarse_guess(
     layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
 ) -> Float[Array, " q"]:
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
-    linear least squares; what is not among the unknowns stays.
-    """
+    linear least squares; what is not among the unknowns stays."""
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
     # A machine that is held through its instruments leaves a simulation by its inputs.
     by_inputs = data.flights[0].by_instrument is None
@@ -273,11 +267,7 @@ def delay_start(
     z0: Float[Array, " q"],
     known: tuple[Any, Any],
 ) -> Float[Array, " q"]:
-    """z0, or where a delay or the time shift is free the deepest valley of the misfit over it.
-
-    Args:
-        problem: with the free parameters and the model that says which are delays.
-    """
+    """z0, or where a delay or the time shift is free the deepest valley of the misfit over it."""
 
     def evaluate(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = residual_and_jacobian(layout, data, noise, jnp.asarray(z, z0.dtype))

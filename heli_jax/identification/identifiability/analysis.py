@@ -148,7 +148,7 @@ _WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
 
 
 class Around(NamedTuple):
-    """What is known beside the slopes at a point."""
+    """Knowledge of a point beside its slopes."""
 
     aliased: Collection[str] = ()
     """the parameters that move a mode which the samples do not tell from its aliases"""

@@ -137,7 +137,7 @@ def with_further(null: list[np.ndarray], others: list[np.ndarray]) -> list[np.nd
 
 
 class WithoutWeakPriors(NamedTuple):
-    """What is left of the data where the nuisances' weak priors are taken away.
+    """Information of the data without the nuisances' weak priors.
 
     Initial states, biases and input offsets carry priors of ten times the signal, so that one that
     no output shows does no harm. What only these hold up of a parameter the data do not determine.

@@ -117,7 +117,7 @@ _STAYS = 0.02
 
 
 class Point(NamedTuple):
-    """Where the residuals were looked at."""
+    """A point at which the residuals were evaluated."""
 
     values: dict[str, float]
     """of the unknowns of interest, SI"""

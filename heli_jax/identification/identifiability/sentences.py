@@ -22,7 +22,7 @@ _BY_PRIOR = 0.9
 
 
 def sentences(verdict: Verdict) -> tuple[str, ...]:
-    """What the data determine, what they do not, and what can be done, most important first."""
+    """Sentences on what the data determine, what they do not, and what can be done."""
     v = verdict
     # At its bound the slope of what is searched through a tanh vanishes: that is no lack of effect.
     bound = {u.name: u for u in v.unknowns if u.at_bound}
@@ -76,7 +76,7 @@ def _switch(name: str) -> str:
 
 
 def _determined(v: Verdict, told: set[str]) -> list[str]:
-    """What the data determine, and what priors do."""
+    """Sentences on what the data and the priors determine."""
     if v.resting_groups and not told:
         return [_resting(group, v) for group in v.resting_groups]
     # To say that the data determine what the prior alone holds would be the worst mistake here: its
@@ -167,7 +167,7 @@ def _exchanged(group: Group) -> str:
 
 
 def _way_out(names: Sequence[str], v: Verdict, count: int = 1, switches: Sequence[str] = ()) -> str:
-    """What can be done about parameters that the data do not tell apart.
+    """Remedies for parameters that the data do not separate.
 
     Args:
         names: the parameters, gains and the time shift concerned.

@@ -1,6 +1,6 @@
-"""What the inputs and the initial states tell, apart from what the colour of a disturbance tells.
+"""The information in inputs and initial states, without that in the colour of a disturbance.
 
-The gain of a filter depends on the machine's parameters, so that innovations inform on these in two
+The gain of a filter depends on the vehicle's parameters, so that innovations inform on these in two
 ways: by the response, and by the correlation of what the response does not explain. The second
 part is information only as far as disturbance and measurement noise are what the model says. Where
 the innovations are not white they are not, and it then fixes combinations that no input shows, at
@@ -36,7 +36,7 @@ def through_inputs(at: Solution, e: Evaluation) -> Evaluation | None:
     With a row for each free parameter that only noise has, such as a process noise of the model's
     own: that is no question to the inputs.
 
-    None without innovations, and where a simulation leaves its record (an unstable machine), so
+    None without innovations, and where a simulation leaves its record (an unstable vehicle), so
     that what of it the inputs make is not known.
     """
     if not e.innovations or not (np.isfinite(e.J).all() and np.isfinite(e.r).all()):
@@ -81,7 +81,7 @@ def _simulated(flight: FlightData, simulated: dict[str, np.ndarray]) -> FlightDa
 
 
 class ByDisturbance(NamedTuple):
-    """What a disturbance tells of the parameters beside what the inputs do."""
+    """Parameters on which a disturbance has more information than the inputs."""
 
     resting: tuple[str, ...]
     """parameters that are determined, and are not by the inputs alone"""
@@ -123,7 +123,7 @@ def remarks(told: ByDisturbance, names: Sequence[str], *, counts: bool, white: b
 
 @np.errstate(over="ignore", invalid="ignore")
 def _left(measured: np.ndarray, simulated: np.ndarray) -> bool:
-    """Whether a simulation (N,) left what was measured (N,), NaN where nothing was."""
+    """True if a simulation (N,) left the measurement (N,), NaN where nothing was measured."""
     seen = ~np.isnan(measured)
     error = (measured - simulated)[seen]
     return not float(np.var(error)) <= _LEFT * float(np.var(measured[seen]))

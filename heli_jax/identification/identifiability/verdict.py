@@ -1,4 +1,4 @@
-"""What the identifiability analysis finds: plain data, of which `sentences` makes words."""
+"""The result of the identifiability analysis: plain data, of which `sentences` makes words."""
 
 import math
 from collections.abc import Iterable, Mapping, Set

@@ -1,6 +1,6 @@
-"""Whether the model is adequate: does it explain what was measured, beside noise and disturbance?
+"""Adequacy of the model: does it explain what was measured, beside noise and disturbance?
 
-That an optimiser arrived and that the data determine the parameters says nothing of it: the best
+That an optimiser converged and that the data determine the parameters says nothing of it: the best
 parameters of a wrong model are found and determined as well as those of the right one.
 
 What is judged is the simulated response of every fitted output. The acceptance card asks for a
@@ -46,7 +46,7 @@ _GROWTH = 3.0
 
 
 class OutputAdequacy(NamedTuple):
-    """Whether one output is explained, and by what numbers."""
+    """The numbers that show if one output is explained."""
 
     # The names of the fields are keys of fit.json.
     output: str
@@ -76,7 +76,7 @@ class OutputAdequacy(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is compared, by flight: SI, NaN where nothing is measured."""
+    """Signals that are compared, by flight: SI, NaN where nothing is measured."""
 
     label: str
     dt: float
@@ -86,7 +86,7 @@ class Record(NamedTuple):
 
 
 def is_unstable(problem: Problem, params: Any, growth: float = _GROWTH) -> bool:
-    """Whether a mode of the linearised model grows by e to `growth` over the longest window;
+    """True if a mode of the linearised model grows by e to `growth` over the longest window;
     `params` is a record of the model's Params, SI."""
     # An eigenvalue just right of the axis is a slow drift, of which the record shows nothing.
     longest = max(f.duration for f in problem.training)
@@ -113,7 +113,7 @@ three standard deviations where the disturbance is so slow that the record holds
 
 
 class Adequacy(NamedTuple):
-    """How well the fitted outputs are explained in time."""
+    """Adequacy of the fitted outputs in time."""
 
     # The names of the first three fields are keys of fit.json.
     judged: tuple[OutputAdequacy, ...] = ()
@@ -130,13 +130,13 @@ class Adequacy(NamedTuple):
 
     @property
     def denied(self) -> bool:
-        """Whether an output is not explained."""
+        """True if an output is not explained."""
         return self.by_chance or any(not output.adequate for output in self.judged)
 
     @property
     def explains_nothing(self) -> bool:
-        """Whether the model follows every output worse than its mean, so that the record determines
-        none of its parameters."""
+        """True if the model follows every output worse than its mean, so that the record
+        determines none of its parameters."""
         # A disturbance, or predictions ahead, let a good model's simulation be as poor.
         if not self.denied or self.ahead is not None:
             return False
@@ -145,7 +145,7 @@ class Adequacy(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What adequacy is assessed by: the fitted flights, and what is known of their residuals."""
+    """The evidence on adequacy: the fitted flights and their residuals."""
 
     records: tuple[Record, ...]
     agreement: Mapping[str, Metrics]
@@ -164,7 +164,7 @@ class Evidence(NamedTuple):
 
 
 def misses(expected: Mapping[str, float]) -> bool:
-    """Whether a simulation misses an output by more than its disturbance lets expect.
+    """True if a simulation misses an output by more than its disturbance lets expect.
 
     Args:
         expected: by output the power of its error over that which is expected.
@@ -173,14 +173,14 @@ def misses(expected: Mapping[str, float]) -> bool:
 
 
 def joined_metrics(name: str, records: Sequence[Record]) -> Metrics:
-    """Of one output over all records that have it."""
+    """The adequacy of one output over all records that have it."""
     both = [(r.measured[name], r.simulated[name]) for r in records if name in r.measured]
     measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
     return metrics(measured, predicted)
 
 
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
-    """Whether the model is adequate to the fitted flights.
+    """The adequacy of the model to the fitted flights.
 
     Args:
         params: the vehicle with the estimates in place, a record of the model's Params, SI.
@@ -229,7 +229,7 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
-    """Whether an output never moves: nothing is to be explained."""
+    """True if an output never moves: nothing is to be explained."""
     # By its range: the mean of equal numbers, and so their variance, is off by rounding. As
     # `metrics` has it, so that what has no VAF is not judged by one.
     return all(
@@ -280,7 +280,7 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
 
 # Do the inputs explain anything? A filter follows any record, if need be by its disturbance alone.
 #
-# What is then estimated is the colour of the noise, and not how the machine answers: from other
+# What is then estimated is the colour of the noise, and not how the vehicle answers: from other
 # starts, or with another disturbance, it is something else, with an interval as narrow.
 
 

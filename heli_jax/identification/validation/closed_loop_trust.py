@@ -150,7 +150,7 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
 
 
 def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
-    """Of the unknowns of interest, at each line of the windows of fitted responses.
+    """Information on the unknowns of interest at each line of the windows of fitted responses.
 
     Args:
         at: where the fit ended.
@@ -225,8 +225,8 @@ class Loop(NamedTuple):
 
     @property
     def inputs(self) -> list[str]:
-        """Those without an instrument that follow the response; all that move freely where it was
-        found of none."""
+        """The inputs without an instrument that follow the response; all that move freely if
+        none was found."""
         direct = [one for one in self.found if one.input not in self.instruments]
         those = [one for one in direct if one.present] or direct
         return list(dict.fromkeys(one.input for one in those))
@@ -282,7 +282,7 @@ def _room(
 def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
-    """Of the unknowns of interest, each frequency by its weight."""
+    """Information on the unknowns of interest, each frequency by its weight."""
     layout, data, noise, z = at
     q = len(layout.of_interest)
     if not any(np.any(w) for w in weights):

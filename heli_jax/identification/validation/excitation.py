@@ -1,4 +1,4 @@
-r"""What inputs excite: the power of a signal that follows others, in bands of a record's lines.
+"""Excitation: the power of a signal that follows others, in bands of a record's lines.
 
 In a narrow band a response is a constant gain, so that least squares over the band's lines gives
 the power of a signal that follows others. Chance makes as much of it as the unknown gains do
@@ -270,7 +270,7 @@ class _Bands(NamedTuple):
 
     @property
     def per_line(self) -> Float[np.ndarray, "b p c"]:
-        """What is not explained, by line."""
+        """The power by line that is not explained."""
         return np.maximum(self.whole - self.parts, 0.0) / (self.lines - self.rank)[:, :, None]
 
     @property
@@ -290,7 +290,7 @@ class _Bands(NamedTuple):
 
     @property
     def asked(self) -> Bool[np.ndarray, "b p"]:
-        """Where the first signal is more than what follows the excitation."""
+        """True at lines where the first signal is more than what follows the excitation."""
         return (self.rank > 0) & (self.whole[:, :, 0] > self.parts[:, :, 0])
 
 

@@ -1,9 +1,9 @@
 """Feedback: do inputs follow the response, through a pilot or a controller?
 
-Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
-multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
+Innovations are what a record's own past cannot predict of its outputs: the residuals of a
+multivariable ARX model of the record itself, so that a poor model of the vehicle is no alarm.
 Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
-13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
+13.4 and 16.5); without it, it does not. Each input is freed of what its own past predicts, and the
 rest is correlated with sums of past innovations. The variance of such a correlation between two
 autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
@@ -59,7 +59,7 @@ class Correlated(NamedTuple):
 def correlations_with_sums(
     u: Float[np.ndarray, " N"], e: Float[np.ndarray, "N p"], blocks: Sequence[tuple[int, int]]
 ) -> Correlated:
-    """Of u with the sums of each column of e over each block of lags.
+    """Correlation of u with the sums of each column of e over each block of lags.
 
     Args:
         u: NaN where it is missing.
@@ -95,12 +95,12 @@ def correlations_with_sums(
 
 
 def _products_over_lags(x: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "N p"]:
-    """Of each column with itself, by lag."""
+    """Autocorrelation of each column, by lag."""
     size = scipy.fft.next_fast_len(2 * len(x), real=True)
     return np.fft.irfft(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: len(x)]
 
 
-# What the past of a record does not foretell of it: the residuals of ARX models.
+# What the past of a record does not predict of it: the residuals of ARX models.
 #
 # The order is the one that BIC takes; where samples are missing, no row is used in which one
 # stands.
@@ -117,8 +117,8 @@ _RIDGE = 1e-12
 def arx_residuals(
     y: Float[np.ndarray, "N p"], past: Float[np.ndarray, "N z"]
 ) -> Float[np.ndarray, "N p"] | None:
-    """What a constant and the samples of other signals before it (their `past`) do not foretell of
-    y, NaN where one of them is missing; None where the record is too short."""
+    """The part of y that a constant and earlier samples of other signals (their `past`) do not
+    predict, NaN where one is missing; None if the record is too short."""
     longest, (N, z) = _ORDERS[-1], past.shape
     scale = np.nanstd(past, axis=0)
     past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
@@ -140,7 +140,7 @@ def arx_residuals(
     factor = np.linalg.cholesky(x.T @ x + _RIDGE * m * np.eye(sizes[-1]))
     along = scipy.linalg.solve_triangular(factor, x.T @ at, lower=True)
     unexplained = np.sum(at**2, axis=0) - np.cumsum(along**2, axis=0)
-    # What rounding leaves of a signal that its past foretells exactly may be below zero.
+    # What rounding leaves of a signal that its past predicts exactly may be below zero.
     criteria = [
         m * np.sum(np.log(np.maximum(unexplained[k - 1], 0.0) / m + 1e-300)) + p * k * np.log(m)
         for k in sizes
@@ -155,7 +155,7 @@ def arx_residuals(
 LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""
 RATE = 50.0
-"""samples a second at most: no feedback that a machine flies by is faster than a quarter of that"""
+"""samples a second at most: no feedback that a vehicle flies by is faster than a quarter of that"""
 _SLOW_RATE = 10.0
 """samples a second at which slow feedback, as a pilot's, shows through a sensor's noise"""
 _PARTS = 5
@@ -181,7 +181,8 @@ _SEEN = 0.8
 
 
 class Feedback(NamedTuple):
-    """What was found of one input of one flight. The names of the fields are keys of fit.json."""
+    """The result of the test for one input of one flight. The names of the fields are keys of
+    fit.json."""
 
     flight: str
     input: str
@@ -200,7 +201,7 @@ class Feedback(NamedTuple):
 
     @property
     def present(self) -> bool:
-        """Whether the input follows the response."""
+        """True if the input follows the response."""
         return self.p_value < LEVEL
 
 
@@ -258,7 +259,7 @@ def _rates_of(flight: Flight) -> tuple[float, ...]:
 
 
 def _frames(u: np.ndarray) -> float:
-    """How often an input has a new value while it moves, of its samples."""
+    """The share of an input's moving samples that have a new value."""
     at = np.flatnonzero(np.diff(u) != 0.0)
     return 1.0 / float(np.median(np.diff(at))) if at.size > 1 else np.inf
 
@@ -267,7 +268,7 @@ class _View(NamedTuple):
     """Signals of a flight at one rate, of which the past is compared with inputs."""
 
     free: dict[str, np.ndarray]
-    """by input what its own past does not foretell (N,)"""
+    """by input what its own past does not predict (N,)"""
     innovations: Float[np.ndarray, "N p"]
     outputs: tuple[str, ...]
     inputs: int
@@ -295,7 +296,7 @@ def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]
     finer = {n: v for n in free if (v := _unforeseen(inputs[n], parts[n])) is not None}
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
-    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # From the past of all signals together. What one output alone cannot predict may well be the
     # answer to an input, and would pass for feedback. A sample's own inputs stand beside the
     # outputs before it.
     now = np.concatenate(list(parts.values()), axis=1)
@@ -310,8 +311,8 @@ def _views(flight: Flight, steps: Mapping[str, int], rate: float) -> list[_View]
 def _unforeseen(
     u: Float[np.ndarray, " N"], own: Float[np.ndarray, "N m"]
 ) -> Float[np.ndarray, " N"] | None:
-    """What an input's own past (N, m) does not foretell of it (N,), without its jumps; None where
-    nothing is left.
+    """The part of an input (N,) that its own past (N, m) does not predict, without its jumps; None
+    where nothing is left.
 
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
@@ -332,7 +333,7 @@ def _unforeseen(
 
 
 def _moves_freely(u: Float[np.ndarray, " N"]) -> bool:
-    """Whether there is anything in an input that could follow."""
+    """True if there is anything in an input that could follow."""
     # A commanded input that stays for twenty samples and jumps follows nothing in between; no more
     # does one whose steps are rounded off, as a programmed doublet's: what an autoregression leaves
     # of its corners rings on into the rest, as it does in the response.
@@ -407,8 +408,7 @@ def _decimated(flight: Flight, earlier: Mapping[str, int], rate: float) -> _Deci
 def feedback_of(
     problem: Problem, delays: Mapping[str, tuple[float, float | None]] | None = None
 ) -> tuple[Feedback, ...]:
-    """Of all flights that are fitted; nothing where sensors are compared with each other, of which
-    none is a stick that anybody moves.
+    """The test for all fitted flights; empty where sensors are compared with each other.
 
     Args:
         delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
@@ -432,8 +432,7 @@ def feedback_of(
 def _delay(
     problem: Problem, flight: Flight, name: str, delays: Mapping[str, tuple[float, float | None]]
 ) -> tuple[float, float, bool]:
-    """Of an input its delay and its sd [s], as far as they are known, and whether that was
-    estimated."""
+    """Delay and sd [s] of an input, as far as they are known, and if the delay was estimated."""
     delay, variance, estimated = 0.0, 0.0, False
     own = dict(problem.model.delays).get(name)
     if own is not None and own not in delays:

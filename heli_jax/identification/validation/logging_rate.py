@@ -1,4 +1,4 @@
-"""Whether the log is fast enough for the dynamics, at the start values or the estimates.
+"""Rates of a log beside the modes of the model, at the start values or the estimates.
 
 Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
 aliases. An input that was sampled while it moved is known at its samples alone: between them a
@@ -142,7 +142,7 @@ class Rate(NamedTuple):
     least: float
     """samples in a period of the mode, below which nothing of it is seen"""
     staircase: bool = False
-    """whether the signal is an input of steps of equal length"""
+    """true for an input of steps of equal length"""
 
     @property
     def samples(self) -> float:
@@ -193,15 +193,15 @@ def _modes_that_show(
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     modes = _modes_of(problem, naming.replace(params, **known), flight)
     behind = states_behind(problem.model)
-    machine = [n not in behind for n in naming.names(problem.model.State)]
+    vehicle = [n not in behind for n in naming.names(problem.model.State)]
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
         if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
-        # A filter's own mode has no part in the machine. Its constants are known, and it is no
+        # A filter's own mode has no part in the vehicle. Its constants are known, and it is no
         # motion that a log would have to show.
         right = modes.right[:, k]
-        if np.linalg.norm(right[machine]) < 1e-6 * np.linalg.norm(right):
+        if np.linalg.norm(right[vehicle]) < 1e-6 * np.linalg.norm(right):
             continue
         part, u, y = modes.strongest(k, problem, flight, sizes)
         if part >= 1.0:
@@ -209,8 +209,8 @@ def _modes_that_show(
 
 
 def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
-    """The rate [Hz] at which an input was sampled while it moved; None where it does not move, or
-    is known between its samples because it was commanded in steps.
+    """Return the rate [Hz] at which an input was sampled while it moved; None if it does not move,
+    or if it is known between its samples because it was commanded in steps.
 
     Args:
         flight: says what the input does between samples, and who decided that.
@@ -240,7 +240,7 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 
 
 def _corner_rate(dt: float, u: np.ndarray) -> float:
-    """The rate of the samples between which an input follows straight lines."""
+    """Return the rate of the samples between which an input follows straight lines."""
     bends = np.abs(np.diff(u, 2))
     # Of most samples: a single absurd one would make the stick's own corners look like rounding.
     low, high = np.quantile(u, [0.01, 0.99])
@@ -259,15 +259,15 @@ def _corner_rate(dt: float, u: np.ndarray) -> float:
 
 
 def output_rate(flight: Flight, name: str) -> float:
-    """The rate [Hz] of the samples of an output that are there."""
+    """Return the rate [Hz] of the samples of an output that are there."""
     seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
     usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
     return 1.0 / max(usual * flight.dt, flight.logged_step(name, "output"))
 
 
 def power_between_samples(flight: Flight, name: str) -> tuple[float, float] | None:
-    """The rate [Hz] of an input, and the part of its power above a quarter of it, where that power
-    does not fall off before half of the rate; None where it does.
+    """Return the rate [Hz] of an input, and the part of its power above a quarter of it; None if
+    that power falls off before half of the rate.
 
     A controller that runs faster than the log moves its input between the samples, by what it saw
     of the response there.
@@ -329,7 +329,7 @@ class FastMode(NamedTuple):
 def measurement_noise(
     problem: Problem, sd: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], ...]:
-    """By flight and output the sd that residuals leave to noise, less what a model misses, SI."""
+    """Return by flight and output the sd of the noise in residuals without what a model misses."""
     # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
     return tuple(
         {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
@@ -342,7 +342,7 @@ def fast_modes(
     values: Mapping[str, float],
     noise: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[FastMode]:
-    """For each fitted flight the fastest mode that its samples cannot show and that is not known.
+    """Return by flight the fastest mode that its samples cannot show and that is not known.
 
     Args:
         values: of the free parameters, SI; gains and shifts among them move no mode.
@@ -407,7 +407,7 @@ something, chi-squared's few squares tell nothing"""
 
 
 def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMode]:
-    """The modes, each with the parameters that take it to an alias which fits as well.
+    """Return the modes, each with the parameters that take it to an alias which fits as well.
 
     Args:
         modes: of `fast_modes` at an optimum.
@@ -433,8 +433,8 @@ def _relative_slopes(
     names: Sequence[str],
     modes: Modes,
 ) -> dict[str, np.ndarray]:
-    """By parameter of every eigenvalue (n,) complex its change over its size, for a relative change
-    of that parameter: first-order perturbation of a simple eigenvalue."""
+    """Return by parameter the relative changes (n,), complex, of the eigenvalues for a relative
+    change of it: first-order perturbation of simple eigenvalues."""
     slopes = {}
     for name in names:
         value = here[name]

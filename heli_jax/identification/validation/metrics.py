@@ -1,4 +1,4 @@
-"""How well a simulated signal agrees with a measured one, and whether what is left is white."""
+"""Agreement of simulated and measured signals, and whiteness of residuals."""
 
 from typing import NamedTuple, cast
 
@@ -45,9 +45,8 @@ FAR = 1e4
 
 
 def diverges(m: Metrics, times: float = 10.0) -> bool:
-    """Whether a simulation left what was measured: it is not finite, or its error has several
-    times the variance of the signal.
-    """
+    """True if a simulation left what was measured: it is not finite, or its error has several
+    times the variance of the signal."""
     return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
 
@@ -82,7 +81,7 @@ def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
 
 
 class Whiteness(NamedTuple):
-    """Whether residuals look like white noise over all their lags."""
+    """The test of residuals for whiteness over all their lags."""
 
     white: bool
     p_value: float
@@ -157,7 +156,7 @@ def kept(signal: np.ndarray) -> np.ndarray:
 
 
 def lags_for(n: int) -> int:
-    """How many lags a record of n samples bears: a quarter of it, at most 500."""
+    """The number of lags for a record of n samples: a quarter of it, at most 500."""
     # Beyond a quarter an autocorrelation is the mean of too few products (Box and Jenkins).
     return max(1, min(n // 4, 500))
 
@@ -192,8 +191,8 @@ def whiteness(
 
 
 def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Where 99 % of white noise's autocorrelations lie (lags,), as `seen_autocorrelation` counts
-    them times the part of the record that a lag leaves."""
+    """The limits within which 99 % of white noise's autocorrelations lie (lags,), as
+    `seen_autocorrelation` counts them times the part of the record that a lag leaves."""
     return BAND99 * np.sqrt(whole / pairs)
 
 
@@ -251,7 +250,7 @@ _SEEN = 0.95
 
 
 def is_decimated(flight: Flight, output: str) -> bool:
-    """Whether an output was logged at a higher rate than the flight has."""
+    """True if an output was logged at a higher rate than the flight has."""
     facts = None if flight.source is None else flight.source.facts.get((output, "output"))
     return facts is not None and facts.usual < _FEWER * flight.dt
 

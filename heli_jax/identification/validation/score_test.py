@@ -146,7 +146,7 @@ def bounded(e: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def across(holes: Sequence[int], size: int) -> np.ndarray:
-    """Of (size,) samples those that the filter of `whitening` makes of samples before a hole."""
+    """The samples (size,) to which the filter of `whitening` brings samples from before a hole."""
     after = np.zeros(size, bool)
     for first in holes:
         after[first : first + ORDER] = True
@@ -366,7 +366,8 @@ def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
-    """That a gain is one of the others, which are maxima of about exponential numbers."""
+    """The probability that a gain is one of the others, which are maxima of about exponential
+    numbers."""
     scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
     if not scale > 0:
         return 1.0

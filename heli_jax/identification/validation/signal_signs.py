@@ -67,8 +67,8 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
 def angle_over_rate(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
 ) -> AngleOverRate | None:
-    """How far an angle moves beside the integral of its rate; None where nothing can be told: a gap
-    is long, the record is short, or the two have little in common.
+    """The motion of an angle over that of the integral of its rate; None if nothing can be
+    compared: a gap is long, the record is short, or the two have little in common.
 
     Args:
         angle: [rad], NaN where missing.
@@ -103,7 +103,7 @@ def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def integral(rate: Float[np.ndarray, " N"], dt: float) -> Float[np.ndarray, " N"]:
-    """Of a signal with straight lines between its samples, from zero.
+    """The integral from zero of a signal with straight lines between its samples.
 
     Args:
         rate: without a missing sample.
@@ -197,7 +197,7 @@ def sticks_of(model: Model) -> dict[str, str]:
 
 
 class _Sign(NamedTuple):
-    """How an output goes with the simulated one in a flight, where that is sure."""
+    """The correlation of an output with the simulated one in a flight, where that is sure."""
 
     correlation: float
     size: float
@@ -214,7 +214,7 @@ def _signs(flight: Flight, run: Mapping[str, np.ndarray]) -> dict[str, _Sign]:
 
 
 def _counts(name: str, sign: _Sign, by_flight: Sequence[Mapping[str, _Sign]]) -> bool:
-    """Whether no flight that says more of an output says that its sign is right."""
+    """True if no flight with more information on an output shows that its sign is right."""
     others = (signs[name] for signs in by_flight if name in signs)
     return sign.correlation > 0 or not any(
         o.correlation > 0 and o.size > _MORE * sign.size for o in others
@@ -299,7 +299,7 @@ def oversized(model: Model, flight: Flight) -> Iterator[Oversized]:
 
 
 def _of_fuselage(model: Model, name: str) -> bool:
-    """Whether an output is an attitude or a rate of the vehicle, and no other angle of it."""
+    """True if an output is an attitude or a rate of the vehicle, and no other angle of it."""
     of_axes = {n for a in axes_of(model) for n in (a.rate, a.angle)}
     return name in of_axes | _ATTITUDE or of_helicopter(model.Params)
 
@@ -413,7 +413,7 @@ def _units_by_size(signal: Signal, values: np.ndarray) -> tuple[str, str]:
 
 
 def _size(measured: np.ndarray, simulated: np.ndarray) -> float:
-    """How many times as far an output moves as was simulated; 0 where nothing can be told."""
+    """The ratio of an output's motion to the simulated one; 0 if nothing can be compared."""
     seen = np.isfinite(measured)
     with np.errstate(over="ignore", invalid="ignore"):
         far = float(np.std(simulated[seen])) if seen.any() else 0.0

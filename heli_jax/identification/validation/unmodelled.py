@@ -1,11 +1,11 @@
-"""What a model lacks, asked of its residuals: a mode, an answer that depends on amplitude, or one
-that changes over the record.
+"""Unmodelled dynamics in the residuals: a mode, a response that depends on amplitude, or one that
+changes over the record.
 
 Of every output the residual in time is tested against the inputs through a bank of filters, beyond
 what the sensitivities explain (`score_test`): the simulation and its residual are there by any
 method. Then against powers of inputs, of the simulated output, its rate and its integral, and the
 sign of the first two, beyond what the input through the same filter explains: a saturation, a rate
-limit, a deadband, friction, a spring that is not linear and a machine that is not alike to both
+limit, a deadband, friction, a spring that is not linear and a vehicle that is not alike to both
 sides do not answer in proportion. Then against the sensitivities times the time, and of single
 flights: a rotor that slows down, a mass that changes and a stick of another scale leave what no
 constant takes up.
@@ -55,7 +55,7 @@ _JITTERS = 5
 
 
 class OwnSamples(NamedTuple):
-    """Where on the grid an output was sampled at even times."""
+    """The places on the grid of an output that was sampled at even times."""
 
     rows: np.ndarray
     """(M,) their numbers"""
@@ -64,8 +64,8 @@ class OwnSamples(NamedTuple):
 
     @property
     def holes(self) -> tuple[int, ...]:
-        """Where in `rows` the sample before is missing: a slow residual jumps there, and so does an
-        input, which is no answer of one to the other."""
+        """Places in `rows` before which a sample is missing: a slow residual jumps there, and so
+        does an input."""
         apart = np.diff(self.rows)
         return tuple((np.flatnonzero(apart > self.every + (self.every >= _JITTERS)) + 1).tolist())
 
@@ -83,7 +83,7 @@ class OwnSamples(NamedTuple):
 
 
 def own_samples(seen: Bool[np.ndarray, " N"]) -> OwnSamples | None:
-    """Where an output was sampled; None where too much of its own samples is missing."""
+    """The places of an output's samples; None if too many of its own samples are missing."""
     rows = np.flatnonzero(seen)
     if rows.size == seen.size:
         return OwnSamples(rows, 1)
@@ -125,7 +125,7 @@ def longest(at: Solution) -> list[int]:
 
 
 def usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
-    """Whether an output was measured, moves, and is followed by a simulation that stays with it.
+    """True if an output was measured, moves, and is followed by a simulation that stays with it.
 
     Args:
         at: where the fit ended.
@@ -145,7 +145,7 @@ def usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
 
 
 def own_of(at: Solution, i: int, name: str) -> OwnSamples | None:
-    """Where a flight's output was sampled.
+    """The places of the samples of a flight's output.
 
     Args:
         at: where the fit ended.
@@ -221,8 +221,8 @@ def moving_inputs(at: Solution) -> list[str]:
 
 
 def nonlinear(y: np.ndarray, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What is not linear of inputs and of the `motions` of a simulated output (each (N,)), and what
-    a linkage with play keeps of the inputs."""
+    """Nonlinear functions of inputs and of the `motions` of a simulated output (each (N,)), and
+    what a linkage with play keeps of the inputs."""
     u = [_normal(v) for v in inputs]
     response = [_normal(v) for v in motions(y)]
     curved = [w for v in (*u, *response) for w in (np.abs(v) * v, v**2)]
@@ -239,7 +239,7 @@ def motions(y: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _behind_play(v: np.ndarray) -> np.ndarray:
-    """Where a signal (N,) takes what follows it with play."""
+    """The position of what follows a signal (N,) with play."""
     half, at, out = 0.5 * _PLAY * float(np.ptp(v)), 0.0, []
     # A stick that is held for many samples moves at a few of them.
     begins = np.flatnonzero(np.diff(v, prepend=np.nan))
@@ -267,7 +267,7 @@ _ENOUGH = 1.0
 
 
 class Unmodelled(NamedTuple):
-    """What the residual of an output follows beyond chance."""
+    """A drive that the residual of an output follows beyond chance."""
 
     output: str
     drive: Drive
@@ -285,8 +285,9 @@ class Unmodelled(NamedTuple):
 def unmodelled(
     at: Solution, e: Evaluation, flights: Sequence[str], *, coloured: bool = False
 ) -> tuple[list[Unmodelled], tuple[float, dict[str, float]]]:
-    """What the residuals follow beyond chance, at most one an output; and the probability that the
-    answer to the inputs asks for other values by chance, with the step to these [SI].
+    """Return the drives that the residuals follow beyond chance, at most one an output; and the
+    probability that the response to the inputs asks for other values by chance, with the step to
+    these [SI].
 
     Output error takes slow drift for slow modes; filter error learns also from how its disturbance
     goes through the vehicle, which misleads it where that acts elsewhere or has another spectrum.
