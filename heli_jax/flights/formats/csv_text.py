@@ -396,6 +396,7 @@ class CsvTable:
         with progress.reading(self.path, self.size):
             columns = self._columns([self.names.index(name) for name in names])
         self._digest.begin()
+        numbers = {}
         for name, (values, _, _) in zip(names, columns, strict=True):
             if isinstance(values, int):
                 cell = self.cell_text(name, values)
@@ -404,7 +405,8 @@ class CsvTable:
                 if ":" in cell:
                     problem += ", or a time such as 2024-03-01T23:59:55.01 or 23:59:55.01"
                 raise wrong(self.path, problem, self.place(values), column(name))
-        return {n: values for n, (values, _, _) in zip(names, columns, strict=True)}
+            numbers[name] = values
+        return numbers
 
     def survey(self) -> list[Survey]:
         """Every column, in the file's order."""
@@ -448,7 +450,9 @@ class CsvTable:
             likely = self._likely_numbers(likely)
             table = self._arrow(self._rows, dict.fromkeys(likely, pa.float64()))
         plain = {} if table is None else {i: table.column(str(i)) for i in likely}
-        made = {i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()}
+        made: dict[int, _Column] = {
+            i: (floats(c), len(c) - c.null_count, 0) for i, c in plain.items()
+        }
         rest = [i for i in dict.fromkeys(indices) if i not in made]
         for i, cells in zip(rest, self._texts(rest) if rest else (), strict=True):
             made[i] = self._parsed(self.names[i], cells)
@@ -547,6 +551,8 @@ class CsvTable:
 
     def _texts(self, indices: Sequence[int]) -> list[list[str | None]]:
         """The cells of some columns, without the blanks around them, None where nothing is left."""
+        import pyarrow as pa
+
         if len(self._rows) > _LARGEST_TEXT:
             problem = (
                 "has quotes, a row of other than the header's number of cells, or a cell that is "
@@ -555,6 +561,12 @@ class CsvTable:
             )
             raise wrong(self.path, problem)
         columns: list[list[str | None]] = [[] for _ in indices]
+        table = self._arrow(self._rows, dict.fromkeys(indices, pa.string()))
+        if table is not None:
+            for texts, i in zip(columns, indices, strict=True):
+                cells = map(str.strip, table.column(str(i)).to_pylist())
+                texts += [None if cell in _NOTHING else cell for cell in cells]
+            return columns
         for line, cells in self._records():
             if len(cells) != len(self.names):
                 raise wrong(self.path, self._ragged(len(cells)), f"line {line}")
